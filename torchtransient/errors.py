@@ -1,0 +1,39 @@
+"""The errors of the library. Every message says what was expected, what came and what to do."""
+
+from __future__ import annotations
+
+
+class TorchTransientError(Exception):
+    """Base of every error that torchtransient raises on purpose."""
+
+
+class ShapeError(TorchTransientError, ValueError):
+    """A tensor has the wrong number of dimensions or the wrong size along one."""
+
+
+class UnitError(TorchTransientError, ValueError):
+    """A quantity lies outside the range that its unit allows (negative bin width, NaN length, ...)."""
+
+
+class SceneError(TorchTransientError, ValueError):
+    """A scene description, plugin parameter or parameter key cannot be used."""
+
+
+class StorageError(TorchTransientError, ValueError):
+    """A file cannot be read or written, or a result would not fit into memory."""
+
+
+class VariantError(TorchTransientError, RuntimeError):
+    """The active Mitsuba variant cannot do what was asked, or no usable LLVM was found."""
+
+
+class DeviceError(TorchTransientError, RuntimeError):
+    """Tensors live on a device that the active variant cannot reach."""
+
+
+class GradientError(TorchTransientError, RuntimeError):
+    """A derivative was asked for that does not exist or is not supported."""
+
+
+class PluginRegistrationError(TorchTransientError, RuntimeError):
+    """A Mitsuba plugin of this library could not be registered for the active variant."""
