@@ -68,6 +68,17 @@ def test_entries_without_noise():
     assert not st.z_test([[1.0, np.nan], [1.1, 1.0]], [1.05, 1.0]).passed
 
 
+def test_pooling_keeps_the_energy_and_fills_every_group():
+    energy = np.array([0.0, 0.0, 3.0, 0.5, 0.6, 0.0, 0.1, 5.0, 0.2, 0.0])
+    starts = st.pool_small_bins(energy, 1.0)
+    np.testing.assert_array_equal(starts, [0, 3, 5])
+    np.testing.assert_allclose(np.add.reduceat(energy, starts), [3.0, 1.1, 5.3])
+    with pytest.raises(UnitError):
+        st.pool_small_bins(energy, 100.0)
+    with pytest.raises(ShapeError):
+        st.pool_small_bins(energy[None], 1.0)
+
+
 def test_variance_slope():
     rng = np.random.default_rng(6)
     spp = np.array([4, 16, 64, 256, 1024])

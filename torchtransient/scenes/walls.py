@@ -112,13 +112,15 @@ def etalon_slab(
     else:
         raise SceneError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
+    # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along it.
+    slab_to_world = translate([3.0, 0.0, d / 2]) @ scale([10.0, 10.0, d / 2])
     return {
         "type": "scene",
         "integrator": transient_path(max_depth, rr_depth),
         "sensor": perspective(look_at([0.0, 0.0, d + 1.0], [0.0, 0.0, 0.0]), 0.1, film, spp),
         "slab": {
             "type": "cube",
-            "to_world": translate([0.0, 0.0, d / 2]) @ scale([10.0, 10.0, d / 2]),
+            "to_world": slab_to_world,
             "bsdf": {"type": "dielectric", "int_ior": positive("index", index), "ext_ior": 1.0},
         },
         "light": {

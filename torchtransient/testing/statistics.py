@@ -86,6 +86,28 @@ def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3,
     return _score(a.mean(axis=0) - b.mean(axis=0), np.sqrt(va + vb), dof, alpha, rounding)
 
 
+def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
+    """First indices of groups of neighbouring bins that each hold at least `minimum` of `expected` (T,).
+
+    Few events in a bin are not normally distributed; pool both sides of a test with `np.add.reduceat(values, starts, axis=-1)`.
+    What is left at the end joins the last group. Raises UnitError when all bins together hold less than `minimum`.
+    """
+    energy = np.asarray(expected, dtype=np.float64)
+    if energy.ndim != 1:
+        raise ShapeError(f"pool_small_bins: expected one row of bins, got shape {energy.shape}")
+    starts, held = [0], 0.0
+    for i, value in enumerate(energy):
+        held += float(value)
+        if held >= minimum and i + 1 < energy.size:
+            starts.append(i + 1)
+            held = 0.0
+    if held < minimum:
+        if len(starts) == 1:
+            raise UnitError(f"pool_small_bins: all bins together hold {held:g}, less than {minimum:g}")
+        starts.pop()
+    return np.asarray(starts, dtype=np.intp)
+
+
 @dataclass(frozen=True)
 class Slope:
     """A straight line through (log x, log y): slope, its standard error, and y at x = 1."""
