@@ -1,0 +1,54 @@
+"""From a spectral sample to the channels of the film, and back for the adjoint."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+class ChannelMatch:
+    """Linear map from a sample's spectrum to the film's channels, weight of the primary ray included.
+
+    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves of the ray's own wavelengths, whose
+    weights are evaluated once per ray instead of once per event.
+    """
+
+    def __init__(self, wavelengths, weight):
+        self.weight = mi.unpolarized_spectrum(weight)
+        self.matrix = None
+        if mi.is_spectral:
+            self.matrix = []
+            for k in range(len(wavelengths)):
+                unit = mi.UnpolarizedSpectrum(0)
+                unit[k] = 1
+                rgb = mi.spectrum_to_srgb(unit, wavelengths)
+                self.matrix.append([rgb[c] * self.weight[k] for c in range(3)])
+
+    def to_channels(self, value) -> list:
+        """Channel values (list of Float) of a spectrum."""
+        if self.matrix is None:
+            weighted = value * self.weight
+            return [weighted[c] for c in range(len(weighted))]
+        return [sum(value[k] * row[c] for k, row in enumerate(self.matrix)) for c in range(3)]
+
+    def to_spectrum(self, channels: list):
+        """The transposed map: adjoint spectrum of adjoint channel values."""
+        if self.matrix is None:
+            result = mi.UnpolarizedSpectrum(0)
+            for c, a in enumerate(channels):
+                result[c] = a * self.weight[c]
+            return result
+        result = mi.UnpolarizedSpectrum(0)
+        for k, row in enumerate(self.matrix):
+            result[k] = sum(channels[c] * row[c] for c in range(3))
+        return result
+
+
+def zero_channels(count: int) -> list:
+    """``count`` zeros."""
+    return [mi.Float(0) for _ in range(count)]
+
+
+def mean_of(channels: list):
+    """Mean over the channels."""
+    return dr.sum(channels) / len(channels)

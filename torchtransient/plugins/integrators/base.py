@@ -1,0 +1,295 @@
+"""What every transient integrator shares: parameters, passes, primary rays and the three entry points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import GradientError, SceneError, VariantError
+from torchtransient.plugins.films.colour import ChannelMatch, mean_of
+from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
+from torchtransient.plugins.sensors.origin import length_to_sensor_origin
+
+# Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32 bits.
+MAX_LANES = 2**26
+
+
+@dataclass
+class Pass:
+    """One kernel launch: ``spp`` samples for the rows of one storage band."""
+
+    band: int
+    first_row: int
+    rows: int
+    spp: int
+    seed: int
+
+
+class Lane:
+    """The film's side of the samples in flight: where they write, with which weight.
+
+    A plain object, which Dr.Jit loops leave alone: the arrays in it are targets of scatters, not loop state.
+    """
+
+    def __init__(self, film, cube, base, match):
+        self.film, self.cube, self.base, self.match = film, cube, base, match
+
+    def put(self, opl, value, active):
+        """Write a contribution; returns what fell before and after the window (mean over channels)."""
+        channels = self.match.to_channels(value)
+        before, after = self.film.put(self.cube, self.base, opl, channels, active)
+        energy = mean_of(channels)
+        return dr.select(active & before, energy, 0), dr.select(active & after, energy, 0)
+
+
+class AdjointLane:
+    """Reads ``A(tau)`` and ``A'(tau)`` of the incoming adjoint for the samples in flight."""
+
+    def __init__(self, film, transient, base, steady, match):
+        self.film, self.transient, self.base, self.steady, self.match = film, transient, base, steady, match
+
+    def read(self, opl, active):
+        """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
+        if self.transient is None:
+            return self.match.to_spectrum(self.steady), mi.UnpolarizedSpectrum(0)
+        A, slope = self.film.read(self.transient, self.base, opl, active)
+        A = [a + s for a, s in zip(A, self.steady, strict=True)]
+        return self.match.to_spectrum(A), self.match.to_spectrum(slope)
+
+
+class TransientIntegrator(mi.CppADIntegrator):
+    """Abstract base of the transient integrators.
+
+    Parameters: ``max_depth`` (6; -1 for no limit), ``rr_depth`` (5), ``hide_emitters`` (false), ``camera_unwarp`` (false: leave out the leg from the
+    first surface to the sensor), ``discard_direct_light`` (false: leave out emission that reaches the sensor without a bounce),
+    ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
+
+    Subclasses provide ``trace`` (primal), ``sweep`` (reverse mode) and ``push`` (forward mode).
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        max_depth = int(props.get("max_depth", 6))
+        if max_depth < -1:
+            raise SceneError(f"max_depth: expected -1 (no limit) or a number >= 0, got {max_depth}.")
+        self.max_depth = max_depth if max_depth != -1 else 0xFFFFFFFF
+        self.rr_depth = int(props.get("rr_depth", 5))
+        if self.rr_depth <= 0:
+            raise SceneError(f"rr_depth: expected a number >= 1, got {self.rr_depth}.")
+        self.camera_unwarp = bool(props.get("camera_unwarp", False))
+        self.discard_direct_light = bool(props.get("discard_direct_light", False))
+        self.temporal_filter = str(props.get("temporal_filter", ""))
+        self.gaussian_stddev = float(props.get("gaussian_stddev", 0.0))
+        self._facts: tuple[object, SceneFacts] | None = None
+
+    # ----------------------------------------------------------------------------------- preparation
+
+    def resolve(self, scene, sensor):
+        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film."""
+        if not (mi.variant() or "").startswith(("llvm", "cuda")):
+            raise VariantError(
+                f"transient rendering needs a JIT variant such as llvm_ad_rgb, the active one is {mi.variant()!r}; "
+                "call mitsuba.set_variant('llvm_ad_rgb') before loading the scene."
+            )
+        if isinstance(sensor, int):
+            sensors = scene.sensors()
+            if not 0 <= sensor < len(sensors):
+                raise SceneError(f"sensor index: the scene has {len(sensors)} sensors, got index {sensor}.")
+            sensor = sensors[sensor]
+        film = sensor.film()
+        if not hasattr(film, "transient_bands"):
+            raise SceneError(
+                f"transient integrators need a film of type transient_hdr_film, the sensor has {film.class_name()}; "
+                "change the film's type in the scene."
+            )
+        if film.exhaustive_scan:
+            raise SceneError(
+                "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing has "
+                "no laser positions. Remove exhaustive_scan."
+            )
+        if self.gaussian_stddev > 0:
+            film.gaussian_stddev = self.gaussian_stddev
+        if self.temporal_filter:
+            film.temporal_filter = self.temporal_filter
+        return sensor, film
+
+    def facts(self, scene) -> SceneFacts:
+        """What the loops may leave out for this scene; looked up once per scene object."""
+        if self._facts is None or self._facts[0] is not scene:
+            self._facts = (scene, scene_facts(scene))
+        return self._facts[1]
+
+    def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
+        """The launches of a job, and the total number of samples per pixel."""
+        sampler = sensor.sampler().clone()
+        if spp:
+            sampler.set_sample_count(spp)
+        spp = sampler.sample_count()
+        width = int(film.crop_size()[0])
+        result = []
+        for band, (first_row, rows, _) in enumerate(film.transient_bands()):
+            per_pass = max(1, min(spp, MAX_LANES // (width * rows)))
+            rows_per_pass = rows if width * rows * per_pass <= MAX_LANES else max(1, MAX_LANES // width)
+            for row in range(first_row, first_row + rows, rows_per_pass):
+                count = min(rows_per_pass, first_row + rows - row)
+                for done in range(0, spp, per_pass):
+                    result.append(Pass(band, row, count, min(per_pass, spp - done), 0))
+        for i, p in enumerate(result):
+            # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
+            p.seed = seed if len(result) == 1 else int(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0][0])
+        return result, spp
+
+    def start(self, scene, sensor, film, job: Pass, spp_total: int):
+        """Seeded sampler, primary rays (attached to the sensor), ray weight and pixel indices of one pass."""
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(job.spp)
+        if sampler.sample_count() != job.spp:
+            # Samplers such as multijitter only take some counts; the pass must know what it really draws.
+            job.spp = sampler.sample_count()
+        sampler.set_samples_per_wavefront(job.spp)
+        width = int(film.crop_size()[0])
+        lanes = width * job.rows * job.spp
+        sampler.seed(job.seed, lanes)
+        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp)
+        row = index // width
+        column = dr.fma(mi.UInt32(mi.Int32(-width)), row, index)
+        row += dr.opaque(mi.UInt32, job.first_row)
+
+        offset, weight = film.sample_offset(sampler.next_2d())
+        crop = mi.Point2f(film.crop_offset())
+        position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
+        # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
+        position = position / mi.ScalarVector2f(film.crop_size())
+        del crop
+        aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
+        time = sensor.shutter_open()
+        if sensor.shutter_open_time() > 0:
+            time += sampler.next_1d() * sensor.shutter_open_time()
+        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        with dr.resume_grad():
+            ray, ray_weight = sensor.sample_ray_differential(
+                time=time, sample1=wavelength, sample2=position, sample3=aperture
+            )
+        scale = mi.Float(1 / spp_total) if weight is None else weight / spp_total
+        return sampler, ray, ray_weight, scale, row, column
+
+    def lane_bases(self, film, job, row, column):
+        """Index of a pixel's first bin in its band, and of its steady value."""
+        width, channels = int(film.crop_size()[0]), film.channel_count()
+        first = film.transient_bands()[job.band][0]
+        pixel = dr.fma(row, width, column)
+        in_band = pixel - dr.opaque(mi.UInt32, first * width)
+        return in_band * film.entries_per_pixel(), pixel * channels
+
+    # ----------------------------------------------------------------------------------- entry points
+
+    def render(
+        self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None
+    ):
+        """Render steady ``(H, W, C)`` and transient ``(H, W, T, C)``.
+
+        ``progress_callback(fraction)`` is called after every pass. With ``develop=False`` nothing is returned and the
+        result stays in the film.
+        """
+        with dr.suspend_grad():
+            sensor, film = self.resolve(scene, sensor)
+            film.prepare(self.aov_names())
+            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            for i, job in enumerate(jobs):
+                self._render_pass(scene, sensor, film, job, total)
+                if evaluate or len(jobs) > 1:
+                    dr.eval(film.bands[job.band][2], film.steady, film.outside)
+                if progress_callback:
+                    dr.sync_thread()
+                    progress_callback((i + 1) / len(jobs))
+            return film.develop() if develop else None
+
+    def _render_pass(self, scene, sensor, film, job, total):
+        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        base, steady_base = self.lane_bases(film, job, row, column)
+        lane = Lane(film, film.bands[job.band][2], base, match)
+        L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
+        for c, value in enumerate(match.to_channels(L)):
+            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, value, steady_base + c)
+        dr.scatter_reduce(dr.ReduceOp.Add, film.outside, before, mi.UInt32(0))
+        dr.scatter_reduce(dr.ReduceOp.Add, film.outside, after, mi.UInt32(1))
+
+    def _first_opl(self, sensor, film, ray):
+        """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
+        length = mi.Float(0) if self.camera_unwarp else length_to_sensor_origin(sensor, ray)
+        return mi.Float64(length) - film.start_opl
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        """Accumulate the gradient of ``<grad_in, render()>`` into the attached parameters of the scene.
+
+        ``grad_in`` is the pair (steady ``(H, W, C)`` or None, transient or None). The transient adjoint is a TensorXf
+        ``(H, W, T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
+        a copy. ``params`` is not used: parameters are found through Dr.Jit's graph.
+
+        Raises GradientError when a path length can change and the temporal filter has no slope, or without a bound on
+        the depth.
+        """
+        with dr.suspend_grad():
+            sensor, film = self.resolve(scene, sensor)
+            facts = self.facts(scene).with_gradients(scene, sensor)
+            self._check_differentiable(film, facts)
+            g_steady, g_transient = grad_in
+            if g_steady is None and g_transient is None:
+                return
+            film.prepare(self.aov_names())
+            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            for job in jobs:
+                self._backward_pass(scene, sensor, film, job, total, g_steady, g_transient, facts)
+                dr.eval()
+
+    def _backward_pass(self, scene, sensor, film, job, total, g_steady, g_transient, facts):
+        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        channels = film.channel_count()
+        _, steady_base = self.lane_bases(film, job, row, column)
+        steady = [mi.Float(0)] * channels
+        if g_steady is not None:
+            steady = [dr.gather(mi.Float, g_steady.array, steady_base + c) for c in range(channels)]
+        transient, base = None, mi.UInt32(0)
+        if g_transient is not None:
+            flat, offset, strides = self._adjoint_layout(film, g_transient)
+            base = row * strides[0] + column * strides[1] + offset
+            transient = (flat, strides[2], strides[3])
+        lane = AdjointLane(film, transient, base, steady, match)
+        first = self._first_opl(sensor, film, ray)
+        a_ray = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
+        if facts.sensor_moves:
+            with dr.resume_grad():
+                objective = dr.dot(a_ray[0], ray.o) + dr.dot(a_ray[1], ray.d)
+                dr.backward_from(objective)
+
+    @staticmethod
+    def _adjoint_layout(film, g_transient):
+        if isinstance(g_transient, tuple):
+            return g_transient
+        expected = film.cube_shape()
+        if tuple(g_transient.shape) != expected:
+            raise GradientError(f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}.")
+        _, w, t, c = expected
+        return g_transient.array, 0, (w * t * c, t * c, c, 1)
+
+    def _check_differentiable(self, film, facts):
+        if facts.geometry and not film.filter.has_slope:
+            raise GradientError(
+                "A parameter that changes optical path lengths (geometry, light or sensor position, index of refraction) needs a "
+                f"temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to 'tent' or 'gaussian'."
+            )
+        if self.max_depth == 0xFFFFFFFF:
+            raise GradientError(
+                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a finite number, "
+                "for instance to where the remaining throughput no longer matters."
+            )
+
+    def to_string(self):
+        return (
+            f"{type(self).__name__}[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
+            f"  camera_unwarp = {self.camera_unwarp},\n  discard_direct_light = {self.discard_direct_light}\n]"
+        )

@@ -1,0 +1,167 @@
+"""``transient_path``: time-resolved path tracing over surfaces."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.integrators.base import TransientIntegrator
+from torchtransient.plugins.integrators.path_record import allocate, write_vertex
+
+
+def mis_weight(pdf_a, pdf_b):
+    """Power heuristic, zero where both densities are."""
+    a2 = dr.square(pdf_a)
+    w = a2 / dr.fma(pdf_b, pdf_b, a2)
+    return dr.select(dr.isfinite(w), w, 0)
+
+
+class TransientPath(TransientIntegrator):
+    r"""Time-resolved path tracer (:monosp:`transient_path`).
+
+    Next-event estimation with multiple importance sampling over surfaces; monochromatic, RGB and spectral variants. Parameters
+    as in :class:`TransientIntegrator`. The optical path length is counted from the sensor's origin, segment by segment between hit points, each times
+    the index of refraction it runs through; light from environment and directional emitters arrives as plane waves that leave the sphere around
+    the scene at t = 0 (see ``plugins/sampling/distant.py``).
+
+    Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries tangents along; both
+    include the time of flight. Visibility changes are not differentiated (no boundary term).
+
+    Not supported: participating media (they are passed through as if empty: the layer refuses such scenes), polarization.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.hide_emitters_ = bool(self.hide_emitters)
+
+    @dr.syntax
+    def trace(self, scene, sampler, ray, first_opl, lane, facts=None, record=False):
+        """Trace the paths of one pass.
+
+        Primal: every event is put on ``lane``; returns the sums (steady radiance, energy before, energy after the window).
+        With ``record=True`` nothing is written to the film: the path goes to thread-local memory and
+        ``(number of vertices, record)`` comes back.
+        """
+        primal = not record
+        facts = self.facts(scene) if facts is None else facts
+        ctx = mi.BSDFContext()
+
+        # ------------------------------------------------------------------- loop state
+        ray = mi.Ray3f(ray)                               # Current ray
+        depth = mi.UInt32(0)                              # Vertices so far
+        L = mi.UnpolarizedSpectrum(0)                     # Steady radiance
+        before, after = mi.Float(0), mi.Float(0)          # Energy outside the window
+        β = mi.UnpolarizedSpectrum(1)                     # Throughput before the current vertex
+        η = mi.Float(1)                                   # Index of the medium of the current ray
+        τ = mi.Float64(first_opl)                         # Optical path length minus start_opl
+        prev = dr.zeros(mi.Interaction3f)                 # Previous vertex
+        prev.p = ray.o
+        prev_pdf = mi.Float(1)
+        prev_delta = mi.Bool(True)
+        active = mi.Bool(self.max_depth > 0)
+        pi = scene.ray_intersect_preliminary(ray, coherent=True)
+        if dr.hint(self.hide_emitters_, mode="scalar"):
+            skip = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (a Dr.Jit comparison)
+            si_skip = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
+            pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
+        store = allocate(self.max_depth, facts) if record else {}
+
+        while dr.hint(active, max_iterations=self.max_depth, label="transient_path"):
+            active_next = mi.Bool(active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+            valid = si.is_valid()
+
+            # ---------------------------------------------------------- length of the segment
+            length = dr.norm(si.p - prev.p)
+            if dr.hint(facts.distant is not None, mode="scalar"):
+                length = dr.select(valid, length, facts.distant.length(prev.p, ray.d))
+            if dr.hint(self.camera_unwarp, mode="scalar"):
+                length = dr.select(depth == 0, 0, length)
+            τ_before = mi.Float64(τ)
+            τ += mi.Float64(length * η)
+
+            # ------------------------------------------------------------------ emission found
+            seen = mi.Bool(True)
+            if dr.hint(self.hide_emitters_, mode="scalar"):
+                seen &= (depth > 0) | valid
+            if dr.hint(self.discard_direct_light, mode="scalar"):
+                seen &= depth > 0
+            emitter = si.emitter(scene)
+            hit = (emitter != None) & seen  # noqa: E711 (a Dr.Jit comparison)
+            ds = mi.DirectionSample3f(scene, si=si, ref=prev)
+            em_pdf = scene.pdf_emitter_direction(prev, ds, hit & ~prev_delta)
+            mis = dr.select(hit, mis_weight(prev_pdf, em_pdf), 0)
+            if dr.hint(primal, mode="scalar"):
+                Le = β * mis * mi.unpolarized_spectrum(emitter.eval(si, hit))
+                L += Le
+                low, high = lane.put(τ, Le, hit)
+                before += low
+                after += high
+
+            # -------------------------------------------------------- emitter and BSDF sampling
+            active_next &= (depth + 1 < self.max_depth) & valid
+            bsdf = si.bsdf(ray)
+            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            u_em = sampler.next_2d()
+            u_lobe = sampler.next_1d()
+            u_dir = sampler.next_2d()
+            ds, em_weight = scene.sample_emitter_direction(si, u_em, False, active_em)
+            active_em &= ds.pdf != 0
+            wo = si.to_local(ds.d)
+            bsdf_val, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next)
+            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
+            Lr = β * mis_em * mi.unpolarized_spectrum(bsdf_val) * mi.unpolarized_spectrum(em_weight)
+            # Shadow rays only where they can matter.
+            active_em &= dr.max(dr.abs(Lr)) > 0
+            occluded = scene.ray_test(si.spawn_ray_to(ds.p), active_em)
+            active_em &= ~occluded
+            if dr.hint(primal, mode="scalar"):
+                Lr = dr.select(active_em, Lr, 0)
+                L += Lr
+                length_em = ds.dist
+                if dr.hint(facts.distant is not None, mode="scalar"):
+                    far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+                    length_em = dr.select(far, facts.distant.length(si.p, ds.d), length_em)
+                η_em = facts.index_towards(bsdf, si, wo, η)
+                low, high = lane.put(τ + mi.Float64(length_em * η_em), Lr, active_em)
+                before += low
+                after += high
+
+            # ----------------------------------------------------------------- to the next vertex
+            β_before, η_before = mi.UnpolarizedSpectrum(β), mi.Float(η)
+            ray_before, pi_before, is_delta = mi.Ray3f(ray), pi, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            β *= mi.unpolarized_spectrum(bsdf_weight)
+            η *= bs.eta
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            prev.p, prev.n, prev.time, prev.wavelengths = si.p, si.n, si.time, si.wavelengths
+            prev_pdf = bs.pdf
+            prev_delta = is_delta
+
+            # --------------------------------------------------------------------------- roulette
+            β_max = dr.max(β)
+            active_next &= β_max != 0
+            rr_prob = dr.minimum(β_max * dr.square(η), 0.95)
+            rr_active = depth >= self.rr_depth
+            rr = dr.select(rr_active, dr.rcp(rr_prob), 1)
+            β *= rr
+            rr_continue = sampler.next_1d() < rr_prob
+            active_next &= ~rr_active | rr_continue
+
+            if dr.hint(record, mode="scalar"):
+                write_vertex(
+                    store, depth, active, facts,
+                    ray_before, pi_before, β_before, τ_before, η_before, mis, rr, u_em, u_lobe, u_dir,
+                    active_em, is_delta, active_next,
+                )
+            pi = scene.ray_intersect_preliminary(ray, active=active_next)
+            depth += 1
+            active = active_next
+
+        if record:
+            result = (depth, store)
+        else:
+            result = (L, before, after)
+        return result
+
+
+mi.register_integrator("transient_path", lambda props: TransientPath(props))

@@ -1,0 +1,99 @@
+"""What a scene contains, looked up before tracing, so that the loops contain only what the scene calls for."""
+
+from __future__ import annotations
+
+import copy
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.sampling.distant import DistantReference, distant_reference
+
+
+class SceneFacts:
+    """Static choices of the kernels.
+
+    ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups. ``distant``: reference sphere of infinitely distant
+    emitters, None when there are none. ``refraction``: table of the indices of transmissive rough BSDFs, None when there are none. The remaining ones
+    describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``, ``emitter_shape_moves``, ``sensor_moves``,
+    ``index_moves``.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(self, delta: bool, instances: bool, distant: DistantReference | None, refraction=None):
+        self.delta = delta
+        self.instances = instances
+        self.distant = distant
+        self.refraction = refraction
+        self.geometry = False
+        self.light_moves = False
+        self.emitter_shape_moves = False
+        self.sensor_moves = False
+        self.index_moves = False
+
+    @property
+    def refracts(self) -> bool:
+        """Whether next-event estimation can pass an interface between two media."""
+        return self.refraction is not None
+
+    def index_towards(self, bsdf, si, wo, η):
+        """Index of the medium that ``wo`` points into, where ``η`` is the one that the path arrived in."""
+        if self.refraction is None:
+            return η
+        return η * self.refraction.relative_index(bsdf, si, wo)
+
+    @property
+    def ray_adjoint(self) -> bool:
+        """Whether the adjoint of the ray itself is handed from vertex to vertex."""
+        return self.geometry and (self.delta or self.sensor_moves)
+
+    def with_gradients(self, scene, sensor) -> SceneFacts:
+        """The same facts with the gradients that the scene's attached parameters ask for."""
+        light, sensor_moves, index = False, False, False
+        shapes = any(shape.parameters_grad_enabled() for shape in scene.shapes())
+        emitter_shape = any(s.is_emitter() and s.parameters_grad_enabled() for s in scene.shapes())
+        for emitter in scene.emitters():
+            if emitter.get_shape() is None:
+                light |= _attached(emitter, ("position", "to_world"))
+        sensor_moves = _attached(sensor, ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"))
+        for bsdf in unique_bsdfs(scene):
+            index |= _attached(bsdf, ("eta",))
+        facts = copy.copy(self)
+        facts.geometry = shapes or light or sensor_moves or index
+        facts.light_moves = light
+        facts.emitter_shape_moves = emitter_shape
+        facts.sensor_moves = sensor_moves
+        facts.index_moves = index
+        return facts
+
+
+def _attached(plugin, names) -> bool:
+    """Whether one of the parameters called ``names`` of a plugin or its children carries gradients."""
+    for key, value in mi.traverse(plugin):
+        if key.split(".")[-1] in names and dr.grad_enabled(value):
+            return True
+    return False
+
+
+def unique_bsdfs(scene) -> list:
+    """The BSDFs of all shapes, each once."""
+    seen, result = set(), []
+    for shape in scene.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None and bsdf.ptr not in seen:
+            seen.add(bsdf.ptr)
+            result.append(bsdf)
+    return result
+
+
+def scene_facts(scene) -> SceneFacts:
+    """Read the facts of a scene that do not depend on which gradients are asked for."""
+    delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in unique_bsdfs(scene))
+    infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
+    instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
+    return SceneFacts(
+        delta=delta or instances,
+        instances=instances,
+        distant=distant_reference(scene) if infinite else None,
+    )
