@@ -234,7 +234,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
-            facts = self.facts(scene).with_gradients(scene, sensor)
+            with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
+                facts = self.facts(scene).with_gradients(scene, sensor)
             self._check_differentiable(film, facts)
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:

@@ -7,13 +7,8 @@ import mitsuba as mi
 
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
-
-
-def mis_weight(pdf_a, pdf_b):
-    """Power heuristic, zero where both densities are."""
-    a2 = dr.square(pdf_a)
-    w = a2 / dr.fma(pdf_b, pdf_b, a2)
-    return dr.select(dr.isfinite(w), w, 0)
+from torchtransient.plugins.integrators.sweep import mis_weight
+from torchtransient.plugins.integrators.sweep import sweep as reverse_sweep
 
 
 class TransientPath(TransientIntegrator):
@@ -77,7 +72,6 @@ class TransientPath(TransientIntegrator):
                 length = dr.select(valid, length, facts.distant.length(prev.p, ray.d))
             if dr.hint(self.camera_unwarp, mode="scalar"):
                 length = dr.select(depth == 0, 0, length)
-            τ_before = mi.Float64(τ)
             τ += mi.Float64(length * η)
 
             # ------------------------------------------------------------------ emission found
@@ -111,8 +105,9 @@ class TransientPath(TransientIntegrator):
             bsdf_val, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next)
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
             Lr = β * mis_em * mi.unpolarized_spectrum(bsdf_val) * mi.unpolarized_spectrum(em_weight)
-            # Shadow rays only where they can matter.
-            active_em &= dr.max(dr.abs(Lr)) > 0
+            # Shadow rays only where they can matter; the derivative of a zero may matter.
+            if dr.hint(primal, mode="scalar"):
+                active_em &= dr.max(dr.abs(Lr)) > 0
             occluded = scene.ray_test(si.spawn_ray_to(ds.p), active_em)
             active_em &= ~occluded
             if dr.hint(primal, mode="scalar"):
@@ -139,7 +134,14 @@ class TransientPath(TransientIntegrator):
 
             # --------------------------------------------------------------------------- roulette
             β_max = dr.max(β)
-            active_next &= β_max != 0
+            if dr.hint(primal, mode="scalar"):
+                active_next &= β_max != 0
+            else:
+                # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black surface.
+                weight_max = dr.max(mi.unpolarized_spectrum(bsdf_weight))
+                first_black = (weight_max == 0) & (dr.max(β_before) > 0) & (bs.pdf > 0)
+                active_next &= (weight_max > 0) | first_black
+                β_max = dr.select(β_max == 0, 1, β_max)
             rr_prob = dr.minimum(β_max * dr.square(η), 0.95)
             rr_active = depth >= self.rr_depth
             rr = dr.select(rr_active, dr.rcp(rr_prob), 1)
@@ -150,7 +152,7 @@ class TransientPath(TransientIntegrator):
             if dr.hint(record, mode="scalar"):
                 write_vertex(
                     store, depth, active, facts,
-                    ray_before, pi_before, β_before, τ_before, η_before, mis, rr, u_em, u_lobe, u_dir,
+                    ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
                     active_em, is_delta, active_next,
                 )
             pi = scene.ray_intersect_preliminary(ray, active=active_next)
@@ -162,6 +164,11 @@ class TransientPath(TransientIntegrator):
         else:
             result = (L, before, after)
         return result
+
+    def sweep(self, scene, sampler, ray, first_opl, lane, facts):
+        """Record the paths of one pass and walk them backwards, see :mod:`.sweep`."""
+        count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
+        return reverse_sweep(self, scene, count, store, lane, facts, ray)
 
 
 mi.register_integrator("transient_path", lambda props: TransientPath(props))
