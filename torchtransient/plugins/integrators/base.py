@@ -119,6 +119,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """What the loops may leave out for this scene; looked up once per scene object."""
         if self._facts is None or self._facts[0] is not scene:
             self._facts = (scene, scene_facts(scene))
+        elif self._facts[1].refraction is not None:
+            self._facts[1].refraction.refresh()
         return self._facts[1]
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
