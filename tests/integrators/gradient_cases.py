@@ -181,7 +181,8 @@ CASES = [
     ),
     Case("wall_distance", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=2048, fd_spp=2048),
     Case("wall_tilt", "shape to_world", room, rotate("wall.to_world", (0, 1, 0)), 0.0, 0.1, spp=2048, fd_spp=2048),
-    Case("side_moves", "shape to_world", room, move("side.to_world", (0, 1, 0.3)), 0.0, 5e-3, spp=4096, fd_spp=8192),
+    Case("side_moves", "shape to_world, silhouette seen from a vertex", room, move("side.to_world", (-1, 0, 0.4)), 0.0, 2e-2, spp=4096, fd_spp=16384,
+         support="biased where silhouettes move"),
     Case(
         "mesh_vertices", "mesh vertex positions",
         lambda: room(wall2={"type": "cube", "to_world": transform().translate([0, 0, -0.5]).scale([2, 2, 0.52]),
@@ -206,6 +207,10 @@ CASES = [
     Case(
         "sphere_light_moves", "area light shape", lambda: room(light=area_light("sphere", 0.15), side_reflectance=0.2),
         move("light.to_world", (0.2, 0.1, 1)), 0.0, 5e-3, spp=4096, fd_spp=4096,
+    ),
+    Case(
+        "wall_near_sphere_light", "shape to_world", lambda: room(light=area_light("sphere", 0.15), side_reflectance=0.2),
+        move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=2048, fd_spp=2048,
     ),
     Case("sensor_translation", "sensor pose", lambda: room(sensor=camera(near=1.0)), move("sensor.to_world", (0.5, 0, 1)), 0.0, 2e-3,
          spp=2048, fd_spp=2048),

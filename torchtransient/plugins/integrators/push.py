@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.integrators.path_record import read_vertex
-from torchtransient.plugins.integrators.sweep import next_vertex, previous_is_delta
+from torchtransient.plugins.integrators.sweep import led_to, next_vertex
 from torchtransient.plugins.integrators.vertex import attach_ray, vertex_terms
 
 
@@ -25,7 +25,7 @@ def tangents(values):
     return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
 
 
-def vertex_tangents(scene, ctx, v, nxt, facts, live, t_ray, t_w):
+def vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, t_ray, t_w):
     """The terms of a vertex, detached, and their tangents in the order of ``values``.
 
     Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind, which
@@ -33,7 +33,7 @@ def vertex_tangents(scene, ctx, v, nxt, facts, live, t_ray, t_w):
     """
     with dr.resume_grad():
         ray, _, _, w = attach_ray(v, facts, t_ray, t_w)
-        x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live)
+        x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here)
         values = [x.Le, x.f, x.W]
         if facts.geometry:
             values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
@@ -76,11 +76,9 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
         follow = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
         si_next = follow.pi.compute_surface_interaction(follow.ray, mi.RayFlags.Minimal, v.goes_on)
         nxt = next_vertex(store, k, si_next.p, si_next.n, follow.ray.d, si_next.is_valid() & v.goes_on, v, facts, ray0)
-        x, t = vertex_tangents(scene, ctx, v, nxt, facts, live, (t_o, t_d), t_w)
+        led_here = led_to(store, k, live, facts)
+        x, t = vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, (t_o, t_d), t_w)
         Le, f, W = x.Le, x.f, x.W
-        own = mi.Bool(True)
-        if dr.hint(facts.emitter_shape_moves, mode="scalar"):
-            own = (k == 0) | previous_is_delta(store, k, live)
         dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), x.length_em * x.index_em
         if dr.hint(facts.geometry, mode="scalar"):
             counted = mi.Float(1)
@@ -88,10 +86,10 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
                 counted = dr.select(k == 0, 0, counted)
             dτ_v += counted * (v.η * t[3] + dη * x.seg)
             dτ_em = dτ_v + v.η * t[4] + dη * length_em
-        d_Le = dr.select(own, dβ * Le + v.β * t[0], 0)
+        d_Le = dβ * Le + v.β * t[0]
         d_f = dβ * f + v.β * t[1]
         dL += dr.select(live, d_Le + d_f, 0)
-        lane.put_slope(v.τ, d_Le, dr.select(own, v.β * Le, 0) * dτ_v, x.hit)
+        lane.put_slope(v.τ, d_Le, v.β * Le * dτ_v, x.hit)
         lane.put_slope(v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
             E = x.E
