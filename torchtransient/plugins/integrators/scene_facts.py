@@ -7,6 +7,7 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable
 from torchtransient.plugins.sampling.distant import DistantReference
 
 
@@ -96,4 +97,5 @@ def scene_facts(scene, reference: DistantReference) -> SceneFacts:
         delta=delta or instances,
         instances=instances,
         distant=reference if infinite else None,
+        refraction=RefractionTable.of(scene),
     )
