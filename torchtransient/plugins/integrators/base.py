@@ -9,7 +9,9 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
+from torchtransient.plugins.integrators.push import tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
+from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32 bits.
@@ -42,6 +44,12 @@ class Lane:
         before, after = self.film.put(self.cube, self.base, opl, channels, active)
         energy = mean_of(channels)
         return dr.select(active & before, energy, 0), dr.select(active & after, energy, 0)
+
+
+    def put_slope(self, opl, d_value, value_d_opl, active):
+        """Forward mode: write ``k df + f k' dtau``."""
+        d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
+        self.film.put_slope(self.cube, self.base, opl, d, slope, active)
 
 
 class AdjointLane:
@@ -82,7 +90,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         self.discard_direct_light = bool(props.get("discard_direct_light", False))
         self.temporal_filter = str(props.get("temporal_filter", ""))
         self.gaussian_stddev = float(props.get("gaussian_stddev", 0.0))
-        self._facts: tuple[object, SceneFacts] | None = None
+        self._distant = None
 
     # ----------------------------------------------------------------------------------- preparation
 
@@ -116,12 +124,15 @@ class TransientIntegrator(mi.CppADIntegrator):
         return sensor, film
 
     def facts(self, scene) -> SceneFacts:
-        """What the loops may leave out for this scene; looked up once per scene object."""
-        if self._facts is None or self._facts[0] is not scene:
-            self._facts = (scene, scene_facts(scene))
-        elif self._facts[1].refraction is not None:
-            self._facts[1].refraction.refresh()
-        return self._facts[1]
+        """What the loops may leave out for this scene.
+
+        The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the clock. The scene
+        itself is not kept, since it owns the integrator and would never be freed.
+        """
+        key = (scene.ptr, len(scene.shapes()))
+        if self._distant is None or self._distant[0] != key:
+            self._distant = (key, distant_reference(scene))
+        return scene_facts(scene, self._distant[1])
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the total number of samples per pixel."""
@@ -221,7 +232,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _first_opl(self, sensor, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
-        length = mi.Float(0) if self.camera_unwarp else length_to_sensor_origin(sensor, ray)
+        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(sensor, ray))
         return mi.Float64(length) - film.start_opl
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -263,11 +274,47 @@ class TransientIntegrator(mi.CppADIntegrator):
             transient = (flat, strides[2], strides[3])
         lane = AdjointLane(film, transient, base, steady, match)
         first = self._first_opl(sensor, film, ray)
-        a_ray = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
+        a_o, a_d, a_first = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
             with dr.resume_grad():
-                objective = dr.dot(a_ray[0], ray.o) + dr.dot(a_ray[1], ray.d)
+                objective = dr.dot(a_o, ray.o) + dr.dot(a_d, ray.d)
+                if not self.camera_unwarp:
+                    objective += a_first * length_to_sensor_origin(sensor, ray)
                 dr.backward_from(objective)
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
+
+        One pass over the samples for one tangent. ``params`` is not used. Errors as in :meth:`render_backward`.
+        """
+        with dr.suspend_grad():
+            sensor, film = self.resolve(scene, sensor)
+            with dr.resume_grad():
+                facts = self.facts(scene).with_gradients(scene, sensor)
+            self._check_differentiable(film, facts)
+            film.prepare(self.aov_names())
+            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            for job in jobs:
+                self._forward_pass(scene, sensor, film, job, total, facts)
+                dr.eval(film.bands[job.band][2], film.steady)
+            return film.develop()
+
+    def _forward_pass(self, scene, sensor, film, job, total, facts):
+        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        base, steady_base = self.lane_bases(film, job, row, column)
+        lane = Lane(film, film.bands[job.band][2], base, match)
+        first = self._first_opl(sensor, film, ray)
+        t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
+        if facts.sensor_moves:
+            with dr.resume_grad():
+                length = length_to_sensor_origin(sensor, ray)
+                t_o, t_d, t_first = tangents([ray.o, ray.d, length])
+                t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
+                d_first = mi.Float(0) if self.camera_unwarp else t_first
+        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first)
+        for c, value in enumerate(match.to_channels(dL)):
+            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, value, steady_base + c)
 
     @staticmethod
     def _adjoint_layout(film, g_transient):

@@ -7,8 +7,9 @@ import mitsuba as mi
 
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
-from torchtransient.plugins.integrators.sweep import mis_weight
+from torchtransient.plugins.integrators.push import push as forward_push
 from torchtransient.plugins.integrators.sweep import sweep as reverse_sweep
+from torchtransient.plugins.integrators.vertex import mis_weight
 
 
 class TransientPath(TransientIntegrator):
@@ -169,6 +170,11 @@ class TransientPath(TransientIntegrator):
         """Record the paths of one pass and walk them backwards, see :mod:`.sweep`."""
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
         return reverse_sweep(self, scene, count, store, lane, facts, ray)
+
+    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
+        """Record the paths of one pass and carry tangents along them, see :mod:`.push`."""
+        count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
+        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first)
 
 
 mi.register_integrator("transient_path", lambda props: TransientPath(props))

@@ -16,4 +16,4 @@ def length_to_sensor_origin(sensor, ray):
     if near is None:
         return mi.Float(0)
     axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
-    return near() / dr.dot(dr.normalize(dr.detach(axis)), dr.detach(ray.d))
+    return near() / dr.dot(dr.normalize(axis), ray.d)

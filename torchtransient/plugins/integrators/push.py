@@ -1,0 +1,94 @@
+"""Forward mode: walk the recorded path once more and carry its tangents along.
+
+``d_beta`` and ``d_tau`` are the derivatives of throughput and optical path length before the current vertex; every event splats
+``k df + f k' dtau``. The rules at a vertex are those of the reverse sweep, so both modes agree to rounding for one seed.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.integrators.path_record import read_vertex
+from torchtransient.plugins.integrators.sweep import next_vertex, previous_is_delta
+from torchtransient.plugins.integrators.vertex import attach_ray, vertex_terms
+
+
+def tangents(values):
+    """Tangents of attached values; zero for those that carry none."""
+    attached = [v for v in values if dr.grad_enabled(v)]
+    if not attached:
+        return [dr.zeros(type(v)) for v in values]
+    pushed = dr.forward_to(*attached)
+    pushed = list(pushed) if isinstance(pushed, (tuple, list)) and len(attached) > 1 else [pushed]
+    return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
+
+
+@dr.syntax
+def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
+    """Write the derivative of the transient to ``lane`` and return that of the steady radiance.
+
+    ``t_o, t_d, d_first`` are the tangents of the primary ray and of the length before it.
+    """
+    ctx = mi.BSDFContext()
+    k = mi.UInt32(0)
+    live = k < count
+    dL = mi.UnpolarizedSpectrum(0)
+    dβ = mi.UnpolarizedSpectrum(0)
+    dτ = mi.Float(d_first)
+    dη = mi.Float(0)
+    t_o, t_d, t_w = mi.Vector3f(t_o), mi.Vector3f(t_d), mi.Vector3f(t_d)
+    while dr.hint(live, max_iterations=integrator.max_depth, label="transient_path forward mode"):
+        v = read_vertex(store, k, live, ray0.time, ray0.wavelengths)
+        follow = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
+        si_next = follow.pi.compute_surface_interaction(follow.ray, mi.RayFlags.Minimal, v.goes_on)
+        nxt = next_vertex(store, k, si_next.p, si_next.n, follow.ray.d, si_next.is_valid() & v.goes_on, v, facts, ray0)
+        with dr.resume_grad():
+            ray, o, d, w = attach_ray(v, facts, (t_o, t_d), t_w)
+            x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live)
+            values = [x.Le, x.f, x.W]
+            if dr.hint(facts.geometry, mode="scalar"):
+                values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
+                if dr.hint(facts.delta, mode="scalar"):
+                    values += [x.p_out, x.d_out]
+                if dr.hint(facts.emitter_shape_moves, mode="scalar"):
+                    values += [x.E, x.length_E]
+            t = tangents(values)
+        Le, f, W = dr.detach(x.Le), dr.detach(x.f), dr.detach(x.W)
+        own = mi.Bool(True)
+        if dr.hint(facts.emitter_shape_moves, mode="scalar"):
+            own = (k == 0) | previous_is_delta(store, k, live)
+        dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), dr.detach(x.length_em) * dr.detach(x.index_em)
+        if dr.hint(facts.geometry, mode="scalar"):
+            counted = mi.Float(1)
+            if dr.hint(integrator.camera_unwarp, mode="scalar"):
+                counted = dr.select(k == 0, 0, counted)
+            dτ_v += counted * (v.η * t[3] + dη * dr.detach(x.seg))
+            dτ_em = dτ_v + v.η * t[4] + dη * length_em
+        d_Le = dr.select(own, dβ * Le + v.β * t[0], 0)
+        d_f = dβ * f + v.β * t[1]
+        dL += dr.select(live, d_Le + d_f, 0)
+        lane.put_slope(v.τ, d_Le, dr.select(own, v.β * Le, 0) * dτ_v, x.hit)
+        lane.put_slope(v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
+        if dr.hint(facts.emitter_shape_moves, mode="scalar"):
+            E = dr.detach(x.E)
+            d_E = dβ * E + v.β * t[-2]
+            dL += dr.select(live, d_E, 0)
+            dτ_E = dτ_v + dη * dr.detach(x.step) * dr.detach(x.length_E) + follow.η * t[-1]
+            lane.put_slope(follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
+
+        # ------------------------------------------------------------------- to the next vertex
+        dβ = dβ * W + v.β * t[2]
+        dτ = dτ_v
+        if dr.hint(facts.geometry, mode="scalar"):
+            dτ += follow.η * t[5]
+            dη = dη * dr.detach(x.step) + v.η * t[7]
+            t_o, t_d = mi.Vector3f(0), mi.Vector3f(0)
+            t_w = dr.select(x.ahead, t[6], 0)
+            if dr.hint(facts.delta, mode="scalar"):
+                t_o = dr.select(x.mirrored, mi.Vector3f(t[8]), 0)
+                t_d = dr.select(x.mirrored, mi.Vector3f(t[9]), 0)
+                t_w = dr.select(x.mirrored, t_d, t_w)
+        k += 1
+        live = k < count
+    return dL

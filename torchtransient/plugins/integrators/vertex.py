@@ -1,0 +1,178 @@
+"""The attached physics of one vertex, shared by reverse and forward mode.
+
+:func:`vertex_terms` re-evaluates what happens at a recorded vertex with derivatives: emission, next-event estimation, scattering and the
+lengths of the segments around it. The sampled path is held fixed in this sense: a vertex slides along the ray that found it when its surface
+moves, and against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on
+light sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray, that
+ray itself is attached.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+class Terms:
+    """Attached values at one vertex; a plain object that only lives within one iteration."""
+
+
+def mis_weight(pdf_a, pdf_b):
+    """Power heuristic, zero where both densities are."""
+    a2 = dr.square(pdf_a)
+    w = a2 / dr.fma(pdf_b, pdf_b, a2)
+    return dr.select(dr.isfinite(w), w, 0)
+
+
+def solid_angle_over_area(p, q, n, active):
+    """``|cos| / distance^2``, the solid angle at ``p`` of an area at ``q`` with normal ``n``; 1 where inactive."""
+    # The inactive side must not see a zero vector: its derivative would be NaN and poison the sum.
+    v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
+    d2 = dr.squared_norm(v)
+    return dr.select(active, dr.abs_dot(n, v) * dr.rsqrt(d2) / d2, 1)
+
+
+def direction_to(p, q, active, otherwise):
+    """Value of ``otherwise`` with the derivative of the direction from ``p`` to ``q`` where active."""
+    v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
+    return dr.replace_grad(otherwise, dr.select(active, dr.normalize(v), otherwise))
+
+
+def length_to(facts, p, q, valid, d):
+    """Length from ``p`` to the point ``q``, or to the distant light in direction ``d`` where ``q`` is not valid."""
+    length = dr.norm(dr.select(valid, q - p, mi.Vector3f(0, 0, 1)))
+    if facts.distant is None:
+        return dr.select(valid, length, 0)
+    return dr.select(valid, length, facts.distant.length(p, d))
+
+
+def material_point(pi, ray, active):
+    """Interaction that follows its shape, and the area element there (up to a constant)."""
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    return si, dr.norm(dr.cross(si.dp_du, si.dp_dv))
+
+
+def attach_ray(v, facts, t_ray=None, t_w=None):
+    """The ray that found a vertex, with the attachments that the facts call for: (ray, o, d, direction for wi)."""
+    o, d, w = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d), mi.Vector3f(v.ray.d)
+    if facts.geometry:
+        dr.enable_grad(w)
+        if t_w is not None:
+            dr.set_grad(w, t_w)
+        if facts.ray_adjoint:
+            dr.enable_grad(o, d)
+            if t_ray is not None:
+                dr.set_grad(o, t_ray[0])
+                dr.set_grad(d, t_ray[1])
+    ray = mi.Ray3f(v.ray)
+    ray.o, ray.d = o, d
+    return ray, o, d, w
+
+
+def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
+    """Next-event estimation: ``terms.f`` (per unit throughput), ``terms.length_em`` and index along the shadow ray."""
+    with dr.suspend_grad():
+        ds, weight = scene.sample_emitter_direction(dr.detach(si), v.u_em, False, v.lit)
+        weight = mi.unpolarized_spectrum(weight)
+        flags = ds.emitter.flags()
+        far = v.lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
+        surface = v.lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
+        inv_pdf = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
+    p, n = mi.Point3f(ds.p), mi.Normal3f(ds.n)
+    area = mi.Float(1)
+    if facts.light_moves:
+        at_point = v.lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+        moving, _ = scene.sample_emitter_direction(si, v.u_em, False, at_point)
+        p = dr.replace_grad(p, dr.select(at_point, moving.p, dr.detach(moving.p)))
+    if facts.emitter_shape_moves:
+        ray_em = dr.detach(si).spawn_ray(ds.d)
+        pi_em = scene.ray_intersect_preliminary(ray_em, active=surface)
+        si_em, area = material_point(pi_em, ray_em, surface & pi_em.is_valid())
+        on_light = surface & pi_em.is_valid() & (dr.detach(si_em).emitter(scene) == ds.emitter)
+        p = dr.replace_grad(p, dr.select(on_light, si_em.p, ds.p))
+        n = dr.replace_grad(n, dr.select(on_light, si_em.n, ds.n))
+        area = dr.relative_grad(dr.select(on_light, area, 1))
+    diff = dr.copy(ds)
+    d = mi.Vector3f(ds.d)
+    if facts.geometry:
+        near = v.lit & ~far
+        d = direction_to(si.p, p, near, d)
+        diff.p, diff.n, diff.d = p, n, d
+        diff.dist = dr.replace_grad(ds.dist, dr.norm(dr.select(near, p - si.p, mi.Vector3f(0, 0, 1))))
+    value = mi.unpolarized_spectrum(scene.eval_emitter_direction(si, diff, v.lit)) * inv_pdf
+    if facts.geometry:
+        value *= dr.relative_grad(solid_angle_over_area(si.p, p, n, surface)) * area
+    em_weight = dr.replace_grad(weight, value)
+
+    wo = si.to_local(d)
+    val, pdf = bsdf.eval_pdf(ctx, si, wo, v.lit)
+    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+    terms.f = dr.select(v.lit, mi.unpolarized_spectrum(val) * em_weight * mis, 0)
+    terms.length_em = length_to(facts, si.p, p, v.lit & ~far, d)
+    terms.index_em = facts.index_towards(bsdf, si, wo, mi.Float(1))
+
+
+def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live):
+    """Evaluate vertex ``v`` (see :class:`~.path_record.Vertex`) with derivatives.
+
+    ``nxt`` is the next vertex: ``p, n, d, valid`` detached and, where emitter shapes move, its ``vertex``. Returns
+    :class:`Terms` with ``si, Le, f, length_em, index_em, W, seg, seg_out, out, step, onward, mirrored`` and, for delta lobes, ``p_out, d_out``.
+    """
+    terms = Terms()
+    terms.onward = onward = v.goes_on & ~v.is_delta
+    terms.mirrored = v.goes_on & v.is_delta
+    si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, live)
+    sid = dr.detach(si)
+    terms.si, terms.sid, terms.valid = si, sid, sid.is_valid()
+    if facts.geometry:
+        si.wi = dr.select(terms.valid, si.to_local(-w), -w)
+    bsdf = sid.bsdf(v.ray)
+
+    hit = live & (v.mis > 0)
+    terms.hit = hit
+    terms.Le = dr.select(hit, v.mis * mi.unpolarized_spectrum(sid.emitter(scene).eval(si, hit)), 0)
+    emitter_terms(terms, scene, ctx, si, bsdf, v, facts)
+
+    ahead = onward & nxt.valid
+    out, J = mi.Vector3f(nxt.d), mi.Float(1)
+    if facts.geometry:
+        out = direction_to(si.p, nxt.p, ahead, out)
+        J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead))
+    wo = si.to_local(out)
+    val, pdf = bsdf.eval_pdf(ctx, si, wo, onward)
+    inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
+    terms.W = dr.select(onward, mi.unpolarized_spectrum(val) * (inv_pdf * J), 0)
+    terms.out, terms.ahead = out, ahead
+    terms.step = dr.select(onward, facts.index_towards(bsdf, si, wo, mi.Float(1)), 1)
+    if facts.delta:
+        bs, weight = bsdf.sample(ctx, si, v.u_lobe, v.u_dir, terms.mirrored)
+        # The weight has the lobe's probability divided out; its derivative comes back with that of the probability.
+        weight = mi.unpolarized_spectrum(weight) * (dr.relative_grad(bs.pdf) * v.rr)
+        terms.W = dr.select(terms.mirrored, weight, terms.W)
+        terms.p_out, terms.d_out = si.p, si.to_world(bs.wo)
+        terms.step = dr.select(terms.mirrored, bs.eta, terms.step)
+    if facts.geometry:
+        terms.seg = length_to(facts, ray.o, si.p, terms.valid, ray.d)
+        terms.seg_out = dr.select(onward, length_to(facts, si.p, nxt.p, nxt.valid, nxt.d), 0)
+    terms.E = None
+    if facts.emitter_shape_moves:
+        emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts)
+    return terms
+
+
+def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
+    """Emission found by BSDF sampling on a shape that moves: ``terms.E`` (per unit throughput), ``terms.length_E``.
+
+    The light's point is a material point here, as it is for next-event estimation: both strategies must move their samples
+    alike, or the weights between them would no longer sum to one under the motion.
+    """
+    lit = terms.ahead & (nxt.vertex.mis > 0)
+    si_e, area = material_point(nxt.vertex.pi, nxt.vertex.ray, lit)
+    out = direction_to(si.p, si_e.p, lit, mi.Vector3f(nxt.d))
+    si_e.wi = dr.select(lit, si_e.to_local(-out), dr.detach(si_e.wi))
+    J = dr.relative_grad(solid_angle_over_area(si.p, si_e.p, si_e.n, lit)) * dr.relative_grad(dr.select(lit, area, 1))
+    val, _ = bsdf.eval_pdf(ctx, si, si.to_local(out), lit)
+    Le = mi.unpolarized_spectrum(dr.detach(si_e).emitter(scene).eval(si_e, lit))
+    terms.E = dr.select(lit, mi.unpolarized_spectrum(val) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
+    terms.length_E = dr.norm(dr.select(lit, si_e.p - si.p, mi.Vector3f(0, 0, 1)))
+    terms.lit_ahead = lit
