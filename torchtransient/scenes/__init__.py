@@ -1,0 +1,10 @@
+"""Scene dictionaries in metres. They need no Mitsuba variant: transforms are (4, 4) arrays, plugins are named by string."""
+
+from torchtransient.scenes.cavities import furnace as furnace
+from torchtransient.scenes.cavities import integrating_sphere as integrating_sphere
+from torchtransient.scenes.cavities import parallel_plates as parallel_plates
+from torchtransient.scenes.cornell import cornell_box as cornell_box
+from torchtransient.scenes.walls import etalon_slab as etalon_slab
+from torchtransient.scenes.walls import glass_slab_before_wall as glass_slab_before_wall
+from torchtransient.scenes.walls import light_over_plane as light_over_plane
+from torchtransient.scenes.walls import moving_wall as moving_wall

@@ -1,0 +1,1 @@
+"""Helpers for testing renderers and gradients: closed forms, finite differences, statistics. Numpy only."""

@@ -11,6 +11,7 @@ from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
 from torchtransient.plugins.integrators.push import tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
+from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32 bits.
@@ -89,7 +90,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         self.discard_direct_light = bool(props.get("discard_direct_light", False))
         self.temporal_filter = str(props.get("temporal_filter", ""))
         self.gaussian_stddev = float(props.get("gaussian_stddev", 0.0))
-        self._facts: tuple[object, SceneFacts] | None = None
+        self._distant = None
 
     # ----------------------------------------------------------------------------------- preparation
 
@@ -123,10 +124,15 @@ class TransientIntegrator(mi.CppADIntegrator):
         return sensor, film
 
     def facts(self, scene) -> SceneFacts:
-        """What the loops may leave out for this scene; looked up once per scene object."""
-        if self._facts is None or self._facts[0] is not scene:
-            self._facts = (scene, scene_facts(scene))
-        return self._facts[1]
+        """What the loops may leave out for this scene.
+
+        The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the clock. The scene
+        itself is not kept, since it owns the integrator and would never be freed.
+        """
+        key = (scene.ptr, len(scene.shapes()))
+        if self._distant is None or self._distant[0] != key:
+            self._distant = (key, distant_reference(scene))
+        return scene_facts(scene, self._distant[1])
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the total number of samples per pixel."""

@@ -7,7 +7,8 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.sampling.distant import DistantReference, distant_reference
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable
+from torchtransient.plugins.sampling.distant import DistantReference
 
 
 class SceneFacts:
@@ -87,7 +88,7 @@ def unique_bsdfs(scene) -> list:
     return result
 
 
-def scene_facts(scene) -> SceneFacts:
+def scene_facts(scene, reference: DistantReference) -> SceneFacts:
     """Read the facts of a scene that do not depend on which gradients are asked for."""
     delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in unique_bsdfs(scene))
     infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
@@ -95,5 +96,6 @@ def scene_facts(scene) -> SceneFacts:
     return SceneFacts(
         delta=delta or instances,
         instances=instances,
-        distant=distant_reference(scene) if infinite else None,
+        distant=reference if infinite else None,
+        refraction=RefractionTable.of(scene),
     )

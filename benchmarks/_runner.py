@@ -1,0 +1,160 @@
+"""What all benchmarks share: worker processes, interleaved timing, medians with quartiles, JSON and tables.
+
+The rules: every side runs in one call of one script, A B A B; warm-up before the first timed run; the timed region ends
+after `dr.eval` and `dr.sync_thread`; seeds are pinned; medians and interquartile ranges are reported, never a best run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+
+
+def arguments(description: str | None, *, peer: bool = True) -> argparse.ArgumentParser:
+    """The options that every benchmark has."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--quick", action="store_true", help="tiny sizes: checks that the script runs, measures nothing"
+    )
+    parser.add_argument("--repeats", type=int, default=None, help="timed runs of every case")
+    parser.add_argument("--json", type=Path, default=None, help="write the report to this file")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    if peer:
+        parser.add_argument("--peer-python", default=None, help="python of an environment with mitransient 1.3.1")
+    return parser
+
+
+class Worker:
+    """A `_worker.py` process. `python` runs it; the environment is inherited, but for PYTHONPATH in foreign ones."""
+
+    def __init__(self, library: str, variant: str, python: str | None = None) -> None:
+        environment = dict(os.environ)
+        if library != "torchtransient":
+            environment.pop("PYTHONPATH", None)
+        self.process = subprocess.Popen(
+            [python or sys.executable, str(HERE / "_worker.py"), library, variant],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        self.versions = self._answer()
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """Send one request and wait for its answer; RuntimeError with the worker's message when it failed."""
+        if self.process.stdin is None:
+            raise RuntimeError("the worker has no input")
+        self.process.stdin.write(json.dumps(request) + "\n")
+        self.process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        line = self.process.stdout.readline() if self.process.stdout else ""
+        if not line:
+            raise RuntimeError(f"the worker ended with exit code {self.process.wait()}; its messages are above")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise RuntimeError(f"the worker failed: {answer['error']}")
+        return answer
+
+    def close(self) -> None:
+        """Let the process end."""
+        if self.process.stdin:
+            self.process.stdin.close()
+        self.process.wait(timeout=60)
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def encoded(node: Any) -> Any:
+    """A scene dictionary of `torchtransient.scenes` as JSON: arrays become {"matrix": ...}."""
+    if isinstance(node, np.ndarray):
+        return {"matrix": node.tolist()}
+    if isinstance(node, dict):
+        return {key: encoded(value) for key, value in node.items()}
+    return node
+
+
+def steady(scene: dict[str, Any], integrator: str) -> dict[str, Any]:
+    """The same scene for one of Mitsuba's own integrators and its `hdrfilm`."""
+    sensor = dict(scene["sensor"])
+    film = {key: sensor["film"][key] for key in ("width", "height", "rfilter")}
+    sensor["film"] = {"type": "hdrfilm", "pixel_format": "rgb", "component_format": "float32", **film}
+    return {**scene, "sensor": sensor, "integrator": {**scene["integrator"], "type": integrator}}
+
+
+def interleave(cases: Mapping[str, Callable[[int], float]], repeats: int, warm_up: int = 2) -> dict[str, list[float]]:
+    """Seconds of every case, `repeats` each, taking turns; `cases[name](seed)` returns the seconds of one run."""
+    for seed in range(warm_up):
+        for run in cases.values():
+            run(seed)
+    seconds: dict[str, list[float]] = {name: [] for name in cases}
+    for seed in range(repeats):
+        for name, run in cases.items():
+            seconds[name].append(run(100 + seed))
+            print(f"  {name}: {seconds[name][-1]:.4f} s", file=sys.stderr)
+    return seconds
+
+
+def summary(values: Sequence[float]) -> dict[str, Any]:
+    """Median, quartiles and the values themselves."""
+    low, high = np.percentile(values, [25, 75])
+    return {"median": statistics.median(values), "q25": float(low), "q75": float(high), "runs": list(values)}
+
+
+def ratio(seconds: Mapping[str, Sequence[float]], name: str, anchor: str, bar: float | None = None) -> dict[str, Any]:
+    """Median over the rounds of name / anchor, with quartiles; `bar` is what it should not exceed."""
+    rounds = [a / b for a, b in zip(seconds[name], seconds[anchor], strict=True)]
+    result = {"of": name, "to": anchor, **summary(rounds)}
+    if bar is not None:
+        result.update(bar=bar, within=bool(result["median"] <= bar))
+    return result
+
+
+def environment(variant: str | None = None) -> dict[str, Any]:
+    """Versions and the size of the machine, without its name."""
+    packages: dict[str, str | None] = {}
+    for name in ("torch", "mitsuba", "drjit", "numpy", "torchtransient"):
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            packages[name] = None
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    own = {"python": platform.python_version(), "machine": platform.machine(), "cpus": cpus, "variant": variant}
+    return {**own, **packages}
+
+
+def report(name: str, settings: Mapping[str, Any], results: Mapping[str, Any], path: Path | None) -> None:
+    """Print `results` as a table and write everything as JSON if a path was given."""
+    print(f"\n{name}")
+    for key, value in settings.items():
+        print(f"  {key} = {value}")
+    for case, row in results.get("cases", {}).items():
+        print(f"  {case:<44} {row['median']:>10.4f} s   [{row['q25']:.4f}, {row['q75']:.4f}]")
+    for row in results.get("ratios", []):
+        bar = "" if "bar" not in row else f"   bar {row['bar']:.2f}: {'reached' if row['within'] else 'MISSED'}"
+        print(f"  {row['of']} / {row['to']}: {row['median']:.3f}   [{row['q25']:.3f}, {row['q75']:.3f}]{bar}")
+    for key, value in results.items():
+        if key not in ("cases", "ratios"):
+            print(f"  {key}: {value}")
+    if path is not None:
+        data = {"benchmark": name, "settings": dict(settings), **results}
+        path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+        print(f"  written to {path}")

@@ -1,0 +1,155 @@
+"""Renders on demand in a process of its own; driven by `_runner.Worker` through one JSON object per line.
+
+Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only the named
+library, so that each side of a comparison runs in its own environment. Requests:
+  {"do": "load", "name", "scene", "gradients": [keys], "temporal_gradients": [keys]}   -> {"ok": true}
+  {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
+  {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
+  {"do": "memory"}                                                                     -> {"peak_bytes"}
+A scene is a Mitsuba dictionary with {"matrix": 4x4} for transforms, or {"xml": path, "parameters": {...}}.
+"""
+
+import json
+import os
+import resource
+import sys
+import time
+import traceback
+
+# Answers go to the original stdout; whatever a library prints goes to stderr.
+ANSWERS = os.fdopen(os.dup(1), "w", buffering=1)
+os.dup2(2, 1)
+
+if sys.argv[1] == "torchtransient":
+    import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported)
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def start(library, variant):
+    """Set the variant and register the library's plugins."""
+    mi.set_variant(variant)
+    if library == "torchtransient":
+        from torchtransient import plugins
+
+        plugins.sync()
+    elif library == "mitransient":
+        import mitransient  # noqa: F401
+
+
+def decoded(node):
+    """Matrices back to Mitsuba transforms."""
+    if isinstance(node, dict):
+        if set(node) == {"matrix"}:
+            return mi.ScalarTransform4f(np.array(node["matrix"]))
+        return {key: decoded(value) for key, value in node.items()}
+    return node
+
+
+class Job:
+    """A loaded scene and the parameters whose gradients are asked for."""
+
+    def __init__(self, request):
+        scene = request["scene"]
+        if "xml" in scene:
+            parameters = {key: str(value) for key, value in scene.get("parameters", {}).items()}
+            self.scene = mi.load_file(scene["xml"], **parameters)
+        else:
+            self.scene = mi.load_dict(decoded(scene))
+        self.integrator = self.scene.integrator()
+        self.gradients = request.get("gradients", [])
+        self.temporal = request.get("temporal_gradients", [])
+        self.adjoint = None
+        self.parameters = mi.traverse(self.scene) if self.gradients or self.temporal else None
+        self.initial = {}
+        for key in self.gradients + self.temporal:
+            value = self.parameters[key]
+            self.initial[key] = type(value)(value)
+        dr.eval(self.initial)
+
+    def render(self, spp, seed):
+        """Seconds of one render, everything evaluated; the mean of the result as a check."""
+        begin = time.perf_counter()
+        images = self.integrator.render(self.scene, sensor=0, seed=seed, spp=spp)
+        dr.eval(images)
+        dr.sync_thread()
+        seconds = time.perf_counter() - begin
+        image = images[0] if isinstance(images, tuple) else images
+        return {"seconds": seconds, "mean": float(np.array(image, dtype=np.float64).mean())}
+
+    def backward(self, spp, seed):
+        """Seconds of attaching the parameters, rendering, and the backward pass down to the leaves."""
+        begin = time.perf_counter()
+        leaves = self.attach()
+        images = self.integrator.render(self.scene, sensor=0, seed=seed, spp=spp)
+        if self.adjoint is None:
+            self.adjoint = tuple(pattern(image) for image in images)
+        self.integrator.render_backward(self.scene, self.parameters, self.adjoint, sensor=0, seed=seed + 1, spp=spp)
+        for key in self.temporal:
+            dr.enqueue(dr.ADMode.Backward, self.parameters[key])
+        if self.temporal:
+            dr.traverse(dr.ADMode.Backward)
+        found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
+        dr.eval(images, found)
+        dr.sync_thread()
+        seconds = time.perf_counter() - begin
+        gradients = {key: np.array(value, dtype=np.float64).ravel().tolist() for key, value in found.items()}
+        return {"seconds": seconds, "gradients": gradients}
+
+    def attach(self):
+        """Fresh leaves: the value itself, or a shift along z in front of a transform."""
+        leaves = {}
+        for key in self.gradients:
+            leaf = type(self.initial[key])(self.initial[key])
+            dr.enable_grad(leaf)
+            self.parameters[key] = leaf
+            leaves[key] = leaf
+        for key in self.temporal:
+            shift = mi.Float(0)
+            dr.enable_grad(shift)
+            self.parameters[key] = mi.Transform4f().translate(mi.Vector3f(0, 0, shift)) @ self.initial[key]
+            leaves[key] = shift
+        self.parameters.update()
+        return leaves
+
+
+def pattern(image):
+    """An adjoint with both signs, different from bin to bin."""
+    size = int(np.prod(image.shape))
+    return mi.TensorXf(dr.sin(dr.arange(mi.Float, size) * 0.01) / size, image.shape)
+
+
+def answer_to(request, jobs):
+    """Carry out one request."""
+    match request["do"]:
+        case "load":
+            jobs[request["name"]] = Job(request)
+            return {"ok": True}
+        case "render":
+            return jobs[request["name"]].render(request["spp"], request["seed"])
+        case "backward":
+            return jobs[request["name"]].backward(request["spp"], request["seed"])
+        case "memory":
+            return {"peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}
+    return {"error": f"unknown request {request['do']!r}"}
+
+
+def main():
+    library, variant = sys.argv[1:3]
+    jobs = {}
+    start(library, variant)
+    versions = {"python": sys.version.split()[0], "mitsuba": mi.__version__, "drjit": dr.__version__}
+    print(json.dumps(versions), file=ANSWERS)
+    for line in sys.stdin:
+        try:
+            answer = answer_to(json.loads(line), jobs)
+        except Exception as error:  # reported to the driver, which stops
+            traceback.print_exc()
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=ANSWERS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""The statistics of `cost_of_accuracy` on a renderer whose variance is known."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
+from torchtransient.accuracy.measure import Estimates, Task, measure
+from torchtransient.accuracy.report import Choice
+from torchtransient.errors import ShapeError, StorageError, UnitError
+
+TRUTH = np.array([0.0, 4.0, 1.0, 0.25])[:, None, None]  # (C*T, H, W): a dark bin, a bright one and two dimmer ones
+
+
+def synthetic(variance, bias=0.0, seconds_per_spp=0.0, salt=0):
+    """Runs normal with `variance / spp` per entry where there is light, plus a bias."""
+
+    def values(spp, seed):
+        rng = np.random.default_rng([seed, spp, salt])
+        time.sleep(seconds_per_spp * spp)
+        noise = rng.normal(0, np.sqrt(variance / spp), (4, 32, 32)) * (TRUTH > 0)
+        return Estimates({"transient": TRUTH + bias * (TRUTH > 0) + noise}, spp)
+
+    def gradient(spp, seed):
+        rng = np.random.default_rng([seed, spp, salt, 1])
+        return Estimates({"key": 3.0 + rng.normal(0, np.sqrt(9 * variance / spp), 4000)}, spp)
+
+    return {"values": Task(values, {"transient": 0}), "gradients": Task(gradient)}
+
+
+SPP = (16, 64, 256, 1024)
+INDEPENDENT, OTHER = Choice("independent", "box"), Choice("multijitter", "box")
+
+
+@pytest.mark.parametrize("reference_spp", [None, 8192])
+def test_magnitude_and_slope(reference_spp):
+    report = measure({INDEPENDENT: synthetic(2.0)}, SPP, reference_spp=reference_spp, repeats=4, progress=False)
+    assert report.quantities() == ["transient", "key"]
+    for quantity, variance in (("transient", 2.0 * 3 / 4), ("key", 18.0)):
+        points = [p for p in report.points if p.quantity == quantity]
+        assert [p.spp for p in points] == list(SPP)
+        for p in points:
+            # the mean square of n normal deviates scatters by sqrt(2 / n); pairs or runs give at least 2 x 3072 of them
+            assert abs(p.squared_error * p.spp / variance - 1) < 5 * np.sqrt(2 / 6144)
+        slope = report.slope(quantity, INDEPENDENT)
+        assert abs(slope.slope + 1) < 0.02
+        assert slope.factor == pytest.approx(variance, rel=0.1)
+    relative = [p.relative_error for p in report.points if p.quantity == "transient"]
+    expected = np.sqrt(2.0 * 3 / 4 / np.array(SPP) / np.mean(TRUTH**2))
+    np.testing.assert_allclose(relative, expected, rtol=0.05)
+    # the median over lit bins is the bin of height 1
+    median = [p.median_bin_error for p in report.points if p.quantity == "transient"]
+    np.testing.assert_allclose(median, np.sqrt(2.0 / np.array(SPP)), rtol=0.1)
+
+
+def test_standard_error_of_the_squared_error():
+    report = measure({INDEPENDENT: synthetic(2.0)}, SPP, repeats=200, progress=False)
+    point = report.points[0]
+    # 100 pairs, each the mean of 3072 squared normal deviates (of 4096 entries)
+    expected = point.squared_error * np.sqrt(2 / 3072) / np.sqrt(100)
+    assert point.squared_error_standard_error == pytest.approx(expected, rel=0.35)
+
+
+def test_pairs_do_not_see_a_bias_and_a_reference_does():
+    tally = ErrorTally(None, None)
+    rng = np.random.default_rng(0)
+    runs = 1.0 + 0.3 + rng.normal(0, 0.01, (6, 5000))
+    for run in runs:
+        tally.add(run)
+    assert tally.result().squared == pytest.approx(1e-4, rel=0.1)
+    reference = Reference(*(1.0 + rng.normal(0, 0.1, (2, 5000))))
+    tally = ErrorTally(None, reference)
+    for run in runs:
+        tally.add(run)
+    # bias^2 + variance; the noise of the reference (0.005 before correction) is taken out
+    assert tally.result().squared == pytest.approx(0.09 + 1e-4, abs=5 * 2 * 0.3 * np.sqrt(0.005 / 5000))
+
+
+def test_gain_compares_error_at_equal_time():
+    better = synthetic(0.2, salt=5)
+    slow = {**synthetic(2.0, seconds_per_spp=1e-4)}
+    quick = {**synthetic(2.0, seconds_per_spp=1e-4, salt=7)}
+    report = measure({INDEPENDENT: slow, OTHER: quick}, (100, 200, 400), repeats=4, progress=False)
+    assert report.gain("transient", INDEPENDENT) == pytest.approx(1.0)
+    assert 0.5 < report.gain("transient", OTHER) < 2.0
+    report = measure({INDEPENDENT: synthetic(2.0), OTHER: better}, SPP, repeats=4, progress=False)
+    error = {p.choice: p.squared_error for p in report.points if p.quantity == "key" and p.spp == 64}
+    assert error[INDEPENDENT] / error[OTHER] == pytest.approx(10, rel=0.2)
+
+
+def test_runs_take_turns_and_warm_up_is_not_timed():
+    calls = []
+
+    def task(name):
+        def run(spp, seed):
+            calls.append((name, spp, seed))
+            time.sleep(0.05 if len([c for c in calls if c[0] == name]) == 1 else 0.0)
+            return Estimates({"transient": np.random.default_rng(seed).normal(size=8)}, spp)
+
+        return {"values": Task(run)}
+
+    report = measure({INDEPENDENT: task("a"), OTHER: task("b")}, (4, 8), repeats=2, progress=False)
+    assert [c[0] for c in calls] == ["a", "b"] * 6
+    assert max(p.seconds for p in report.points) < 0.04
+    timed = [c for c in calls if c[0] == "a"]
+    assert len({seed for _, _, seed in timed}) == len(timed)  # no two runs share a seed
+
+
+def test_table_json_and_plot(tmp_path):
+    report = measure(
+        {INDEPENDENT: synthetic(2.0), OTHER: synthetic(0.5, salt=3)},
+        SPP,
+        repeats=2,
+        progress=False,
+        settings={"scene": "synthetic"},
+    )
+    table = report.table()
+    assert "transient [independent, box]" in table and "key [multijitter, box]" in table and "slope -1.0" in table
+    report.to_json(tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert len(data["points"]) == 16 and len(data["slopes"]) == 4 and data["settings"] == {"scene": "synthetic"}
+    assert data["points"][0]["sampler"] == "independent"
+    assert data["points"][0]["squared_error_standard_error"] is None  # a single pair tells no spread
+    report.plot(tmp_path / "report.png")
+    assert (tmp_path / "report.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    for write in (report.to_json, report.plot):
+        with pytest.raises(StorageError, match="cannot write"):
+            write(tmp_path / "missing" / "file.png")
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ({"spp": ()}, "spp"),
+        ({"spp": (4, 4)}, "different"),
+        ({"spp": (0, 4)}, "at least 1"),
+        ({"spp": (4,), "repeats": 3}, "even"),
+        ({"spp": (4,), "repeats": 1}, "at least 2"),
+        ({"spp": (64,), "reference_spp": 128}, "four times"),
+    ],
+)
+def test_errors(arguments, words):
+    with pytest.raises(UnitError, match=words):
+        measure({INDEPENDENT: synthetic(1.0)}, **arguments, progress=False)
+
+
+def test_shapes_must_agree():
+    tally = ErrorTally()
+    with pytest.raises(ShapeError):
+        tally.result()
+    tally.add(np.zeros(3))
+    with pytest.raises(ShapeError):
+        tally.add(np.zeros(4))
+    with pytest.raises(ShapeError):
+        ErrorTally(None, Reference(np.zeros(3), np.zeros(3))).add(np.zeros(4))
+    with pytest.raises(ShapeError):
+        ErrorTally(None, Reference(np.zeros(3), np.zeros(4))).add(np.zeros(3))

@@ -1,0 +1,122 @@
+"""Squared and relative error of Monte Carlo estimates, from independent runs that are never all in memory.
+
+Two ways to the same number, the expected squared error per entry:
+
+* against a *reference* of two independent halves A and B: mean of (x - (A + B) / 2)^2 less the reference's own variance,
+  (A - B)^2 / 4. It contains the bias of the estimate, if the reference has none.
+* from *pairs* of independent runs: mean of (x1 - x2)^2 / 2, the variance. It sees no bias.
+
+The power that a relative error divides by is the product of two independent runs, A B or x1 x2, whose expectation is the squared
+truth; a squared estimate would add its variance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchtransient.errors import ShapeError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Two independent halves of a long reference, arrays of equal shape."""
+
+    first: ArrayLike
+    second: ArrayLike
+
+
+@dataclass
+class ErrorTally:
+    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is none."""
+
+    time_dim: int | None = None
+    reference: Reference | None = None
+    squared: list[Array] = field(default_factory=list)
+    power: list[Array] = field(default_factory=list)
+    entries_per_bin: int = 0
+    _waiting: NDArray[np.float32] | None = None
+    _reference_sums: tuple[Array, Array, NDArray[np.float32]] | None = None
+
+    def add(self, run: ArrayLike) -> None:
+        """One independent run. Raises ShapeError when its shape differs from the reference's or the run before."""
+        x = np.asarray(run, dtype=np.float32)
+        if self.reference is not None:
+            noise, power, mean = self._against_reference(x)
+            self.squared.append(self._per_bin(_square(x - mean)) - noise)
+            self.power.append(power)
+        elif self._waiting is None:
+            self._waiting = np.array(x, copy=True)
+        else:
+            if self._waiting.shape != x.shape:
+                raise ShapeError(f"expected runs of equal shape, got {self._waiting.shape} and {x.shape}")
+            self.squared.append(self._per_bin(_square(x - self._waiting)) / 2.0)
+            self.power.append(self._per_bin(np.multiply(x, self._waiting, dtype=np.float64)))
+            self._waiting = None
+
+    def _against_reference(self, x: NDArray[np.float32]) -> tuple[Array, Array, NDArray[np.float32]]:
+        """The reference's own noise and power per bin, and its mean; computed at the first run."""
+        if self._reference_sums is None:
+            if self.reference is None:
+                raise ShapeError("ErrorTally: no reference was given")
+            a = np.asarray(self.reference.first, dtype=np.float32)
+            b = np.asarray(self.reference.second, dtype=np.float32)
+            if a.shape != b.shape:
+                raise ShapeError(f"expected two halves of equal shape, got {a.shape} and {b.shape}")
+            mean = np.asarray((a + b) * np.float32(0.5), dtype=np.float32)
+            power = self._per_bin(np.multiply(a, b, dtype=np.float64))
+            self._reference_sums = self._per_bin(_square(a - b)) / 4.0, power, mean
+        noise, power, mean = self._reference_sums
+        if mean.shape != x.shape:
+            raise ShapeError(f"expected a run of the reference's shape {mean.shape}, got {x.shape}")
+        return noise, power, mean
+
+    def _per_bin(self, values: Array) -> Array:
+        """Mean over everything but time, shape (T,) or (1,)."""
+        if self.time_dim is None:
+            return np.asarray([values.mean()], dtype=np.float64)
+        axes = tuple(i for i in range(values.ndim) if i != self.time_dim % values.ndim)
+        return np.asarray(values.mean(axis=axes), dtype=np.float64)
+
+    def result(self) -> ErrorEstimate:
+        """The figures of all runs so far; ShapeError when there were none (or a single one without a reference)."""
+        if not self.squared:
+            raise ShapeError("ErrorTally: expected at least one run against a reference, or two without one")
+        per_run = np.stack(self.squared)
+        totals = per_run.mean(axis=1)
+        error = float(totals.std(ddof=1) / math.sqrt(len(totals))) if len(totals) > 1 else math.nan
+        squared, power = per_run.mean(axis=0), np.stack(self.power).mean(axis=0)
+        lit = power > 0
+        per_bin = np.sqrt(np.maximum(squared[lit], 0.0) / power[lit])
+        total_power = float(power.mean())
+        mean_squared = float(squared.mean())
+        relative = math.sqrt(max(mean_squared, 0.0) / total_power) if total_power > 0 else math.nan
+        return ErrorEstimate(
+            squared=mean_squared,
+            squared_standard_error=error,
+            relative=relative,
+            median_bin=float(np.median(per_bin)) if lit.any() else math.nan,
+        )
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """`squared`: expected squared error per entry, and its standard error over the runs (NaN for one run or pair).
+
+    `relative`: root of squared error over power, all entries together: what bright bins decide. `median_bin`: the same per
+    time bin, median over the bins that hold light: what dim, late bins decide. NaN where there is no light at all.
+    """
+
+    squared: float
+    squared_standard_error: float
+    relative: float
+    median_bin: float
+
+
+def _square(values: NDArray[np.float32]) -> Array:
+    return np.multiply(values, values, dtype=np.float64)

@@ -1,0 +1,136 @@
+"""Closed cavities with exact transient solutions: furnace, integrating sphere, parallel plates. Lengths in metres.
+
+The solutions are in `torchtransient.testing.closed_forms` under the same names.
+"""
+
+from __future__ import annotations
+
+from torchtransient.scenes.parts import (
+    SceneDict,
+    diffuse,
+    perspective,
+    positive,
+    transient_film,
+    transient_path,
+)
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+
+
+def _camera(resolution: int, num_bins: int, start_opl: float, bin_width_opl: float, spp: int, fov: float) -> SceneDict:
+    film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
+    return perspective(look_at([0.0, 0.0, 0.0], [0.0, 0.0, -1.0]), fov, film, spp)
+
+
+def furnace(
+    radius: float = 1.0,
+    reflectance: float = 0.8,
+    radiance: float = 1.0,
+    *,
+    resolution: int = 2,
+    num_bins: int = 400,
+    start_opl: float = 0.0,
+    bin_width_opl: float = 0.05,
+    spp: int = 256,
+    max_depth: int = 64,
+    rr_depth: int = 1000,
+    emitter_sampling: bool = False,
+) -> SceneDict:
+    """A diffuse sphere that emits `radiance` from its whole inner side, seen from its centre. Lengths in metres.
+
+    Every pixel sees the same thing. Russian roulette starts at `rr_depth`, beyond `max_depth` by default, so that the only
+    bias is the truncation at `max_depth` segments: the energy left out is `radiance * reflectance**max_depth / (1 - reflectance)`.
+    Closed form: `closed_forms.furnace`.
+
+    Mitsuba's sphere light (3.9.1) gives some points of its own surface the density of a sphere seen from outside, which makes
+    a furnace 0.17 % too bright when the wall is sampled as an emitter. By default a dark point light at the centre takes the
+    emitter samples instead, and emission is found by BSDF sampling alone; `emitter_sampling=True` samples the wall itself.
+    """
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": transient_path(max_depth, rr_depth),
+        "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 45.0),
+        "wall": {
+            "type": "sphere",
+            "radius": positive("radius", radius),
+            "flip_normals": True,
+            "bsdf": diffuse(reflectance),
+            "emitter": {"type": "area", "radiance": float(radiance)},
+        },
+    }
+    if not emitter_sampling:
+        scene["wall"]["emitter"]["sampling_weight"] = 0.0
+        scene["dark"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 0.0}
+    return scene
+
+
+def integrating_sphere(
+    radius: float = 1.0,
+    reflectance: float = 0.8,
+    intensity: float = 1.0,
+    *,
+    resolution: int = 2,
+    num_bins: int = 400,
+    start_opl: float = 0.0,
+    bin_width_opl: float = 0.05,
+    spp: int = 256,
+    max_depth: int = 64,
+    rr_depth: int = 1000,
+) -> SceneDict:
+    """A diffuse sphere lit by a point source of `intensity` (W/sr) at its centre and seen from there. Lengths in metres.
+
+    Light reaches the wall at `radius` everywhere with irradiance `intensity / radius**2`, then crosses the sphere along
+    independent chords. Closed form: `closed_forms.integrating_sphere_radiance`.
+    """
+    return {
+        "type": "scene",
+        "integrator": transient_path(max_depth, rr_depth),
+        "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 45.0),
+        "light": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": float(intensity)},
+        "wall": {
+            "type": "sphere",
+            "radius": positive("radius", radius),
+            "flip_normals": True,
+            "bsdf": diffuse(reflectance),
+        },
+    }
+
+
+def parallel_plates(
+    separation: float = 1.0,
+    reflectance: float = 0.8,
+    radiance: float = 1.0,
+    *,
+    half_extent: float = 1000.0,
+    resolution: int = 2,
+    num_bins: int = 400,
+    start_opl: float = 0.0,
+    bin_width_opl: float = 0.05,
+    spp: int = 256,
+    max_depth: int = 64,
+    rr_depth: int = 1000,
+) -> SceneDict:
+    """Two emitting diffuse squares facing each other, the camera half-way between them. Lengths in metres.
+
+    The plates stand at z = -separation / 2 and +separation / 2 and reach `half_extent` to each side. The camera looks at one
+    of them through a field of view of 0.5 degrees, so that the first leg is separation / 2 to 1e-5. Of a flight's
+    energy at most `(separation / half_extent)**2` leaves through the open sides; arrivals before `half_extent` do not
+    notice the edges. Closed form: `closed_forms.parallel_plates`.
+    """
+    gap = positive("separation", separation)
+    size = scale(positive("half_extent", half_extent))
+
+    def plate(to_world: object) -> SceneDict:
+        return {
+            "type": "rectangle",
+            "to_world": to_world,
+            "bsdf": diffuse(reflectance),
+            "emitter": {"type": "area", "radiance": float(radiance)},
+        }
+
+    return {
+        "type": "scene",
+        "integrator": transient_path(max_depth, rr_depth),
+        "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 0.5),
+        "back": plate(translate([0.0, 0.0, -gap / 2]) @ size),
+        "front": plate(translate([0.0, 0.0, gap / 2]) @ rotate([0, 1, 0], 180) @ size),
+    }

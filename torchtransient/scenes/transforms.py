@@ -1,0 +1,91 @@
+"""Affine transforms as float64 arrays of shape (4, 4), column vectors, in Mitsuba's conventions.
+
+They need no Mitsuba variant, pickle, and compose with `@`: `translate(t) @ rotate(axis, angle) @ scale(s)` scales first,
+as `mi.ScalarTransform4f().translate(t).rotate(axis, angle).scale(s)` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import SceneError, ShapeError
+
+Matrix = NDArray[np.float64]
+Triple = Sequence[float] | NDArray[np.float64]
+
+
+def _triple(name: str, values: Triple) -> NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (3,):
+        raise ShapeError(f"{name}: expected three numbers, got shape {array.shape}; pass [x, y, z]")
+    if not np.all(np.isfinite(array)):
+        raise SceneError(f"{name}: expected finite numbers, got {array.tolist()}")
+    return array
+
+
+def identity() -> Matrix:
+    """The transform that leaves every point where it is, shape (4, 4)."""
+    return np.eye(4)
+
+
+def translate(offset: Triple) -> Matrix:
+    """Shift by `offset` (3,), metres. Returns (4, 4). Raises ShapeError unless three numbers come."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = _triple("translate", offset)
+    return matrix
+
+
+def scale(factor: float | Triple) -> Matrix:
+    """Scale about the origin by one number or by one per axis (3,). Returns (4, 4).
+
+    A zero factor has no inverse and raises SceneError: Mitsuba inverts every transform.
+    """
+    factors = np.full(3, float(factor)) if np.ndim(factor) == 0 else _triple("scale", factor)  # type: ignore[arg-type]
+    if np.any(factors == 0) or not np.all(np.isfinite(factors)):
+        raise SceneError(f"scale: expected finite factors other than zero, got {factors.tolist()}")
+    return np.diag([*factors, 1.0])
+
+
+def rotate(axis: Triple, angle_deg: float) -> Matrix:
+    """Rotate about `axis` (3,) through the origin by `angle_deg` degrees, right-handed. Returns (4, 4).
+
+    Rodrigues' formula. The axis need not have unit length; a zero axis raises SceneError.
+    """
+    direction = _triple("rotate", axis)
+    length = np.linalg.norm(direction)
+    if length == 0:
+        raise SceneError("rotate: expected an axis with a direction, got [0, 0, 0]")
+    x, y, z = direction / length
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.deg2rad(angle_deg)
+    matrix = np.eye(4)
+    matrix[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return matrix
+
+
+def look_at(origin: Triple, target: Triple, up: Triple = (0.0, 1.0, 0.0)) -> Matrix:
+    """Frame at `origin` whose local +z looks at `target`, local +y as near to `up` as it can be. Returns (4, 4).
+
+    All three arguments have shape (3,), metres. Local +x points to the *left* of the view, as Mitsuba's cameras expect.
+    Raises SceneError when origin and target coincide or `up` is parallel to the view.
+    """
+    eye = _triple("look_at origin", origin)
+    forward = _triple("look_at target", target) - eye
+    distance = np.linalg.norm(forward)
+    if distance == 0:
+        raise SceneError(f"look_at: origin and target are the same point {eye.tolist()}; move one of them")
+    forward = forward / distance
+    left = np.cross(_triple("look_at up", up), forward)
+    length = np.linalg.norm(left)
+    if length < 1e-12:
+        raise SceneError(f"look_at: up {list(map(float, up))} is parallel to the view; choose another up direction")
+    left = left / length
+    matrix = np.eye(4)
+    matrix[:3, 0] = left
+    matrix[:3, 1] = np.cross(forward, left)
+    matrix[:3, 2] = forward
+    matrix[:3, 3] = eye
+    return matrix

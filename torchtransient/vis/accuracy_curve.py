@@ -1,0 +1,71 @@
+"""Error against time and samples, as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import ShapeError, StorageError
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of the picture. The three lists have equal length; `seconds` and errors that are not positive are left out."""
+
+    quantity: str
+    label: str
+    spp: Sequence[float]
+    seconds: Sequence[float]
+    squared_relative_error: Sequence[float]
+
+
+def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
+    """Write a log-log PNG: squared relative error against seconds (left) and samples per pixel (right), a row per quantity.
+
+    A dashed guide of slope -1 starts at the first point of the first curve: independent samples fall along it.
+    Raises ShapeError without curves and StorageError when `path` cannot be written. Needs matplotlib (extra `vis`).
+    """
+    from matplotlib.figure import Figure
+
+    if not curves:
+        raise ShapeError("plot_accuracy: expected at least one curve, got none")
+    quantities = list(dict.fromkeys(curve.quantity for curve in curves))
+    figure = Figure(figsize=(10.0, 3.6 * len(quantities) + 0.4), layout="constrained")
+    axes = figure.subplots(len(quantities), 2, squeeze=False, sharey="row")
+    for row, quantity in zip(axes, quantities, strict=True):
+        lines = [curve for curve in curves if curve.quantity == quantity]
+        for axis, unit in zip(row, ("seconds", "spp"), strict=True):
+            _draw(axis, lines, unit)
+        row[0].set_title(quantity, loc="left", fontsize=10)
+        row[0].set_ylabel("squared relative error")
+        row[1].legend(fontsize=8, frameon=False)
+    for axis, label in zip(axes[-1], ("seconds per render", "samples per pixel"), strict=True):
+        axis.set_xlabel(label)
+    try:
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise StorageError(f"plot_accuracy: cannot write {path}: {error}; choose a writable place") from error
+
+
+def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
+    """One panel: the curves over `unit` ("seconds" or "spp") and the guide."""
+    starts, ends = [], []
+    for i, curve in enumerate(lines):
+        x = np.asarray(getattr(curve, unit), dtype=np.float64)
+        y = np.asarray(curve.squared_relative_error, dtype=np.float64)
+        good = (x > 0) & (y > 0)
+        if good.any():
+            starts.append((x[good][0], y[good][0]))
+            ends.append(x[good].max())
+        axis.plot(x[good], y[good], marker="osD^v<>P"[i % 8], markersize=4, linewidth=1.2, label=curve.label)
+    if starts:
+        x0, y0 = starts[0]
+        x1 = max(*ends, 2 * x0)
+        axis.plot([x0, x1], [y0, y0 * x0 / x1], color="0.5", linestyle="--", linewidth=0.8, label="slope -1")
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.grid(True, which="major", color="0.9", linewidth=0.6)
