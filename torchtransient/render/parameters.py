@@ -255,7 +255,8 @@ class SlotTable:
             if normals != target and normals in built.params:
                 touched[normals] = None
         self._check_overlap()
-        self.originals = {target: built.params[target] for target in touched}
+        # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
+        self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
 
     def _check_overlap(self) -> None:
         owner: dict[str, str] = {}

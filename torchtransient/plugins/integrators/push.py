@@ -19,7 +19,8 @@ def tangents(values):
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
-    pushed = dr.forward_to(*attached)
+    # Interior nodes keep their tangents: the origin of a camera ray depends on its direction, and both are wanted.
+    pushed = dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
     pushed = list(pushed) if isinstance(pushed, (tuple, list)) and len(attached) > 1 else [pushed]
     return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
 
