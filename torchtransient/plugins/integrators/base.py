@@ -114,7 +114,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if self.temporal_filter:
             check_name(self.temporal_filter)
         self.gaussian_stddev = None
-        if props.has_property("gaussian_stddev"):
+        if "gaussian_stddev" in props:
             self.gaussian_stddev = float(props["gaussian_stddev"])
             check_stddev(self.gaussian_stddev)
         self._distant = None
