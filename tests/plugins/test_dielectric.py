@@ -67,7 +67,10 @@ def evaluate_all(bsdf, ctx):
         return (bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, *rest)
 
     if mi.variant().startswith("scalar"):
-        lanes = [call(mi.Vector3f(a), mi.Vector3f(b), float(c), mi.Point2f(d)) for a, b, c, d in zip(*inputs(200), strict=True)]
+        lanes = [
+            call(mi.Vector3f(a), mi.Vector3f(b), float(c), mi.Point2f(d))
+            for a, b, c, d in zip(*inputs(200), strict=True)
+        ]
         return [np.stack([np.array(x, dtype=float) for x in column], -1) for column in zip(*lanes, strict=True)]
     wi, wo, u1, u2 = inputs(LANES)
     result = call(mi.Vector3f(wi.T), mi.Vector3f(wo.T), mi.Float(u1), mi.Point2f(u2.T))
@@ -112,7 +115,9 @@ VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_pol
 def test_smooth_equals_mitsuba(variant):
     activate(variant)
     for material, ctx in product(MATERIALS, contexts()):
-        compare(mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx)
+        compare(
+            mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx
+        )
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -185,7 +190,9 @@ def test_smooth_sample_is_attached():
     for got, value in zip(outputs, expected, strict=True):
         np.testing.assert_allclose(dr.detach(got).numpy(), value.detach().numpy(), rtol=2e-5, atol=2e-6)
         (slope,) = torch.autograd.grad(value.sum(), eta, retain_graph=True, allow_unused=False)
-        np.testing.assert_allclose(np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5)
+        np.testing.assert_allclose(
+            np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5
+        )
 
 
 def test_smooth_sample_is_attached_to_the_incident_direction():
@@ -310,7 +317,9 @@ def test_gradient_passes_through_a_call_by_pointer():
     """The plugins are reached through arrays of pointers in a loop: the index must collect its derivative there too."""
     activate("llvm_ad_rgb")
     for kind in ("diff_dielectric", "diff_rough_dielectric"):
-        scene = mi.load_dict({"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}})
+        scene = mi.load_dict(
+            {"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}}
+        )
         params = mi.traverse(scene)
         dr.enable_grad(params["a.bsdf.eta"])
         params.update()
