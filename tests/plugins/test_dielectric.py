@@ -164,7 +164,7 @@ def test_smooth_sample_is_attached():
     """Direction, index, probability and weight of both lobes against autograd in double precision."""
     activate("llvm_ad_mono")
     bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    wi, _, u1, u2 = inputs(LANES)
+    wi, _, u1, _u2 = inputs(LANES)
     steep = np.abs(wi[:, 2]) > 0.8  # no total internal reflection
     wi, u1 = wi[steep], u1[steep]
     u1[::2] *= 0.04  # many reflections
@@ -201,7 +201,7 @@ def test_smooth_sample_is_attached_to_the_incident_direction():
     wi = mi.Vector3f(0.48, -0.36, 0.8)
     dr.enable_grad(wi)
     for u, lobe in ((0.0, "reflection"), (0.9, "transmission")):
-        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(u), mi.Point2f(0.5))
+        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(u), mi.Point2f(0.5))
         w = torch.tensor([[0.48, -0.36, 0.8]], dtype=torch.float64, requires_grad=True)
         eta = torch.tensor([1.5], dtype=torch.float64)
         expected = w * torch.tensor([-1.0, -1.0, 1.0]) if lobe == "reflection" else refracted_direction(w, eta)
@@ -325,7 +325,7 @@ def test_gradient_passes_through_a_call_by_pointer():
         params.update()
         rays = mi.Ray3f(mi.Point3f(0.1, 0.2, 2), dr.normalize(mi.Vector3f(mi.Float([0.3, -0.2, 0.1]), 0.1, -1)))
         si = scene.ray_intersect(rays)
-        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
+        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
         dr.backward(dr.sum(bs.eta + bs.pdf * 0))
         assert dr.grad(params["a.bsdf.eta"])[0] == pytest.approx(3, rel=1e-5)
 
