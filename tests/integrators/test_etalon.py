@@ -226,7 +226,7 @@ def test_gradient_of_a_slab_in_its_index(side, angle_deg):
         "integrator": {"type": "transient_path", "max_depth": max_depth, "rr_depth": 1000},
     })  # fmt: skip
     params = mi.traverse(scene)
-    etas = [k for k in params if k.endswith("eta")]
+    etas = [k for k, _ in params if k.endswith("eta")]
     for k in etas:
         dr.enable_grad(params[k])
     params.update()
