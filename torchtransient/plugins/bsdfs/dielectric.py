@@ -62,8 +62,10 @@ class DiffDielectric(mi.BSDF):
         if has_r and has_t:
             # The second condition keeps a lobe of zero probability from being drawn when the first one rounds.
             selected_r = (sample1 < dr.detach(terms.reflectance)) | (dr.detach(terms.transmittance) <= 0)
-            bs.pdf = dr.select(selected_r, terms.reflectance, terms.transmittance)
-            factor = mi.Float(1)
+            probability = dr.select(selected_r, terms.reflectance, terms.transmittance)
+            bs.pdf = dr.detach(probability)
+            # The value over its detached probability: one, with the derivative of Fresnel's term.
+            factor = dr.relative_grad(probability)
         else:
             selected_r = mi.Mask(has_r)
             bs.pdf = mi.Float(1)
