@@ -257,7 +257,7 @@ CASES = [
     Case(
         "rough_mirror_moves", "shape to_world",
         lambda: mirror_room({"type": "roughconductor", "alpha": 0.2, "distribution": "ggx"}), move("wall.to_world", (0, 0, 1)), 0.0, 4e-3,
-        spp=8192, fd_spp=8192,
+        spp=32768, fd_spp=32768,
     ),
     Case(
         "plastic_alpha", "roughness (rough plastic)",
@@ -272,11 +272,11 @@ CASES = [
     Case(
         "plastic_moves", "shape to_world",
         lambda: room(bsdf={"type": "plastic", "diffuse_reflectance": 0.4}, light=area_light()), move("wall.to_world", (0, 0, 1)), 0.0, 4e-3,
-        spp=4096, fd_spp=4096,
+        spp=4096, fd_spp=16384,
     ),
     Case(
         "thin_glass_tilts", "shape to_world",
-        lambda: glass_slab({"type": "thindielectric", "int_ior": 1.5}, "rectangle"), rotate("slab.to_world", (0, 1, 0)), 0.0, 0.5, spp=8192, fd_spp=8192,
+        lambda: glass_slab({"type": "thindielectric", "int_ior": 1.5}, "rectangle"), rotate("slab.to_world", (0, 1, 0)), 0.0, 0.5, spp=8192, fd_spp=65536,
     ),
     Case(
         "mask_opacity", "mask opacity",

@@ -182,9 +182,14 @@ def test_smooth_sample_is_attached():
     mask = torch.tensor(reflected)
     mirror = w * torch.tensor([-1.0, -1.0, 1.0])
     wo = torch.where(mask[:, None], mirror, refracted_direction(w, eta))
-    expected = [*wo.T, torch.where(mask, F, 1 - F), torch.where(mask, 1.0, eta_it), torch.where(mask, 1.0, eta_it**-2)]
+    probability = torch.where(mask, F, 1 - F)
+    # Mitsuba's convention: the probability is detached, and the weight is the attached value over it.
+    value_over_probability = probability / probability.detach() * torch.where(mask, 1.0, eta_it**-2)
+    expected = [*wo.T, torch.where(mask, 1.0, eta_it), value_over_probability]
+    np.testing.assert_allclose(bs.pdf.numpy(), probability.detach().numpy(), rtol=2e-5, atol=2e-6)
+    assert not dr.grad_enabled(bs.pdf)
 
-    outputs = [*bs.wo, bs.pdf, bs.eta, weight[0]]
+    outputs = [*bs.wo, bs.eta, weight[0]]
     dr.set_grad(params["eta"], 1)
     dr.forward_to(outputs)
     for got, value in zip(outputs, expected, strict=True):
