@@ -54,7 +54,7 @@ class Worker:
         self.versions = self._answer()
 
     def ask(self, **request: Any) -> dict[str, Any]:
-        """Send one request and wait for its answer; RuntimeError with the worker's message when it failed."""
+        """Send one request and wait for its answer; RuntimeError when the worker ended instead."""
         if self.process.stdin is None:
             raise RuntimeError("the worker has no input")
         self.process.stdin.write(json.dumps(request) + "\n")
@@ -66,8 +66,6 @@ class Worker:
         if not line:
             raise RuntimeError(f"the worker ended with exit code {self.process.wait()}; its messages are above")
         answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise RuntimeError(f"the worker failed: {answer['error']}")
         return answer
 
     def close(self) -> None:
@@ -75,12 +73,6 @@ class Worker:
         if self.process.stdin:
             self.process.stdin.close()
         self.process.wait(timeout=60)
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def encoded(node: Any) -> Any:

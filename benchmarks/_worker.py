@@ -2,7 +2,7 @@
 
 Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only the named
 library, so that each side of a comparison runs in its own environment. Requests:
-  {"do": "load", "name", "scene", "gradients": [keys], "temporal_gradients": [keys]}   -> {"ok": true}
+  {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
   {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
   {"do": "memory"}                                                                     -> {"peak_bytes"}
@@ -14,7 +14,6 @@ import os
 import resource
 import sys
 import time
-import traceback
 
 # Answers go to the original stdout; whatever a library prints goes to stderr.
 ANSWERS = os.fdopen(os.dup(1), "w", buffering=1)
@@ -60,11 +59,11 @@ class Job:
             self.scene = mi.load_dict(decoded(scene))
         self.integrator = self.scene.integrator()
         self.gradients = request.get("gradients", [])
-        self.temporal = request.get("temporal_gradients", [])
+        self.shifts = request.get("shifts", {})
         self.adjoint = None
-        self.parameters = mi.traverse(self.scene) if self.gradients or self.temporal else None
+        self.parameters = mi.traverse(self.scene) if self.gradients or self.shifts else None
         self.initial = {}
-        for key in self.gradients + self.temporal:
+        for key in [*self.gradients, *self.shifts]:
             value = self.parameters[key]
             self.initial[key] = type(value)(value)
         dr.eval(self.initial)
@@ -87,9 +86,9 @@ class Job:
         if self.adjoint is None:
             self.adjoint = tuple(pattern(image) for image in images)
         self.integrator.render_backward(self.scene, self.parameters, self.adjoint, sensor=0, seed=seed + 1, spp=spp)
-        for key in self.temporal:
+        for key in self.shifts:
             dr.enqueue(dr.ADMode.Backward, self.parameters[key])
-        if self.temporal:
+        if self.shifts:
             dr.traverse(dr.ADMode.Backward)
         found = {key: dr.grad(leaf) for key, leaf in leaves.items()}
         dr.eval(images, found)
@@ -99,17 +98,17 @@ class Job:
         return {"seconds": seconds, "gradients": gradients}
 
     def attach(self):
-        """Fresh leaves: the value itself, or a shift along z in front of a transform."""
+        """Fresh leaves: the value itself, or how far a transform is shifted along its direction."""
         leaves = {}
         for key in self.gradients:
             leaf = type(self.initial[key])(self.initial[key])
             dr.enable_grad(leaf)
             self.parameters[key] = leaf
             leaves[key] = leaf
-        for key in self.temporal:
+        for key, direction in self.shifts.items():
             shift = mi.Float(0)
             dr.enable_grad(shift)
-            self.parameters[key] = mi.Transform4f().translate(mi.Vector3f(0, 0, shift)) @ self.initial[key]
+            self.parameters[key] = mi.Transform4f().translate(mi.Vector3f(direction) * shift) @ self.initial[key]
             leaves[key] = shift
         self.parameters.update()
         return leaves
@@ -133,7 +132,7 @@ def answer_to(request, jobs):
             return jobs[request["name"]].backward(request["spp"], request["seed"])
         case "memory":
             return {"peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}
-    return {"error": f"unknown request {request['do']!r}"}
+    raise ValueError(f"unknown request {request['do']!r}")
 
 
 def main():
@@ -143,12 +142,8 @@ def main():
     versions = {"python": sys.version.split()[0], "mitsuba": mi.__version__, "drjit": dr.__version__}
     print(json.dumps(versions), file=ANSWERS)
     for line in sys.stdin:
-        try:
-            answer = answer_to(json.loads(line), jobs)
-        except Exception as error:  # reported to the driver, which stops
-            traceback.print_exc()
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), file=ANSWERS)
+        # An error ends the process: its trace is on stderr, and the driver stops at the missing answer.
+        print(json.dumps(answer_to(json.loads(line), jobs)), file=ANSWERS)
 
 
 if __name__ == "__main__":

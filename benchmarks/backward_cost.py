@@ -1,6 +1,6 @@
 """Render and backward: ours with gradients through the time of flight against mitransient without them.
 
-Cornell box, 128 x 128, 64 spp, depth 8, 300 bins. Ours differentiates the red albedo and the position of the back wall
+Cornell box, 128 x 128, 64 spp, depth 8, 300 bins. Ours differentiates the red albedo and the position of the red wall along its normal
 (tent filter); the peer, whose time of flight has no derivative, the red albedo alone. Our albedo alone is shown too.
 Bar: 1.0 x the peer. Without `--peer-python` only our own cases are compared with each other.
 """
@@ -11,7 +11,7 @@ from _runner import Worker, arguments, encoded, environment, interleave, ratio, 
 
 from torchtransient.scenes import cornell_box
 
-ALBEDO, WALL = "red.reflectance.value", "back.to_world"
+ALBEDO, WALL = "red.reflectance.value", {"red-wall.to_world": [1.0, 0.0, 0.0]}
 
 
 def main() -> None:
@@ -24,18 +24,18 @@ def main() -> None:
     ours = Worker("torchtransient", options.variant)
     workers = [ours]
     jobs = {
-        "torchtransient: render": (ours, "render", box, [], []),
-        "torchtransient: albedo": (ours, "backward", box, [ALBEDO], []),
-        "torchtransient: albedo and wall": (ours, "backward", tent, [ALBEDO], [WALL]),
+        "torchtransient: render": (ours, "render", box, [], {}),
+        "torchtransient: albedo": (ours, "backward", box, [ALBEDO], {}),
+        "torchtransient: albedo and wall": (ours, "backward", tent, [ALBEDO], WALL),
     }
     if options.peer_python:
         peer = Worker("mitransient", options.variant, options.peer_python)
         workers.append(peer)
-        jobs["mitransient: render"] = (peer, "render", box, [], [])
-        jobs["mitransient: albedo"] = (peer, "backward", box, [ALBEDO], [])
+        jobs["mitransient: render"] = (peer, "render", box, [], {})
+        jobs["mitransient: albedo"] = (peer, "backward", box, [ALBEDO], {})
     cases = {}
-    for name, (worker, what, scene, radiometric, temporal) in jobs.items():
-        worker.ask(do="load", name=name, scene=encoded(scene), gradients=radiometric, temporal_gradients=temporal)
+    for name, (worker, what, scene, radiometric, shifts) in jobs.items():
+        worker.ask(do="load", name=name, scene=encoded(scene), gradients=radiometric, shifts=shifts)
         cases[name] = lambda seed, w=worker, n=name, do=what: w.ask(do=do, name=n, spp=spp, seed=seed)["seconds"]
     seconds = interleave(cases, repeats)
     ratios = [

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...errors import SceneError
+from .._registry import register
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 from .microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
@@ -61,7 +62,7 @@ class DiffRoughDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def _read_roughness(self, props: Any) -> None:
-        given = [name for name in ("alpha", "alpha_u", "alpha_v") if props.has_property(name)]
+        given = [name for name in ("alpha", "alpha_u", "alpha_v") if name in props]
         if given not in ([], ["alpha"], ["alpha_u", "alpha_v"]):
             raise SceneError(
                 f"diff_rough_dielectric: give either 'alpha' or both 'alpha_u' and 'alpha_v', got {', '.join(given)}."
@@ -242,4 +243,4 @@ def _widening(wi: Any) -> Any:
     return 1.2 - 0.2 * dr.sqrt(dr.abs(wi.z))
 
 
-mi.register_bsdf("diff_rough_dielectric", lambda props: DiffRoughDielectric(props))
+register("bsdf", "diff_rough_dielectric", DiffRoughDielectric)

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
-from torchtransient.plugins.integrators.push import tangents
+from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
@@ -171,11 +171,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         row += dr.opaque(mi.UInt32, job.first_row)
 
         offset, weight = film.sample_offset(sampler.next_2d())
-        crop = mi.Point2f(film.crop_offset())
         position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
         # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
         position = position / mi.ScalarVector2f(film.crop_size())
-        del crop
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
         time = sensor.shutter_open()
         if sensor.shutter_open_time() > 0:
@@ -291,6 +289,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():
                 facts = self.facts(scene).with_gradients(scene, sensor)
+                settle_tangents(scene, facts)
             self._check_differentiable(film, facts)
             film.prepare(self.aov_names())
             jobs, total = self.passes(sensor, film, int(seed), int(spp))

@@ -1,0 +1,47 @@
+"""Runs the peer in a process of its own, in the environment that TORCHTRANSIENT_PEER_PYTHON names."""
+
+import importlib.util
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported; child processes inherit what it found)
+
+
+def peer_python():
+    """The interpreter that has mitransient: the one that is named, or this one."""
+    named = os.environ.get("TORCHTRANSIENT_PEER_PYTHON")
+    if named:
+        return named
+    if importlib.util.find_spec("mitransient") is None:
+        pytest.fail(
+            "the tests marked 'peer' need mitransient 1.3.1: install the extra 'peer' here, or set TORCHTRANSIENT_PEER_PYTHON to the "
+            "python of an environment that has it",
+            pytrace=False,
+        )
+    return sys.executable
+
+
+@pytest.fixture
+def peer(tmp_path):
+    """`peer(scene, seeds, spp)` -> the peer's steady (K, H, W, C) and transient (K, H, W, T, C), float64."""
+
+    def render(scene, seeds, spp, variant="llvm_ad_rgb"):
+        request, result = tmp_path / "request.pickle", tmp_path / "result.npz"
+        request.write_bytes(pickle.dumps({"variant": variant, "scene": scene, "seeds": list(seeds), "spp": spp}))
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        script = Path(__file__).with_name("peer_render.py")
+        done = subprocess.run(
+            [peer_python(), script, request, result], env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        with np.load(result) as data:
+            assert str(data["version"]).startswith("1.3"), f"compared with 1.3.1, found {data['version']}"
+            return data["steady"].astype(np.float64), data["transient"].astype(np.float64)
+
+    return render
