@@ -40,7 +40,7 @@ _ROOM = {
         },
         "sampler": {"type": "independent", "sample_count": 16},
     },
-    "light": {"type": "point", "position": [0.5, 0.25, 4.0], "intensity": 10.0},
+    "light": {"type": "point", "position": [-0.5, 0.25, 4.0], "intensity": 10.0},
     "wall": {"type": "rectangle", "to_world": pose(scale=3.0), "bsdf": {"type": "diffuse", "reflectance": 0.5}},
     "box": {
         "type": "cube",

@@ -202,7 +202,8 @@ def test_shared_material_collects_from_all_its_shapes():
         room["wall"]["bsdf"], room["box"]["bsdf"] = dict(paint), dict(paint)
         if shared:
             keys = ["paint.reflectance.value"]
-            room["paint"] = paint
+            # Mitsuba names a shared object after the first place where it is met.
+            room = {"type": "scene", "paint": paint, **room}
             room["wall"]["bsdf"] = room["box"]["bsdf"] = {"type": "ref", "id": "paint"}
         renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=keys, spp=64, grad_seed=1)
         renderer(seed=0).steady.sum().backward()
