@@ -92,8 +92,10 @@ class DiffDielectric(mi.BSDF):
         """Mueller matrix of the chosen lobe between the implicit Stokes frames of the two directions."""
         forward = ctx.mode == mi.TransportMode.Radiance
         towards_light, towards_sensor = (bs.wo, si.wi) if forward else (si.wi, bs.wo)
-        reflection = mi.mueller.specular_reflection(towards_light.z, mi.Complex2f(self.eta))
-        transmission = mi.mueller.specular_transmission(towards_light.z, self.eta)
+        # Both matrices are the same seen from either side. The cosine that was given is the accurate one: that of a
+        # refracted direction close to the critical angle has lost the digits that matter.
+        reflection = mi.mueller.specular_reflection(si.wi.z, mi.Complex2f(self.eta))
+        transmission = mi.mueller.specular_transmission(si.wi.z, self.eta)
         matrix = dr.select(selected_r, reflection, transmission)
         normal = mi.Vector3f(0, 0, 1)
         s_in, s_out = dr.cross(normal, -towards_light), dr.cross(normal, towards_sensor)

@@ -16,7 +16,7 @@ def relative_index(props: Any, plugin: str) -> Any:
     Names are looked up by Mitsuba itself: its own ``dielectric`` is built from the same two values and asked for its
     ``eta``, so that the table of materials and its spelling are the installed version's.
     """
-    sides = {name: props[name] for name in ("int_ior", "ext_ior") if props.has_property(name)}
+    sides = {name: props[name] for name in ("int_ior", "ext_ior") if name in props}
     sides = {name: value if isinstance(value, str) else float(value) for name, value in sides.items()}
     for name, value in sides.items():
         if not isinstance(value, str) and not value > 0:
@@ -29,7 +29,7 @@ def relative_index(props: Any, plugin: str) -> Any:
 
 def optional_texture(props: Any, name: str) -> Any | None:
     """The texture of a lobe, or None (a factor of one) when the scene does not give it."""
-    return props.get_texture(name) if props.has_property(name) else None
+    return props.get_texture(name) if name in props else None
 
 
 def opaque(value: Any) -> Any:

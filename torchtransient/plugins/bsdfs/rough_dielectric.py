@@ -61,7 +61,7 @@ class DiffRoughDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def _read_roughness(self, props: Any) -> None:
-        given = [name for name in ("alpha", "alpha_u", "alpha_v") if props.has_property(name)]
+        given = [name for name in ("alpha", "alpha_u", "alpha_v") if name in props]
         if given not in ([], ["alpha"], ["alpha_u", "alpha_v"]):
             raise SceneError(
                 f"diff_rough_dielectric: give either 'alpha' or both 'alpha_u' and 'alpha_v', got {', '.join(given)}."

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
-from torchtransient.plugins.integrators.push import tangents
+from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
@@ -291,6 +291,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():
                 facts = self.facts(scene).with_gradients(scene, sensor)
+                settle_tangents(scene, facts)
             self._check_differentiable(film, facts)
             film.prepare(self.aov_names())
             jobs, total = self.passes(sensor, film, int(seed), int(spp))

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.integrators.path_record import read_vertex
-from torchtransient.plugins.integrators.sweep import next_vertex, previous_is_delta
+from torchtransient.plugins.integrators.sweep import led_to, next_vertex
 from torchtransient.plugins.integrators.vertex import attach_ray, vertex_terms
 
 
@@ -19,9 +19,42 @@ def tangents(values):
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
-    pushed = dr.forward_to(*attached)
+    # Some of the values are inputs of others: their tangents must survive the traversal, so vertices are not cleared.
+    pushed = dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
     pushed = list(pushed) if isinstance(pushed, (tuple, list)) and len(attached) > 1 else [pushed]
     return [pushed.pop(0) if dr.grad_enabled(v) else dr.zeros(type(v)) for v in values]
+
+
+def vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, t_ray, t_w):
+    """The terms of a vertex, detached, and their tangents in the order of ``values``.
+
+    Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind, which
+    the next traversal would run into.
+    """
+    with dr.resume_grad():
+        ray, _, _, w = attach_ray(v, facts, t_ray, t_w)
+        x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here)
+        values = [x.Le, x.f, x.W]
+        if facts.geometry:
+            values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
+            if facts.delta:
+                values += [x.p_out, x.d_out]
+            if facts.emitter_shape_moves:
+                values += [x.E, x.length_E]
+        t = tangents(values)
+    for name, value in vars(x).items():
+        if value is not None:
+            setattr(x, name, dr.detach(value))
+    return x, t
+
+
+def settle_tangents(scene, facts):
+    """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
+    attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
+    if facts.refracts and dr.grad_enabled(facts.refraction.table):
+        attached.append(facts.refraction.table)
+    if attached:
+        dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
 
 
 @dr.syntax
@@ -43,38 +76,26 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
         follow = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
         si_next = follow.pi.compute_surface_interaction(follow.ray, mi.RayFlags.Minimal, v.goes_on)
         nxt = next_vertex(store, k, si_next.p, si_next.n, follow.ray.d, si_next.is_valid() & v.goes_on, v, facts, ray0)
-        with dr.resume_grad():
-            ray, o, d, w = attach_ray(v, facts, (t_o, t_d), t_w)
-            x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live)
-            values = [x.Le, x.f, x.W]
-            if dr.hint(facts.geometry, mode="scalar"):
-                values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
-                if dr.hint(facts.delta, mode="scalar"):
-                    values += [x.p_out, x.d_out]
-                if dr.hint(facts.emitter_shape_moves, mode="scalar"):
-                    values += [x.E, x.length_E]
-            t = tangents(values)
-        Le, f, W = dr.detach(x.Le), dr.detach(x.f), dr.detach(x.W)
-        own = mi.Bool(True)
-        if dr.hint(facts.emitter_shape_moves, mode="scalar"):
-            own = (k == 0) | previous_is_delta(store, k, live)
-        dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), dr.detach(x.length_em) * dr.detach(x.index_em)
+        led_here = led_to(store, k, live, facts)
+        x, t = vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, (t_o, t_d), t_w)
+        Le, f, W = x.Le, x.f, x.W
+        dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), x.length_em * x.index_em
         if dr.hint(facts.geometry, mode="scalar"):
             counted = mi.Float(1)
             if dr.hint(integrator.camera_unwarp, mode="scalar"):
                 counted = dr.select(k == 0, 0, counted)
-            dτ_v += counted * (v.η * t[3] + dη * dr.detach(x.seg))
+            dτ_v += counted * (v.η * t[3] + dη * x.seg)
             dτ_em = dτ_v + v.η * t[4] + dη * length_em
-        d_Le = dr.select(own, dβ * Le + v.β * t[0], 0)
+        d_Le = dβ * Le + v.β * t[0]
         d_f = dβ * f + v.β * t[1]
         dL += dr.select(live, d_Le + d_f, 0)
-        lane.put_slope(v.τ, d_Le, dr.select(own, v.β * Le, 0) * dτ_v, x.hit)
+        lane.put_slope(v.τ, d_Le, v.β * Le * dτ_v, x.hit)
         lane.put_slope(v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
-            E = dr.detach(x.E)
+            E = x.E
             d_E = dβ * E + v.β * t[-2]
             dL += dr.select(live, d_E, 0)
-            dτ_E = dτ_v + dη * dr.detach(x.step) * dr.detach(x.length_E) + follow.η * t[-1]
+            dτ_E = dτ_v + dη * x.step * x.length_E + follow.η * t[-1]
             lane.put_slope(follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
 
         # ------------------------------------------------------------------- to the next vertex
@@ -82,7 +103,7 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
         dτ = dτ_v
         if dr.hint(facts.geometry, mode="scalar"):
             dτ += follow.η * t[5]
-            dη = dη * dr.detach(x.step) + v.η * t[7]
+            dη = dη * x.step + v.η * t[7]
             t_o, t_d = mi.Vector3f(0), mi.Vector3f(0)
             t_w = dr.select(x.ahead, t[6], 0)
             if dr.hint(facts.delta, mode="scalar"):

@@ -16,7 +16,8 @@ class SceneFacts:
 
     ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups. ``distant``: reference sphere of infinitely distant
     emitters, None when there are none. ``refraction``: table of the indices of transmissive rough BSDFs, None when there are none. The remaining ones
-    describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``, ``emitter_shape_moves``, ``sensor_moves``,
+    describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
+    spherical ones), ``sensor_moves``,
     ``index_moves``.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
@@ -30,6 +31,7 @@ class SceneFacts:
         self.geometry = False
         self.light_moves = False
         self.emitter_shape_moves = False
+        self.sphere_lights = False
         self.sensor_moves = False
         self.index_moves = False
 
@@ -64,6 +66,7 @@ class SceneFacts:
         facts.geometry = shapes or light or sensor_moves or index
         facts.light_moves = light
         facts.emitter_shape_moves = emitter_shape
+        facts.sphere_lights = facts.geometry and any(s.is_emitter() and s.class_name() == "Sphere" for s in scene.shapes())
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
         return facts

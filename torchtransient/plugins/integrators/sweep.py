@@ -13,7 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.integrators.path_record import read_vertex
+from torchtransient.plugins.integrators.path_record import DELTA, read_vertex
 from torchtransient.plugins.integrators.vertex import Terms, attach_ray, vertex_terms
 
 
@@ -29,6 +29,14 @@ def next_vertex(store, k, p, n, d, valid, v, facts, ray0):
     if facts.emitter_shape_moves:
         nxt.vertex = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
     return nxt
+
+
+def led_to(store, k, active, facts):
+    """Whether the sensor or a delta lobe led to vertex ``k``; only looked up where it matters."""
+    if not (facts.emitter_shape_moves or facts.sphere_lights):
+        return mi.Bool(True)
+    flags = store["flags"].read(dr.maximum(k, 1) - 1, active & (k > 0))
+    return (k == 0) | ((flags & DELTA) != 0)
 
 
 @dr.syntax
@@ -51,22 +59,18 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
         nxt = next_vertex(store, k, next_p, next_n, next_d, next_valid, v, facts, ray0)
         with dr.resume_grad():
             ray, o, d, w = attach_ray(v, facts)
-            x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live)
+            x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_to(store, k, live, facts))
             f, Le, W = dr.detach(x.f), dr.detach(x.Le), dr.detach(x.W)
             τ_em = mi.Float64(dr.detach(x.length_em) * dr.detach(x.index_em) * v.η)
             A_e, A1_e = lane.read(v.τ, x.hit)
             A_n, A1_n = lane.read(v.τ + τ_em, v.lit)
-            own = mi.Bool(True)
-            if dr.hint(facts.emitter_shape_moves, mode="scalar"):
-                # Emission found after a smooth bounce belongs to the vertex before, see emission_ahead().
-                own = (k == 0) | previous_is_delta(store, k, live)
-            objective = dr.sum(v.β * (dr.select(own, A_e, 0) * x.Le + A_n * x.f + x.W * S))
-            S_new = dr.select(own, A_e * Le, 0) + A_n * f + W * S
+            objective = dr.sum(v.β * (A_e * x.Le + A_n * x.f + x.W * S))
+            S_new = A_e * Le + A_n * f + W * S
             D_new = mi.UnpolarizedSpectrum(D)
             a_η_new = mi.Float(0)
             if dr.hint(facts.geometry, mode="scalar"):
                 D_em, D_out = A1_n * f, W * D
-                D_new = dr.select(own, A1_e * Le, 0) + D_em + D_out
+                D_new = A1_e * Le + D_em + D_out
                 if dr.hint(facts.emitter_shape_moves, mode="scalar"):
                     A_E, A1_E = lane.read(nxt.vertex.τ, x.lit_ahead)
                     E = dr.detach(x.E)
@@ -105,11 +109,3 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
         live = i >= 0
     first = dr.sum(D)
     return a_o, a_d, first
-
-
-def previous_is_delta(store, k, active):
-    """Whether vertex ``k - 1`` scattered by a delta lobe."""
-    from torchtransient.plugins.integrators.path_record import DELTA
-
-    flags = store["flags"].read(dr.maximum(k, 1) - 1, active & (k > 0))
-    return (flags & DELTA) != 0

@@ -52,6 +52,11 @@ def material_point(pi, ray, active):
     return si, dr.norm(dr.cross(si.dp_du, si.dp_dv))
 
 
+def is_sphere(emitter):
+    """Whether the shape of an area emitter is a sphere."""
+    return emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere)
+
+
 def attach_ray(v, facts, t_ray=None, t_w=None):
     """The ray that found a vertex, with the attachments that the facts call for: (ray, o, d, direction for wi)."""
     o, d, w = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d), mi.Vector3f(v.ray.d)
@@ -84,13 +89,21 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
         at_point = v.lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
         moving, _ = scene.sample_emitter_direction(si, v.u_em, False, at_point)
         p = dr.replace_grad(p, dr.select(at_point, moving.p, dr.detach(moving.p)))
+    cone = mi.Bool(False)
+    if facts.sphere_lights:
+        # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A sphere is
+        # sampled over the cone that it fills, which moves with it, and by this strategy alone.
+        cone = surface & is_sphere(ds.emitter)
+        surface &= ~cone
+        ds_cone, weight_cone = scene.sample_emitter_direction(si, v.u_em, False, cone)
+        p = dr.replace_grad(p, dr.select(cone, ds_cone.p, dr.detach(ds_cone.p)))
     if facts.emitter_shape_moves:
         ray_em = dr.detach(si).spawn_ray(ds.d)
         pi_em = scene.ray_intersect_preliminary(ray_em, active=surface)
         si_em, area = material_point(pi_em, ray_em, surface & pi_em.is_valid())
         on_light = surface & pi_em.is_valid() & (dr.detach(si_em).emitter(scene) == ds.emitter)
-        p = dr.replace_grad(p, dr.select(on_light, si_em.p, ds.p))
-        n = dr.replace_grad(n, dr.select(on_light, si_em.n, ds.n))
+        p = dr.select(on_light, dr.replace_grad(p, si_em.p), p)
+        n = dr.select(on_light, dr.replace_grad(n, si_em.n), n)
         area = dr.relative_grad(dr.select(on_light, area, 1))
     diff = dr.copy(ds)
     d = mi.Vector3f(ds.d)
@@ -102,18 +115,22 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
     value = mi.unpolarized_spectrum(scene.eval_emitter_direction(si, diff, v.lit)) * inv_pdf
     if facts.geometry:
         value *= dr.relative_grad(solid_angle_over_area(si.p, p, n, surface)) * area
+    if facts.sphere_lights:
+        value = dr.select(cone, mi.unpolarized_spectrum(weight_cone), value)
     em_weight = dr.replace_grad(weight, value)
 
     wo = si.to_local(d)
     val, pdf = bsdf.eval_pdf(ctx, si, wo, v.lit)
-    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+    mis = dr.select(ds.delta | cone, 1, mis_weight(ds.pdf, dr.detach(pdf)))
     terms.f = dr.select(v.lit, mi.unpolarized_spectrum(val) * em_weight * mis, 0)
     terms.length_em = length_to(facts, si.p, p, v.lit & ~far, d)
     terms.index_em = facts.index_towards(bsdf, si, wo, mi.Float(1))
 
 
-def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live):
+def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     """Evaluate vertex ``v`` (see :class:`~.path_record.Vertex`) with derivatives.
+
+    ``led_here``: the vertex was found by the sensor or by a delta lobe, so that emission there has no other strategy.
 
     ``nxt`` is the next vertex: ``p, n, d, valid`` detached and, where emitter shapes move, its ``vertex``. Returns
     :class:`Terms` with ``si, Le, f, length_em, index_em, W, seg, seg_out, out, step, onward, mirrored`` and, for delta lobes, ``p_out, d_out``.
@@ -129,6 +146,12 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live):
     bsdf = sid.bsdf(v.ray)
 
     hit = live & (v.mis > 0)
+    if facts.emitter_shape_moves:
+        # Emission found after a smooth bounce belongs to the vertex before, see emission_ahead().
+        hit &= led_here
+    elif facts.sphere_lights:
+        on_surface = mi.has_flag(sid.emitter(scene).flags(), mi.EmitterFlags.Surface)
+        hit &= led_here | ~on_surface | ~is_sphere(sid.emitter(scene))
     terms.hit = hit
     terms.Le = dr.select(hit, v.mis * mi.unpolarized_spectrum(sid.emitter(scene).eval(si, hit)), 0)
     emitter_terms(terms, scene, ctx, si, bsdf, v, facts)
@@ -167,6 +190,10 @@ def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
     alike, or the weights between them would no longer sum to one under the motion.
     """
     lit = terms.ahead & (nxt.vertex.mis > 0)
+    if facts.sphere_lights:
+        with dr.suspend_grad():
+            hit = nxt.vertex.pi.compute_surface_interaction(nxt.vertex.ray, mi.RayFlags.Minimal, lit)
+            lit &= ~is_sphere(hit.emitter(scene))
     si_e, area = material_point(nxt.vertex.pi, nxt.vertex.ray, lit)
     out = direction_to(si.p, si_e.p, lit, mi.Vector3f(nxt.d))
     si_e.wi = dr.select(lit, si_e.to_local(-out), dr.detach(si_e.wi))

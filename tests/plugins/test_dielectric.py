@@ -1,0 +1,354 @@
+"""``diff_dielectric`` and ``diff_rough_dielectric`` against Mitsuba's plugins, and their derivatives against the textbook."""
+
+from __future__ import annotations
+
+import importlib
+from itertools import product
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
+
+LANES = 4000
+
+MATERIALS = [
+    {"int_ior": 1.5, "ext_ior": 1.0},
+    {},
+    {"int_ior": "water", "ext_ior": "diamond"},
+    {"int_ior": 1.33, "specular_reflectance": 0.3, "specular_transmittance": 0.7},
+]
+ROUGHNESSES = [
+    {"alpha": 0.3},
+    {"alpha": 0.02, "distribution": "ggx"},
+    {"alpha_u": 0.1, "alpha_v": 0.5, "distribution": "ggx"},
+    {"alpha_u": 0.1, "alpha_v": 0.5},
+]
+
+
+def activate(variant: str) -> None:
+    mi.set_variant(variant)
+    for name in ("dielectric", "rough_dielectric"):
+        importlib.reload(importlib.import_module(f"torchtransient.plugins.bsdfs.{name}"))
+
+
+def directions(count: int, seed: int) -> np.ndarray:
+    """Directions over the whole sphere; one in ten is close to the surface."""
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    d[::10, 2] *= 1e-2
+    return (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+
+
+def interaction(wi):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = wi
+    if mi.is_spectral:
+        si.wavelengths = mi.UnpolarizedSpectrum(550)
+    return si
+
+
+def inputs(count: int):
+    rng = np.random.default_rng(7)
+    wi, wo = directions(count, 1), directions(count, 2)
+    return wi, wo, rng.random(count, dtype=np.float32), rng.random((count, 2), dtype=np.float32)
+
+
+def evaluate_all(bsdf, ctx):
+    """Every result of ``sample``, ``eval``, ``pdf`` and ``eval_pdf`` as arrays with the lane last."""
+
+    def call(wi, wo, u1, u2):
+        si = interaction(wi)
+        bs, weight = bsdf.sample(ctx, si, u1, u2, True)
+        f, pdf = bsdf.eval_pdf(ctx, si, wo, True)
+        rest = (weight, f, pdf, bsdf.eval(ctx, si, wo, True), bsdf.pdf(ctx, si, wo, True))
+        return (bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, *rest)
+
+    if mi.variant().startswith("scalar"):
+        lanes = [call(mi.Vector3f(a), mi.Vector3f(b), float(c), mi.Point2f(d)) for a, b, c, d in zip(*inputs(200), strict=True)]
+        return [np.stack([np.array(x, dtype=float) for x in column], -1) for column in zip(*lanes, strict=True)]
+    wi, wo, u1, u2 = inputs(LANES)
+    result = call(mi.Vector3f(wi.T), mi.Vector3f(wo.T), mi.Float(u1), mi.Point2f(u2.T))
+    arrays = [np.asarray(np.array(x), dtype=float) for x in result]
+    return [np.broadcast_to(a, (*a.shape[:-1], LANES)) for a in arrays]  # constants come as one entry
+
+
+def contexts():
+    for mode, component in product((mi.TransportMode.Radiance, mi.TransportMode.Importance), (None, 0, 1)):
+        ctx = mi.BSDFContext(mode)
+        if component is not None:
+            ctx.component = component
+        yield ctx
+
+
+def compare(ours, theirs, ctx):
+    for i in range(2):
+        assert ours.flags(i) == theirs.flags(i)
+    got, expected = evaluate_all(ours, ctx), evaluate_all(theirs, ctx)
+    # Where the weight is zero (a facet seen from behind) direction, density and index have no meaning.
+    weight = expected[5]
+    lit = weight.reshape(-1, weight.shape[-1]).max(0) > 0
+    # Mitsuba computes Mueller matrices of refraction from the refracted cosine, which loses up to a quarter at grazing
+    # incidence (the matrix's first entry must be 1 / eta^2 here; see test_grazing_mueller_matrix).
+    steep = np.abs(inputs(weight.shape[-1])[0][:, 2]) > 0.05
+    for k, (a, b) in enumerate(zip(got, expected, strict=True)):
+        assert np.isfinite(a).all()
+        if k < 5:
+            a, b = a[..., lit], b[..., lit]
+        elif k == 5 and mi.is_polarized:
+            a, b = a[..., steep], b[..., steep]
+        error = np.abs(a - b) / (np.abs(b) + 2e-3)
+        # Within a few parts in 1e7 of the critical angle, and at a lobe's boundary, rounding of the inputs decides.
+        assert np.quantile(error, 0.998) < 2e-3, k
+        assert error.max() < 0.6 or (error > 2e-3).sum() <= 2, k
+
+
+VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_smooth_equals_mitsuba(variant):
+    activate(variant)
+    for material, ctx in product(MATERIALS, contexts()):
+        compare(mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_rough_equals_mitsuba(variant):
+    activate(variant)
+    for (material, roughness), ctx in product(zip(MATERIALS, ROUGHNESSES, strict=True), contexts()):
+        both = {**material, **roughness}
+        ours = mi.load_dict({"type": "diff_rough_dielectric", **both})
+        compare(ours, mi.load_dict({"type": "roughdielectric", **both}), ctx)
+
+
+def test_grazing_mueller_matrix():
+    activate("llvm_ad_mono_polarized")
+    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    z = np.float32([1e-3, 1e-2, 0.1, 0.5, 1])
+    wi = mi.Vector3f(np.stack([np.sqrt(1 - z * z), 0 * z, z]))
+    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(0.9999999), mi.Point2f(0.5))
+    assert dr.all(bs.sampled_component == 1)
+    np.testing.assert_allclose(np.array(weight)[0, 0].ravel(), 1 / 2.25, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sample_visible", [True, False])
+@pytest.mark.parametrize("roughness", ROUGHNESSES)
+def test_sample_agrees_with_eval_and_pdf(roughness, sample_visible):
+    activate("llvm_ad_mono")
+    bsdf = mi.load_dict({"type": "diff_rough_dielectric", "sample_visible": sample_visible, **roughness})
+    wi, _, u1, u2 = inputs(LANES)
+    wi = wi[np.abs(wi[:, 2]) > 0.05]
+    n = len(wi)
+    si, ctx = interaction(mi.Vector3f(wi.T)), mi.BSDFContext()
+    bs, weight = bsdf.sample(ctx, si, mi.Float(u1[:n]), mi.Point2f(u2[:n].T))
+    f, pdf = bsdf.eval_pdf(ctx, si, bs.wo)
+    used = (weight[0] > 0).numpy()
+    assert used.mean() > 0.7
+    for a, b in ((pdf.numpy(), bs.pdf.numpy()), (f[0].numpy(), (weight[0] * bs.pdf).numpy())):
+        error = np.abs(a - b)[used] / (np.abs(b)[used] + 1e-3)
+        assert np.quantile(error, 0.99) < 2e-2
+
+
+# ------------------------------------------------------------------------------------------------ derivatives
+
+
+def test_smooth_sample_is_attached():
+    """Direction, index, probability and weight of both lobes against autograd in double precision."""
+    activate("llvm_ad_mono")
+    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    wi, _, u1, u2 = inputs(LANES)
+    steep = np.abs(wi[:, 2]) > 0.8  # no total internal reflection
+    wi, u1 = wi[steep], u1[steep]
+    u1[::2] *= 0.04  # many reflections
+    params = mi.traverse(bsdf)
+    dr.enable_grad(params["eta"])
+    params.update()
+    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(mi.Vector3f(wi.T)), mi.Float(u1), mi.Point2f(0.5))
+    reflected = bs.sampled_component.numpy() == 0
+    assert 0.1 < reflected.mean() < 0.9
+
+    w = torch.tensor(wi, dtype=torch.float64)
+    eta = torch.full((len(wi),), 1.5, dtype=torch.float64, requires_grad=True)
+    eta_it = torch.where(w[:, 2] > 0, eta, 1 / eta)
+    F = fresnel_reflectance(w[:, 2], eta)
+    mask = torch.tensor(reflected)
+    mirror = w * torch.tensor([-1.0, -1.0, 1.0])
+    wo = torch.where(mask[:, None], mirror, refracted_direction(w, eta))
+    expected = [*wo.T, torch.where(mask, F, 1 - F), torch.where(mask, 1.0, eta_it), torch.where(mask, 1.0, eta_it**-2)]
+
+    outputs = [*bs.wo, bs.pdf, bs.eta, weight[0]]
+    dr.set_grad(params["eta"], 1)
+    dr.forward_to(outputs)
+    for got, value in zip(outputs, expected, strict=True):
+        np.testing.assert_allclose(dr.detach(got).numpy(), value.detach().numpy(), rtol=2e-5, atol=2e-6)
+        (slope,) = torch.autograd.grad(value.sum(), eta, retain_graph=True, allow_unused=False)
+        np.testing.assert_allclose(np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5)
+
+
+def test_smooth_sample_is_attached_to_the_incident_direction():
+    activate("llvm_ad_mono")
+    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    wi = mi.Vector3f(0.48, -0.36, 0.8)
+    dr.enable_grad(wi)
+    for u, lobe in ((0.0, "reflection"), (0.9, "transmission")):
+        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(u), mi.Point2f(0.5))
+        w = torch.tensor([[0.48, -0.36, 0.8]], dtype=torch.float64, requires_grad=True)
+        eta = torch.tensor([1.5], dtype=torch.float64)
+        expected = w * torch.tensor([-1.0, -1.0, 1.0]) if lobe == "reflection" else refracted_direction(w, eta)
+        for axis in range(3):
+            (slope,) = torch.autograd.grad(expected[0, axis], w, retain_graph=True)
+            dr.clear_grad(wi)
+            dr.backward(bs.wo[axis], flags=dr.ADFlag.ClearInterior)
+            got = dr.grad(wi).numpy()[:, 0]
+            # On the sphere: the plugin takes z of the refracted direction from wi.z, the reference from wi.x and wi.y.
+            tangents = np.array([[0.6, 0.8, 0.0], [0.64, -0.48, -0.6]])
+            np.testing.assert_allclose(tangents @ got, tangents @ slope.numpy()[0], atol=2e-6)
+
+
+@pytest.mark.parametrize("ggx", [True, False])
+@pytest.mark.parametrize("alphas", [(0.3, 0.3), (0.1, 0.5), (0.02, 0.02)])
+def test_rough_eval_and_pdf_are_attached(ggx, alphas):
+    """Derivatives in the index, both roughnesses and both directions against autograd in double precision."""
+    activate("llvm_ad_mono")
+    bsdf = mi.load_dict({
+        "type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha_u": alphas[0], "alpha_v": alphas[1],
+        "distribution": "ggx" if ggx else "beckmann",
+    })  # fmt: skip
+    wi, _, u1, u2 = inputs(LANES)
+    keep = np.abs(wi[:, 2]) > 0.1
+    wi, u1, u2 = wi[keep], u1[keep], u2[keep]
+    u1[::2] *= 0.05
+    # Directions that matter: where the plugin scatters to, for a somewhat wider lobe.
+    wide = mi.load_dict({"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 1.2 * max(alphas)})
+    bs, weight = wide.sample(mi.BSDFContext(), interaction(mi.Vector3f(wi.T)), mi.Float(u1), mi.Point2f(u2.T))
+    wo = bs.wo.numpy().T
+    good = (weight[0].numpy() > 0) & (np.abs(wo[:, 2]) > 0.1)
+    wi, wo = wi[good], wo[good]
+
+    def f64(x):
+        return torch.tensor(np.asarray(x, dtype=np.float64)).requires_grad_()
+
+    n = len(wi)
+    reference = [f64(wi), f64(wo), f64(np.full(n, 1.5))] + [f64(np.full(n, np.float32(a))) for a in alphas]
+    expected = rough_dielectric(*reference, ggx)
+
+    params = mi.traverse(bsdf)
+    arguments = [mi.Vector3f(wi.T), mi.Vector3f(wo.T)]
+    for key in ("eta", "alpha_u.value", "alpha_v.value"):
+        params[key] = dr.full(mi.Float, params[key][0], n) if key == "eta" else params[key]
+    params.update()
+    checked = 0
+    for k, value in enumerate(expected):
+        slopes = torch.autograd.grad(value.sum(), reference, retain_graph=True)
+        leaves = [*arguments, params["eta"], params["alpha_u.value"], params["alpha_v.value"]]
+        for leaf, slope in zip(leaves, slopes, strict=True):
+            dr.enable_grad(leaf)
+            params.update()
+            got = bsdf.eval_pdf(mi.BSDFContext(), interaction(arguments[0]), arguments[1])[k]
+            dr.backward(dr.sum(got))
+            a, b = dr.grad(leaf).numpy(), slope.numpy()
+            dr.disable_grad(leaf)
+            if a.ndim == 2:
+                # Only turning a unit vector means something: compare along the sphere.
+                d = leaf.numpy().T
+                a, b = (g - d * (g * d).sum(1, keepdims=True) for g in (a.T, b))
+            if a.shape[0] == 1:  # a uniform roughness collects the sum over all lanes
+                assert a.sum() == pytest.approx(b.sum(), rel=1e-3)
+            else:
+                scale = np.abs(b) + 1e-3 * np.abs(b).max()
+                assert np.quantile(np.abs(a - b) / scale, 0.99) < 2e-3
+            checked += 1
+    assert checked == 10
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_detached_estimator_of_a_rough_lobe(side):
+    """What the integrator does: mean of ``weight * relative_grad(pdf) * g(wo)`` over detached samples.
+
+    Its derivative in eta and alpha must be that of the integral over the sphere of directions.
+    """
+    activate("llvm_ad_mono")
+    plugin = {"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.4, "distribution": "ggx"}
+    wi = mi.Vector3f(dr.normalize(mi.Vector3f(0.4, 0.2, 0.9 * side)))
+    weigh = mi.Vector3f(0.3, -0.5, 0.7)
+
+    count = 400000
+    rng = np.random.default_rng(3)
+    u1, u2 = mi.Float(rng.random(count)), mi.Point2f(rng.random((2, count)))
+    for key in ("eta", "alpha.value"):
+        bsdf = mi.load_dict(plugin)
+        params = mi.traverse(bsdf)
+        dr.enable_grad(params[key])
+        params.update()
+        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), u1, u2)
+        estimate = weight[0] * dr.relative_grad(bs.pdf) * (1 + dr.dot(bs.wo, weigh))
+        estimate = dr.select(weight[0] > 0, estimate, 0)
+        dr.set_grad(params[key], 1)
+        samples = dr.forward_to(estimate).numpy()
+        mean, error = samples.mean(), samples.std() / np.sqrt(count)
+
+        # Midpoint rule over the sphere, in double precision.
+        z = (np.arange(800) + 0.5) / 400 - 1
+        phi = (np.arange(800) + 0.5) * (2 * np.pi / 800)
+        Z, P = (torch.tensor(x.ravel()) for x in np.meshgrid(z, phi))
+        R = torch.sqrt(1 - Z * Z)
+        wo = torch.stack([R * torch.cos(P), R * torch.sin(P), Z], -1)
+        w = torch.tensor(wi.numpy()[:, 0], dtype=torch.float64).expand_as(wo)
+        eta = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+        alpha = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+        value, _ = rough_dielectric(w, wo, eta.expand(len(wo)), alpha.expand(len(wo)), alpha.expand(len(wo)), True)
+        integrand = value * (1 + wo @ torch.tensor(weigh.numpy()[:, 0], dtype=torch.float64))
+        total = integrand.sum() * (4 * np.pi / len(wo))
+        (slope,) = torch.autograd.grad(total, eta if key == "eta" else alpha)
+        assert abs(mean - slope.item()) < 4 * error + 2e-3 * abs(slope.item()), key
+
+
+def test_gradient_passes_through_a_call_by_pointer():
+    """The plugins are reached through arrays of pointers in a loop: the index must collect its derivative there too."""
+    activate("llvm_ad_rgb")
+    for kind in ("diff_dielectric", "diff_rough_dielectric"):
+        scene = mi.load_dict({"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}})
+        params = mi.traverse(scene)
+        dr.enable_grad(params["a.bsdf.eta"])
+        params.update()
+        rays = mi.Ray3f(mi.Point3f(0.1, 0.2, 2), dr.normalize(mi.Vector3f(mi.Float([0.3, -0.2, 0.1]), 0.1, -1)))
+        si = scene.ray_intersect(rays)
+        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
+        dr.backward(dr.sum(bs.eta + bs.pdf * 0))
+        assert dr.grad(params["a.bsdf.eta"])[0] == pytest.approx(3, rel=1e-5)
+
+
+# ----------------------------------------------------------------------------------------------------- parameters
+
+
+def test_parameters():
+    activate("llvm_ad_mono")
+    smooth = mi.traverse(mi.load_dict({"type": "diff_dielectric", "int_ior": "bk7", "ext_ior": "air"}))
+    assert smooth["eta"][0] == pytest.approx(1.5046 / 1.000277, rel=1e-6)
+    assert smooth.flags("eta") & mi.ParamFlags.Discontinuous
+    textured = {"type": "diff_rough_dielectric", "alpha_u": 0.2, "alpha_v": 0.3, "specular_reflectance": 0.5}
+    assert set(mi.traverse(mi.load_dict(textured)).keys()) == {
+        "eta", "alpha_u.value", "alpha_v.value", "specular_reflectance.value",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("plugin", "message"),
+    [
+        ({"type": "diff_dielectric", "int_ior": 0.0}, "above 0"),
+        ({"type": "diff_dielectric", "ext_ior": -1.5}, "above 0"),
+        ({"type": "diff_dielectric", "int_ior": "unobtainium"}, "Valid choices are"),
+        ({"type": "diff_rough_dielectric", "int_ior": 1.3, "ext_ior": 1.3}, "must differ"),
+        ({"type": "diff_rough_dielectric", "distribution": "phong"}, "'beckmann' or 'ggx'"),
+        ({"type": "diff_rough_dielectric", "alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.1}, "either 'alpha'"),
+        ({"type": "diff_rough_dielectric", "alpha_u": 0.1}, "both 'alpha_u' and 'alpha_v'"),
+        ({"type": "diff_dielectric", "roughness": 0.1}, "roughness"),
+    ],
+)
+def test_wrong_parameters(plugin, message):
+    activate("llvm_ad_mono")
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict(plugin)

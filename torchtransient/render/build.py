@@ -1,0 +1,277 @@
+"""From a description to a Mitsuba scene: what is overridden on the way, and the errors told in the user's terms.
+
+The description is parsed into Mitsuba's list of nodes, the nodes are edited (film, integrator, plugins with more derivatives, stable
+names), and the list is instantiated. The same edits serve XML files and dictionaries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.render.description import Description
+
+# Steady integrators whose parameters mean the same for `transient_path`.
+_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+_PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+# What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
+_STEADY_FILMS = ("hdrfilm", "specfilm")
+_FILM_PROPERTIES = (
+    "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
+)  # fmt: skip
+DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """What is changed of a description when it is built.
+
+    ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for the integrator, or None.
+    ``substitute``: names of BSDFs that are built as their differentiable twins. ``merge``: let Mitsuba merge meshes and
+    equal materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into transient ones.
+    """
+
+    time_axis: tuple[float, float, int] | None = None
+    max_depth: int | None = None
+    substitute: frozenset[str] = frozenset()
+    merge: bool = False
+    transient: bool = False
+
+
+@dataclass
+class BuiltScene:
+    """A Mitsuba scene with what has to be known about its nodes."""
+
+    scene: Any
+    params: Any
+    mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
+    integrator: str = ""
+    slots: dict[tuple[str, ...], Any] = field(default_factory=dict)
+
+
+def build(description: Description, variant: str, options: BuildOptions) -> BuiltScene:
+    """Instantiate a description under the active variant. Raises ``SceneError`` with file and line where Mitsuba knows them."""
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(variant)
+    config.merge_equivalent = options.merge
+    config.merge_meshes = options.merge
+    try:
+        with description.resolved_files():
+            state = description.parse(config)
+            _check_root(state, description)
+            name_nodes(state)
+            _override_films(state, options)
+            _override_integrator(state, options)
+            _substitute_plugins(state, options.substitute)
+            transforms = _mesh_transforms(state)
+            integrator = _find_child(state, state.root, _is_integrator)
+            plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
+    except TorchTransientError:
+        raise
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise _scene_error(description, error) from error
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"{description.name}: expected one <scene>, got {type(scene).__name__}.")
+    params = mi.traverse(scene)
+    return BuiltScene(scene, params, transforms, plugin)
+
+
+def _scene_error(description: Description, error: Exception) -> Exception:
+    """The library's own error when a plugin raised one, else a ``SceneError`` with Mitsuba's message, which names file and line."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, TorchTransientError):
+            return type(cause)(f"{description.name}: {cause}")
+        cause = cause.__cause__ or cause.__context__
+    text = str(error).replace("While loading string", f"While loading {description.name}")
+    return SceneError(f"{description.name}: Mitsuba could not build the scene. {text}")
+
+
+def _check_root(state: Any, description: Description) -> None:
+    if state.root.props.plugin_name() != "scene":
+        raise SceneError(f"{description.name}: expected a <scene> at the top, got <{state.root.props.plugin_name()}>.")
+
+
+# --------------------------------------------------------------------------------------------------------- nodes
+
+
+def _children(state: Any, node: Any) -> list[tuple[str, int]]:
+    """(property, node index) for every child object of a node, references by id included."""
+    import mitsuba as mi
+
+    result, by_id = [], state.id_to_index
+    for key, value in node.props.items():
+        if isinstance(value, mi.Properties.ResolvedReference):
+            result.append((key, value.index()))
+        elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
+            result.append((key, by_id[value.id()]))
+    return result
+
+
+def _find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
+    for _, index in _children(state, node):
+        if matches(state.nodes[index]):
+            return index
+    return None
+
+
+def _is_film(node: Any) -> bool:
+    """In dictionaries Mitsuba does not know the kind of plugins written in Python; those are told by their name."""
+    import mitsuba as mi
+
+    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().endswith("_film")
+    return unknown or node.type == mi.ObjectType.Film
+
+
+def _is_integrator(node: Any) -> bool:
+    import mitsuba as mi
+
+    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().startswith("transient_")
+    return unknown or node.type == mi.ObjectType.Integrator
+
+
+def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, properties: Mapping[str, Any]) -> None:
+    import mitsuba as mi
+
+    node = mi.parser.SceneNode()
+    node.type = kind
+    node.props = mi.Properties(plugin)
+    for name, value in properties.items():
+        node.props[name] = value
+    state.nodes.append(node)
+    if len(state.node_paths):
+        state.node_paths = [*state.node_paths, key]
+    state.nodes[parent].props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+
+
+def name_nodes(state: Any) -> None:
+    """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``, ``shape_1``."""
+    children = [state.nodes[index] for _, index in _children(state, state.root)]
+    taken = {node.props.id() for node in children}
+    nameless = [node for node in children if not node.props.id()]
+    count: dict[str, int] = {}
+    for node in nameless:
+        kind = str(node.type).rsplit(".", 1)[-1].lower()
+        count[kind] = count.get(kind, 0) + 1
+    seen: dict[str, int] = {}
+    for node in nameless:
+        kind = str(node.type).rsplit(".", 1)[-1].lower()
+        number = seen.get(kind, 0)
+        name = kind if count[kind] == 1 else f"{kind}_{number}"
+        while name in taken:
+            number += 1
+            name = f"{kind}_{number}"
+        seen[kind] = number + 1
+        taken.add(name)
+        node.props.set_id(name)
+    _name_nested_bsdfs(state, taken)
+
+
+def _name_nested_bsdfs(state: Any, taken: set[str]) -> None:
+    """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
+    import mitsuba as mi
+
+    direct = {index for _, index in _children(state, state.root)}
+    for index, node in enumerate(state.nodes):
+        if node.type == mi.ObjectType.BSDF and index not in direct:
+            name = f"{node.props.id() or 'bsdf'}#{index}"
+            while name in taken:
+                name += "'"
+            taken.add(name)
+            node.props.set_id(name)
+
+
+def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
+    """``to_world`` as described, by the name of the shape: meshes apply it while loading and forget it."""
+    import mitsuba as mi
+
+    result = {}
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Shape and node.props.id():
+            matrix = np.eye(4)
+            if "to_world" in node.props:
+                matrix = np.array(node.props["to_world"].matrix, dtype=np.float64)
+            result[node.props.id()] = matrix
+    return result
+
+
+# ----------------------------------------------------------------------------------------------------- overrides
+
+
+def _override_films(state: Any, options: BuildOptions) -> None:
+    import mitsuba as mi
+
+    if options.time_axis is None and not options.transient:
+        return
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
+        film = _find_child(state, node, _is_film)
+        if film is None and node.type == mi.ObjectType.Sensor:
+            _add_child(state, index, "film", "hdrfilm", mi.ObjectType.Film, {})
+            film = len(state.nodes) - 1
+        if film is not None:
+            _override_film(state, film, options)
+
+
+def _override_film(state: Any, index: int, options: BuildOptions) -> None:
+    node = state.nodes[index]
+    plugin = node.props.plugin_name()
+    if options.transient and plugin in _STEADY_FILMS:
+        if options.time_axis is None and "temporal_bins" not in node.props:
+            raise SceneError(
+                f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., time_axis=tt.TimeAxis(start_opl=..., "
+                "bin_width_opl=..., num_bins=...)), or make the film a transient_hdr_film."
+            )
+        _become(state, index, "transient_hdr_film", keep=_FILM_PROPERTIES)
+    if options.time_axis is not None:
+        start, width, bins = options.time_axis
+        props = state.nodes[index].props
+        props["start_opl"], props["bin_width_opl"], props["temporal_bins"] = float(start), float(width), int(bins)
+
+
+def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
+    """Turn a node into another plugin; keep the named properties and every child object."""
+    import mitsuba as mi
+
+    old = state.nodes[index].props
+    children = {key for key, _ in _children(state, state.nodes[index])}
+    new = mi.Properties(plugin)
+    new.set_id(old.id())
+    for key in list(old.keys()):
+        if key in keep or key in children:
+            new[key] = old[key]
+    state.nodes[index].props = new
+
+
+def _override_integrator(state: Any, options: BuildOptions) -> None:
+    import mitsuba as mi
+
+    index = _find_child(state, state.root, _is_integrator)
+    if options.transient:
+        if index is None:
+            _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
+            index = len(state.nodes) - 1
+        plugin = state.nodes[index].props.plugin_name()
+        if plugin in _PATH_INTEGRATORS:
+            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        elif not plugin.startswith("transient_"):
+            raise SceneError(
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can stand in for: "
+                f"{', '.join(_PATH_INTEGRATORS)}."
+            )
+    if options.max_depth is not None and index is not None:
+        state.nodes[index].props["max_depth"] = int(options.max_depth)
+
+
+def _substitute_plugins(state: Any, names: frozenset[str]) -> None:
+    """Build the BSDFs called ``names`` as their differentiable twins, which take the same parameters."""
+    for node in state.nodes:
+        if node.props.id() in names and node.props.plugin_name() in DIFFERENTIABLE_PLUGINS:
+            node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[node.props.plugin_name()])

@@ -1,0 +1,243 @@
+"""What a scene is described by: an XML file or a dictionary, reduced to plain data that can be pickled.
+
+A description is parsed into Mitsuba's intermediate representation (``mitsuba.parser.ParserState``) whenever a scene is built. It never holds a
+Mitsuba object: those belong to one variant of one process.
+"""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import SceneError
+
+# Entries of a bitmap or volume that hold pixels, not a transform, even when they happen to be 4 x 4.
+_ARRAY_KEYS = ("data", "bitmap", "grid")
+
+
+@dataclass(frozen=True)
+class XmlDescription:
+    """An XML file: its path, its text at the time of loading, and the values for its ``$parameters``."""
+
+    path: str
+    text: str
+    parameters: tuple[tuple[str, str], ...]
+
+    @property
+    def name(self) -> str:
+        """How messages call this scene."""
+        return self.path
+
+    def parse(self, config: Any) -> Any:
+        """Mitsuba's parser state. The text of the time of loading counts, even if the file has changed or gone since."""
+        import mitsuba as mi
+
+        path = Path(self.path)
+        parameters = dict(self.parameters)
+        if path.is_file() and path.read_text(encoding="utf-8") == self.text:
+            return mi.parser.parse_file(config, self.path, **parameters)
+        return mi.parser.parse_string(config, self.text, **parameters)
+
+    @contextmanager
+    def resolved_files(self) -> Iterator[None]:
+        """Relative file names are looked up beside the XML file first."""
+        with _search_path(str(Path(self.path).parent)):
+            yield
+
+
+@dataclass(frozen=True)
+class DictDescription:
+    """A scene dictionary: strings, numbers, lists, and numpy arrays for transforms and pixels."""
+
+    tree: dict[str, Any]
+    folder: str
+
+    @property
+    def name(self) -> str:
+        """How messages call this scene."""
+        return "scene dictionary"
+
+    def parse(self, config: Any) -> Any:
+        """Mitsuba's parser state."""
+        import mitsuba as mi
+
+        return mi.parser.parse_dict(config, _to_mitsuba(self.tree, ""))
+
+    @contextmanager
+    def resolved_files(self) -> Iterator[None]:
+        """Relative file names are looked up in the folder that was current when the scene was loaded."""
+        with _search_path(self.folder):
+            yield
+
+
+Description = XmlDescription | DictDescription
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """A ``mitsuba.Bitmap`` as plain data: values as stored, and whether they are gamma-encoded."""
+
+    values: np.ndarray
+    srgb_gamma: bool
+
+    def to_bitmap(self) -> Any:
+        """The bitmap."""
+        import mitsuba as mi
+
+        bitmap = mi.Bitmap(self.values)
+        bitmap.set_srgb_gamma(self.srgb_gamma)
+        return bitmap
+
+
+@contextmanager
+def _search_path(folder: str) -> Iterator[None]:
+    import mitsuba as mi
+
+    before = mi.file_resolver()
+    resolver = mi.FileResolver(before)
+    resolver.prepend(folder)
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(before)
+
+
+def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) -> XmlDescription:
+    """Read an XML scene. Raises ``SceneError`` for a missing, unreadable or malformed file."""
+    file = Path(path)
+    if not file.is_file():
+        kind = "a folder" if file.is_dir() else "no such file"
+        raise SceneError(f"tt.load: expected the path of an XML scene, got {str(path)!r} ({kind} seen from {os.getcwd()}).")
+    try:
+        text = file.read_text(encoding="utf-8")
+        ElementTree.fromstring(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"tt.load: {file} cannot be read as text: {error}.") from error
+    except ElementTree.ParseError as error:
+        line, column = error.position
+        raise SceneError(f"tt.load: {file} is not well-formed XML at line {line}, column {column + 1}: {error}.") from error
+    values = tuple((key, _xml_value(key, value)) for key, value in sorted(parameters.items()))
+    return XmlDescription(str(file.resolve()), text, values)
+
+
+def _xml_value(key: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (str, int, float)):
+        return str(value)
+    raise SceneError(f"tt.load: XML parameter {key!r} must be a string or a number, got {type(value).__name__}.")
+
+
+def describe_dict(scene: Mapping[str, Any]) -> DictDescription:
+    """Reduce a scene dictionary to plain data. Raises ``SceneError`` for entries that cannot be described."""
+    tree = _to_plain(scene, "")
+    if tree.get("type") != "scene":
+        raise SceneError(f"tt.load: expected a dictionary with 'type': 'scene', got 'type': {tree.get('type')!r}.")
+    return DictDescription(tree, os.getcwd())
+
+
+def _to_plain(value: Any, path: str) -> Any:
+    """Plain data for ``value``: dictionaries, strings, numbers, lists of numbers, numpy arrays."""
+    where = path or "the top level"
+    if isinstance(value, Mapping):
+        plain = {}
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise SceneError(f"tt.load: keys must be strings, got {key!r} at {where}.")
+            plain[key] = _to_plain(item, f"{path}.{key}" if path else key)
+        return plain
+    if isinstance(value, (bool, int, float, str, Pixels)):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, np.ndarray):
+        return value.item() if value.ndim == 0 else np.array(value)
+    if isinstance(value, (list, tuple)):
+        return _plain_sequence(value, where)
+    if hasattr(value, "detach") and hasattr(value, "cpu"):
+        return _to_plain(value.detach().cpu().numpy(), path)
+    return _plain_mitsuba(value, where)
+
+
+def _plain_sequence(value: list[Any] | tuple[Any, ...], where: str) -> Any:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        # A spectrum given as (wavelength, value) pairs stays a list; everything else is ragged or not numeric.
+        raise SceneError(f"tt.load: the list at {where} is not an array of numbers: {value!r}.") from error
+    if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 2):
+        return array.tolist()
+    return array
+
+
+def _plain_mitsuba(value: Any, where: str) -> Any:
+    """Mitsuba and Dr.Jit values that have a description: transforms, colours, vectors, tensors, bitmaps."""
+    import mitsuba as mi
+
+    if isinstance(value, mi.Bitmap):
+        return Pixels(np.array(value), bool(value.srgb_gamma()))
+    if "Transform" in type(value).__name__:
+        return _plain_transform(value, where)
+    module = type(value).__module__
+    if module.startswith(("drjit", "mitsuba")) and not isinstance(value, mi.Object):
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise SceneError(f"tt.load: the {type(value).__name__} at {where} cannot be described as an array.") from error
+        array = array.reshape(array.shape[:-1]) if array.ndim == 2 and array.shape[-1] == 1 else array
+        if array.size == 1:
+            return float(array.reshape(-1)[0])
+        return array.tolist() if array.ndim == 1 else array
+    raise SceneError(
+        f"tt.load: the {type(value).__name__} at {where} cannot be described, and a scene must be rebuilt in other variants and processes. "
+        "Give its dictionary, transforms as 4x4 arrays or Mitsuba transforms, pixels as arrays, meshes as files."
+    )
+
+
+def _plain_transform(value: Any, where: str) -> np.ndarray:
+    matrix = np.array(value.matrix, dtype=np.float64)
+    if matrix.ndim == 3 and matrix.shape[-1] == 1:
+        matrix = matrix[..., 0]
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise SceneError(f"tt.load: expected one transform at {where}, got matrices of shape {matrix.shape}.")
+    return matrix
+
+
+def _double_transform() -> Any:
+    """Mitsuba's scalar transform in double precision, which has no public name in single precision variants."""
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    properties["transform"] = mi.ScalarTransform4f()
+    return type(properties["transform"])
+
+
+def _to_mitsuba(value: Any, key: str) -> Any:
+    """The dictionary that Mitsuba reads, for the active variant."""
+    import mitsuba as mi
+
+    if isinstance(value, dict):
+        return {name: _to_mitsuba(item, name) for name, item in value.items()}
+    if isinstance(value, Pixels):
+        return value.to_bitmap()
+    if isinstance(value, np.ndarray):
+        if key == "bitmap":
+            return mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
+        if key not in _ARRAY_KEYS and value.shape == (4, 4):
+            return _double_transform()(value)
+        if key not in _ARRAY_KEYS and value.shape == (3, 3):
+            return mi.ScalarTransform3f(value)
+        if value.ndim == 1:
+            return value.tolist()
+        return mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
+    return value

@@ -1,0 +1,336 @@
+"""Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
+
+Every run installs its values in the scene, renders, reads the result and puts the described values back, under one lock: between two runs a
+scene is always in the state of its description, and no Dr.Jit graph outlives a run.
+
+Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items when there are several.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchtransient.errors import GradientError, SceneError, ShapeError, UnitError
+from torchtransient.render.build import BuildOptions
+from torchtransient.render.memory import check_fits
+from torchtransient.render.variant import active_variant
+
+if TYPE_CHECKING:
+    from torchtransient.render.parameters import SlotTable
+    from torchtransient.render.scene_handle import Scene
+
+
+@dataclass(frozen=True)
+class Item:
+    """One film to fill: which entry of the batch, which sensor, with which seeds."""
+
+    entry: int
+    sensor: int
+    seed: int
+    grad_seed: int
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Everything about a call that is not a tensor.
+
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects what the primal
+    run reports (seconds, energy outside the window) and belongs to one call.
+    """
+
+    scene: Scene
+    options: BuildOptions
+    keys: tuple[str, ...]
+    items: tuple[Item, ...]
+    batched: tuple[bool, ...]
+    spp: int
+    spp_grad: int
+    temporal_filter: str | None
+    needs: tuple[bool, ...] = ()
+    progress: Callable[[float], None] | None = None
+    log: dict[str, Any] = field(default_factory=dict)
+
+
+class _Session:
+    """A built scene in use."""
+
+    def __init__(self, job: RenderJob, slots: SlotTable):
+        self.job = job
+        self.slots = slots
+        self.scene = slots.built.scene
+        self.params = slots.built.params
+        self.integrator = self.scene.integrator()
+        self.sensors = self.scene.sensors()
+
+    def film(self, item: Item) -> Any:
+        return self.sensors[item.sensor].film()
+
+    def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
+        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        import drjit as dr
+        import mitsuba as mi
+
+        leaves = []
+        for value, batched, need in zip(values, self.job.batched, needs, strict=True):
+            entry = value[item.entry] if batched else value
+            # A copy: the scene must neither alias nor misalign memory that belongs to the caller.
+            leaf = mi.Float(entry.detach().reshape(-1).clone())
+            if need:
+                dr.enable_grad(leaf)
+            leaves.append(leaf)
+        with _quiet():
+            self.slots.install(leaves)
+        return leaves
+
+    def set_filter(self, name: str) -> list[tuple[Any, str]]:
+        """Use a temporal filter on all films; returns what they had."""
+        before = []
+        for target in [self.integrator, *(sensor.film() for sensor in self.sensors)]:
+            if hasattr(target, "temporal_filter"):
+                before.append((target, target.temporal_filter))
+                target.temporal_filter = name
+        return before
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is in our own table."""
+    import mitsuba as mi
+
+    logger = mi.logger()
+    before = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(before)
+
+
+@contextmanager
+def _session(job: RenderJob) -> Iterator[_Session]:
+    with active_variant(job.scene.variant):
+        slots = job.scene.slots(job.keys, job.options)
+        session = _Session(job, slots)
+        filters = session.set_filter(job.temporal_filter) if job.temporal_filter else []
+        try:
+            yield session
+        finally:
+            for target, name in filters:
+                target.temporal_filter = name
+            try:
+                slots.restore()
+            except BaseException:
+                job.scene.drop(job.options)
+                raise
+
+
+# ---------------------------------------------------------------------------------------------------------- primal
+
+
+def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render every item. Returns (steady, transient); a single item is a view of the film's own memory."""
+    started = time.perf_counter()
+    _check_finite(job, values)
+    with _session(job) as session:
+        check_items(session.sensors, job.items)
+        check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
+        result = _render_items(session, values)
+        job.log["integrator"] = session.slots.built.integrator
+    job.log["seconds"] = time.perf_counter() - started
+    return result
+
+
+def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    import drjit as dr
+
+    job, count = session.job, len(session.job.items)
+    steady_all = transient_all = None
+    before, after = [], []
+    for n, item in enumerate(job.items):
+        if n == 0 or item.entry != job.items[n - 1].entry:
+            session.install(item, values, [False] * len(values))
+        film = session.film(item)
+        with dr.suspend_grad():
+            session.integrator.render(
+                session.scene, sensor=item.sensor, seed=item.seed, spp=job.spp, develop=False, progress_callback=_fraction(job, n)
+            )
+            before.append(film.energy_before)
+            after.append(film.energy_after)
+            steady, transient = _take(film, transient_all[n] if transient_all is not None else None)
+        if count == 1:
+            steady_all, transient_all = steady, transient
+        elif steady_all is None or transient_all is None:
+            steady_all, transient_all = steady.new_empty((count, *steady.shape)), transient.new_empty((count, *transient.shape))
+        if count > 1:
+            steady_all[n].copy_(steady)
+            transient_all[n].copy_(transient)
+        del steady, transient
+    job.log["energy_before"], job.log["energy_after"] = tuple(before), tuple(after)
+    if steady_all is None or transient_all is None:
+        raise ShapeError("a batch must have at least one entry, got 0.")
+    return steady_all, transient_all
+
+
+def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
+    report, count = job.progress, len(job.items)
+    return None if report is None else lambda fraction: report((n + fraction) / count)
+
+
+def _take(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    """The film's result as torch tensors that own the film's memory. A cube stored in several bands is put together."""
+    import drjit as dr
+    import mitsuba as mi
+
+    bands = film.transient_bands()
+    shape = film.cube_shape()
+    dr.eval(film.steady, *(band[2] for band in bands))
+    dr.sync_thread()
+    steady = mi.TensorXf(film.steady, (shape[0], shape[1], shape[-1])).torch()
+    if len(bands) == 1:
+        transient = mi.TensorXf(bands[0][2], shape).torch()
+    else:
+        transient = torch.empty(shape, dtype=steady.dtype, device=steady.device) if into is None else into
+        while bands:
+            first, rows, flat = bands.pop(0)
+            transient[first : first + rows].copy_(flat.torch().view(rows, *shape[1:]))
+            del flat
+    film.clear()
+    return steady, transient
+
+
+def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
+    """All sensors of a call must fill films of one shape. Raises ``SceneError``."""
+    for item in items:
+        if not 0 <= item.sensor < len(sensors):
+            raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
+        if not hasattr(sensors[item.sensor].film(), "cube_shape"):
+            raise SceneError("the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...).")
+    shapes = {item.sensor: tuple(sensors[item.sensor].film().cube_shape()) for item in items}
+    if len(set(shapes.values())) > 1:
+        raise SceneError(
+            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one TransientRenderer per sensor."
+        )
+
+
+def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
+    for key, value in zip(job.keys, values, strict=True):
+        if not bool(torch.isfinite(value).all()):
+            bad = int((~torch.isfinite(value)).sum())
+            raise UnitError(f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite.")
+
+
+# ----------------------------------------------------------------------------------------------------- derivatives
+
+
+def vjp(
+    job: RenderJob, values: Sequence[torch.Tensor], g_steady: torch.Tensor | None, g_transient: torch.Tensor | None
+) -> list[torch.Tensor]:
+    """Gradients of ``<g_steady, steady> + <g_transient, transient>`` for the values that need one, in their shapes."""
+    import drjit as dr
+
+    grads: list[torch.Tensor | None] = [torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)]
+    if g_steady is not None or g_transient is not None:
+        with _session(job) as session:
+            _check_slope(session)
+            for n, item in enumerate(job.items):
+                leaves = session.install(item, values, job.needs)
+                several = len(job.items) > 1
+                gs = None if g_steady is None else _steady_adjoint(g_steady[n] if several else g_steady)
+                gt = None if g_transient is None else _cube_adjoint(g_transient[n] if several else g_transient)
+                session.integrator.render_backward(
+                    session.scene, session.params, (gs, gt), sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
+                )
+                _finish_backward(session, leaves)
+                for grad, leaf, batched in zip(grads, leaves, job.batched, strict=True):
+                    if grad is not None:
+                        target = grad[item.entry] if batched else grad
+                        target += dr.grad(leaf).torch().view(target.shape)
+                del leaves, gs, gt
+    return [grad for grad in grads if grad is not None]
+
+
+def _finish_backward(session: _Session, leaves: Sequence[Any]) -> None:
+    """Carry what has arrived at the scene's parameters on to the leaves."""
+    import drjit as dr
+
+    for target in session.slots.originals:
+        value = session.params[target]
+        if dr.grad_enabled(value):
+            dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    dr.eval([dr.grad(leaf) for leaf in leaves])
+    dr.sync_thread()
+
+
+def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Derivatives of (steady, transient) along ``tangents``, given for the values that need one."""
+    import drjit as dr
+    import mitsuba as mi
+
+    steady_all, transient_all = [], []
+    with _session(job) as session:
+        _check_slope(session)
+        for item in job.items:
+            leaves = session.install(item, values, job.needs)
+            given = iter(tangents)
+            for leaf, need, batched in zip(leaves, job.needs, job.batched, strict=True):
+                if need:
+                    tangent = next(given)
+                    tangent = tangent[item.entry] if batched else tangent
+                    dr.set_grad(leaf, mi.Float(tangent.detach().reshape(-1).clone()))
+                    dr.enqueue(dr.ADMode.Forward, leaf)
+            # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
+            dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+            d_steady, d_transient = session.integrator.render_forward(
+                session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
+            )
+            dr.eval(d_steady, d_transient)
+            dr.sync_thread()
+            steady_all.append(d_steady.torch())
+            transient_all.append(d_transient.torch())
+            del leaves, d_steady, d_transient
+    if len(job.items) == 1:
+        return steady_all[0], transient_all[0]
+    return torch.stack(steady_all), torch.stack(transient_all)
+
+
+def _check_slope(session: _Session) -> None:
+    """A path length that changes needs a temporal filter with a slope."""
+    table = session.job.scene.parameters()
+    moving = [key for key, need in zip(session.job.keys, session.job.needs, strict=True) if need and table[key].moves_path_length]
+    film = session.film(session.job.items[0])
+    if moving and not film.filter.has_slope:
+        raise GradientError(no_slope(moving, film.temporal_filter))
+
+
+def no_slope(keys: Sequence[str], temporal_filter: str) -> str:
+    """The message for a derivative through the time of flight that the temporal filter does not have."""
+    return (
+        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has no slope: the derivative "
+        "through the time of flight would be lost. Use temporal_filter='auto', 'tent' or 'gaussian'."
+    )
+
+
+def _steady_adjoint(g: torch.Tensor) -> Any:
+    import mitsuba as mi
+
+    return mi.TensorXf(g.detach().contiguous())
+
+
+def _cube_adjoint(g: torch.Tensor) -> Any:
+    """The adjoint cube as (flat array, offset, strides): read where it is, in whatever layout torch left it."""
+    import mitsuba as mi
+
+    g = g.detach()
+    span = 1 + sum((size - 1) * stride for size, stride in zip(g.shape, g.stride(), strict=True))
+    if span >= 2**32:
+        # Beyond 32-bit indices only the film's own layout is understood.
+        return mi.TensorXf(g.contiguous())
+    flat = g.as_strided((span,), (1,), g.storage_offset())
+    return mi.Float(flat), 0, tuple(int(stride) for stride in g.stride())

@@ -1,0 +1,283 @@
+"""The parameters of a scene: what they are, which of them have derivatives, and how torch values enter the scene.
+
+Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key ``<mesh>.to_world`` is offered
+for them all the same: the matrix replaces the one of the description, and vertices and normals follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchtransient.errors import SceneError
+from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, BuiltScene
+
+CORRECT = "correct"
+SILHOUETTES = "correct except where silhouettes move (no boundary term)"
+
+_VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
+# Mitsuba's classes whose index of refraction is a plain float, and the plugin each was made from.
+_INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
+_SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
+_SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
+_LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric."""
+
+    key: str
+    kind: str
+    shape: tuple[int, ...] | None
+    value: Any
+    differentiable: bool
+    moves_path_length: bool
+    reason: str
+    substitute: str | None = None
+
+
+class ParameterTable(Mapping[str, ParameterInfo]):
+    """The parameters of a scene by key. ``str(table)`` is a readable table."""
+
+    def __init__(self, entries: list[ParameterInfo]):
+        self._entries = {entry.key: entry for entry in entries}
+
+    def __getitem__(self, key: str) -> ParameterInfo:
+        return self._entries[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def differentiable(self) -> list[str]:
+        """The keys that have a derivative."""
+        return [key for key, entry in self._entries.items() if entry.differentiable]
+
+    def __str__(self) -> str:
+        rows = [("key", "shape", "value", "derivative")]
+        for entry in self._entries.values():
+            shape = "-" if entry.shape is None else str(entry.shape)
+            mark = "" if entry.differentiable else "no: "
+            rows.append((entry.key, shape, _short(entry.value), mark + entry.reason))
+        widths = [max(len(row[i]) for row in rows) for i in range(3)]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3] for row in rows]
+        lines.insert(1, "-" * max(len(line) for line in lines))
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        if value.size > 4:
+            return f"mean {float(np.mean(value)):.4g}"
+        return np.array2string(value, precision=4, separator=", ").replace("\n", "")
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# ------------------------------------------------------------------------------------------------------ the table
+
+
+def parameter_table(built: BuiltScene) -> ParameterTable:
+    """Read the table off a built scene (unmerged, without substitutions), inside its variant."""
+    entries = []
+    for key in built.params.keys():
+        node = built.params.properties[key][2]
+        entries.append(_describe(built, key, node))
+        if key.endswith(".vertex_positions"):
+            entries.append(_mesh_to_world(built, key, node))
+    return ParameterTable(entries)
+
+
+def _mesh_to_world(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
+    value = built.mesh_to_world.get(node.id(), np.eye(4))
+    name = key.rsplit(".", 1)[0] + ".to_world"
+    return ParameterInfo(name, "mesh_transform", (4, 4), value.astype(np.float32), True, True, SILHOUETTES)
+
+
+def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
+    import mitsuba as mi
+
+    current = built.params[key]
+    name = key.rsplit(".", 1)[-1]
+    class_name = node.class_name()
+    kind, shape, value = classify(key, current)
+    if class_name in _INDEX_CLASSES and name == "eta":
+        twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
+        reason = f"{CORRECT}; built as {twin} when asked for, since Mitsuba's own index is a plain float"
+        return ParameterInfo(key, "number", (), float(current), True, True, reason, substitute=node.id())
+    differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
+    if not differentiable and isinstance(node, mi.Shape) and name == "faces":
+        reason = "a list of vertex numbers"
+    return ParameterInfo(key, kind, shape, value, differentiable, moves, reason)
+
+
+def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool, str]:
+    """(has a derivative, can change a path length, why)."""
+    import mitsuba as mi
+
+    if kind == "plain":
+        return False, False, "a plain value, fixed when the scene is built"
+    if kind == "integer":
+        return False, False, "not a real number"
+    if flags & mi.ParamFlags.ReadOnly:
+        return False, False, "read-only in Mitsuba"
+    if isinstance(node, mi.Shape) and name in _SHAPE_KEYS:
+        return True, True, SILHOUETTES
+    if isinstance(node, mi.Sensor) and name in _SENSOR_KEYS:
+        return True, True, SILHOUETTES
+    if name in _LIGHT_KEYS.get(node.class_name(), ()):
+        return True, True, CORRECT
+    if name == "eta" and isinstance(node, mi.BSDF):
+        return True, True, CORRECT
+    if flags & mi.ParamFlags.NonDifferentiable:
+        return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
+    return True, False, CORRECT
+
+
+def is_transform(value: Any) -> bool:
+    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of component letters."""
+    return "Transform" in type(value).__name__
+
+
+def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None, Any]:
+    """(kind, shape of the torch value, current value as numpy) of a Mitsuba value."""
+    import drjit as dr
+
+    if is_transform(current):
+        matrix = np.array(current.matrix)
+        matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
+        return "transform" if dr.is_jit_v(current.matrix) else "plain", tuple(matrix.shape), matrix
+    if not dr.is_jit_v(current):
+        if isinstance(current, (bool, int, float)):
+            return "plain", (), current
+        if dr.is_array_v(current):
+            return "plain", (len(current),), np.array(current)
+        return "plain", None, type(current).__name__
+    if not dr.is_float_v(current):
+        return "integer", tuple(np.array(current).shape), np.array(current)
+    if dr.is_tensor_v(current):
+        return "tensor", tuple(int(n) for n in current.shape), np.array(current)
+    value = np.array(current)
+    if dr.depth_v(current) == 2:
+        return "vector", (len(current),), value.reshape(len(current), -1)[:, 0]
+    columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
+    if columns is not None:
+        return "vertices", (value.size // columns, columns), value.reshape(-1, columns)
+    if value.size == 1:
+        return "number", (), value.reshape(())
+    return "list", (value.size,), value
+
+
+# ---------------------------------------------------------------------------------------------- values in a scene
+
+
+class Slot:
+    """Where one torch value goes: its shape, and the Mitsuba parameters that are written from it."""
+
+    def __init__(self, built: BuiltScene, key: str):
+        self.key = key
+        self._built = built
+        params = built.params
+        if key in params:
+            self.kind, shape, self.initial = classify(key, params[key])
+            self.targets = [key]
+        else:
+            self.kind, shape = "mesh_transform", (4, 4)
+            prefix = key.rsplit(".", 1)[0]
+            node = params.properties[f"{prefix}.vertex_positions"][2]
+            self.initial = built.mesh_to_world.get(node.id(), np.eye(4))
+            self.targets = [f"{prefix}.vertex_positions", f"{prefix}.vertex_normals"]
+        if shape is None:
+            raise SceneError(f"parameter {key!r} is not numeric.")
+        self.shape: tuple[int, ...] = shape
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def write(self, leaf: Any, originals: Mapping[str, Any]) -> None:
+        """Set the Mitsuba parameters from the flat array ``leaf`` by operations that Dr.Jit can differentiate."""
+        import drjit as dr
+        import mitsuba as mi
+
+        params = self._built.params
+        if self.kind == "mesh_transform":
+            self._write_mesh(leaf, originals)
+            return
+        current = originals[self.key]
+        if self.kind == "tensor":
+            params[self.key] = type(current)(leaf, shape=self.shape)
+        elif self.kind == "vector":
+            params[self.key] = dr.unravel(type(current), leaf)
+        elif self.kind == "transform":
+            n = self.shape[0]
+            entries = [dr.gather(mi.Float, leaf, mi.UInt32(i)) for i in range(n * n)]
+            matrix = mi.Matrix4f if n == 4 else mi.Matrix3f
+            params[self.key] = type(current)(matrix(*entries))
+        else:
+            params[self.key] = type(current)(leaf)
+
+    def _write_mesh(self, leaf: Any, originals: Mapping[str, Any]) -> None:
+        """New vertices ``T inv(T0) v0``, normals by the inverse transpose; T0 is the transform of the description."""
+        import drjit as dr
+        import mitsuba as mi
+
+        params = self._built.params
+        positions_key, normals_key = self.targets
+        entries = [dr.gather(mi.Float, leaf, mi.UInt32(i)) for i in range(16)]
+        relative = mi.Matrix4f(*entries) @ mi.Matrix4f(np.linalg.inv(self.initial))
+        transform = mi.Transform4f(relative)
+        points = dr.unravel(mi.Point3f, originals[positions_key])
+        params[positions_key] = dr.ravel(transform @ points)
+        if len(originals[normals_key]):
+            normals = dr.unravel(mi.Normal3f, originals[normals_key])
+            params[normals_key] = dr.ravel(dr.normalize(transform @ normals))
+
+
+class SlotTable:
+    """The slots of some keys in one built scene, with the values that the scene goes back to."""
+
+    def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
+        self.built = built
+        self.slots = [Slot(built, key) for key in keys]
+        touched = dict.fromkeys(target for slot in self.slots for target in slot.targets)
+        for target in list(touched):
+            # Mitsuba recomputes normals when positions change: both have to go back.
+            normals = target.replace(".vertex_positions", ".vertex_normals")
+            if normals != target and normals in built.params:
+                touched[normals] = None
+        self._check_overlap()
+        # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
+        self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
+
+    def _check_overlap(self) -> None:
+        owner: dict[str, str] = {}
+        for slot in self.slots:
+            for target in slot.targets:
+                if target in owner:
+                    raise SceneError(f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them.")
+                owner[target] = slot.key
+
+    def install(self, leaves: list[Any]) -> None:
+        """Write one leaf per slot and let the scene follow."""
+        for slot, leaf in zip(self.slots, leaves, strict=True):
+            slot.write(leaf, self.originals)
+        self.built.params.update()
+
+    def restore(self) -> None:
+        """Put the described values back."""
+        if not self.originals:
+            return
+        params = self.built.params
+        for key, value in self.originals.items():
+            params[key] = value
+            params.set_dirty(key)
+        params.update()

@@ -1,0 +1,142 @@
+"""``tt.load`` and ``tt.Scene``: a scene that can be pickled, copied and rebuilt in any differentiable variant."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from torchtransient.errors import GradientError, SceneError
+from torchtransient.render.build import BuildOptions, BuiltScene, build
+from torchtransient.render.description import Description, describe_dict, describe_xml
+from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table
+from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
+
+# Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
+_MAX_BUILDS = 8
+
+
+class Scene:
+    """A scene's description, and the Mitsuba scenes built from it when they are needed.
+
+    Made by :func:`load`. Pickling and copying take the description alone; the Mitsuba scene is built on first use, under the scene's variant.
+    Instances are immutable, so copies share everything. Not supported: Mitsuba objects inside a description (they belong to one variant of one process).
+    """
+
+    def __init__(self, description: Description, variant: str | None):
+        self._description = description
+        self._requested_variant = variant
+        self._variant: str | None = None
+        self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
+        self._table: ParameterTable | None = None
+
+    @property
+    def variant(self) -> str:
+        """The variant that this scene is built in; settled at the first use."""
+        if self._variant is None:
+            self._variant = resolve_variant(self._requested_variant)
+        return self._variant
+
+    def parameters(self) -> ParameterTable:
+        """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives a table."""
+        with engine_lock:
+            if self._table is None:
+                with active_variant(self.variant):
+                    self._table = parameter_table(self.built(BuildOptions()))
+            return self._table
+
+    def built(self, options: BuildOptions) -> BuiltScene:
+        """The Mitsuba scene for some options. Must be called inside ``active_variant(scene.variant)``."""
+        found = self._builds.get(options)
+        if found is None:
+            found = build(self._description, self.variant, options)
+            self._builds[options] = found
+            while len(self._builds) > _MAX_BUILDS:
+                self._builds.popitem(last=False)
+        self._builds.move_to_end(options)
+        return found
+
+    def drop(self, options: BuildOptions) -> None:
+        """Forget one built scene; the next use builds it anew."""
+        self._builds.pop(options, None)
+
+    def options_for(self, keys: Iterable[str], options: BuildOptions) -> BuildOptions:
+        """The options under which every one of ``keys`` is an independent, differentiable parameter.
+
+        Raises ``SceneError`` for unknown keys and ``GradientError`` for keys without a derivative.
+        """
+        keys = tuple(keys)
+        if not keys:
+            return replace(options, merge=True)
+        table = self.parameters()
+        substitute = set(options.substitute)
+        for key in keys:
+            info = table.get(key)
+            if info is None:
+                raise SceneError(unknown_key(key, list(table)))
+            if not info.differentiable:
+                raise GradientError(f"parameter {key!r} has no derivative: {info.reason}.")
+            if info.substitute is not None:
+                substitute.add(info.substitute)
+        return replace(options, substitute=frozenset(substitute), merge=False)
+
+    def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
+        """How torch values for ``keys`` enter the built scene. Must be called inside ``active_variant(scene.variant)``."""
+        built, wanted = self.built(options), tuple(keys)
+        if wanted not in built.slots:
+            built.slots[wanted] = SlotTable(built, wanted)
+        return built.slots[wanted]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["description"], state["variant"])  # type: ignore[misc]
+        self._variant = state["settled"]
+
+    def __copy__(self) -> Scene:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
+        return self
+
+    def __repr__(self) -> str:
+        return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r})"
+
+
+def unknown_key(key: str, known: list[str]) -> str:
+    """The message for a parameter key that a scene does not have."""
+    close = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
+    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
+
+
+def load(scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, variant: str | None = None, **xml_parameters: Any) -> Scene:
+    """Describe a scene: the path of a Mitsuba XML file, a scene dictionary, or another :class:`Scene`.
+
+    ``variant``: a differentiable variant such as ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_spectral``; None takes the active one if it is
+    differentiable and ``llvm_ad_rgb`` otherwise, settled at the first use. ``xml_parameters`` fill the ``$name`` parameters of an XML file.
+
+    Nothing is built yet and no variant is switched: that happens at the first use, inside the call, and the variant that was
+    active before is put back (when none was active, the scene's variant stays active). Dictionaries hold transforms as (4, 4) arrays or nested
+    lists, or as Mitsuba transforms; colours, vectors, bitmaps and tensors of Mitsuba are taken too. Scenes written for mitransient 1.x load unchanged.
+    Children of an XML scene without an id are named after their kind: ``sensor``, ``shape_0``, ``shape_1``.
+
+    Raises ``SceneError`` for a missing or malformed file and for entries that cannot be described; faults inside the scene (unknown plugins, unknown or
+    unused parameters) are reported when the scene is built, with file and line where Mitsuba knows them. Raises ``VariantError`` for a variant
+    that cannot be used.
+    """
+    if variant is not None:
+        resolve_variant(variant)
+    if isinstance(scene, (str, os.PathLike)):
+        return Scene(describe_xml(scene, xml_parameters), variant)
+    if xml_parameters:
+        raise SceneError(f"tt.load: {', '.join(sorted(xml_parameters))} only have a meaning for XML files, got {type(scene).__name__}.")
+    if isinstance(scene, Scene):
+        return scene if variant is None or variant == scene.variant else Scene(scene._description, variant)
+    if isinstance(scene, Mapping):
+        return Scene(describe_dict(scene), variant)
+    raise SceneError(f"tt.load: expected a path, a dictionary or a tt.Scene, got {type(scene).__name__}.")
