@@ -1,0 +1,12 @@
+"""Mitsuba plugins in Python. They know Mitsuba and Dr.Jit and never torch.
+
+Importing this package lets Mitsuba call us whenever its variant changes; see `_registry`.
+"""
+
+from torchtransient.plugins._registry import plugin_errors as plugin_errors
+from torchtransient.plugins._registry import register as register
+from torchtransient.plugins._registry import register_module as register_module
+from torchtransient.plugins._registry import sync as sync
+from torchtransient.plugins._registry import attach as _attach
+
+_attach()

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .._registry import register
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 
@@ -125,4 +126,4 @@ class DiffDielectric(mi.BSDF):
         )
 
 
-mi.register_bsdf("diff_dielectric", lambda props: DiffDielectric(props))
+register("bsdf", "diff_dielectric", DiffDielectric)

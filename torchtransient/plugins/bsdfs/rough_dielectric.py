@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...errors import SceneError
+from .._registry import register
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 from .microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
@@ -242,4 +243,4 @@ def _widening(wi: Any) -> Any:
     return 1.2 - 0.2 * dr.sqrt(dr.abs(wi.z))
 
 
-mi.register_bsdf("diff_rough_dielectric", lambda props: DiffRoughDielectric(props))
+register("bsdf", "diff_rough_dielectric", DiffRoughDielectric)

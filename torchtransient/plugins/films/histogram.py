@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError, StorageError
+from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.temporal_filter import make_temporal_filter
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
@@ -273,4 +274,4 @@ class TransientHDRFilm(mi.Film):
         )
 
 
-mi.register_film("transient_hdr_film", lambda props: TransientHDRFilm(props))
+register("film", "transient_hdr_film", TransientHDRFilm)

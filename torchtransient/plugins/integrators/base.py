@@ -171,11 +171,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         row += dr.opaque(mi.UInt32, job.first_row)
 
         offset, weight = film.sample_offset(sampler.next_2d())
-        crop = mi.Point2f(film.crop_offset())
         position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
         # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
         position = position / mi.ScalarVector2f(film.crop_size())
-        del crop
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
         time = sensor.shutter_open()
         if sensor.shutter_open_time() > 0:

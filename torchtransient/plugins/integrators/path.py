@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
 from torchtransient.plugins.integrators.push import push as forward_push
@@ -177,4 +178,4 @@ class TransientPath(TransientIntegrator):
         return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first)
 
 
-mi.register_integrator("transient_path", lambda props: TransientPath(props))
+register("integrator", "transient_path", TransientPath)

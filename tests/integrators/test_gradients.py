@@ -1,0 +1,50 @@
+"""Every parameter of the support table: reverse mode against finite differences, forward mode against reverse mode.
+
+The bounds are derived: reverse mode and finite differences are independent estimates over different seeds, their difference may be three standard
+errors of both; forward and reverse mode use the same paths, so they differ by float32 sums alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gradient_cases import CASES, Problem
+
+SIGMAS = 3.0
+# Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about sqrt(n) ulp.
+ROUNDING = 2e-3
+
+
+@pytest.fixture(scope="module")
+def problems():
+    """Loaded problems by name, so that kernels and scenes are shared between the tests of a case."""
+    return {}
+
+
+def _problem(problems, case):
+    # One at a time: a loaded scene stays a target of every virtual call of its variant.
+    if case.name not in problems:
+        problems.clear()
+        problems[case.name] = Problem(case)
+    return problems[case.name]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_forward_equals_reverse(problems, case):
+    problem = _problem(problems, case)
+    reverse, forward = problem.reverse(100), problem.forward(100)
+    assert np.isfinite(reverse) and reverse != 0
+    assert forward == pytest.approx(reverse, rel=ROUNDING)
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c.support == "correct"], ids=lambda case: case.name)
+def test_reverse_against_finite_differences(problems, case):
+    problem = _problem(problems, case)
+    reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
+    h = case.step
+    above, below = [[problem.loss(case.value + sign * h, s) for s in range(case.seeds)] for sign in (1, -1)]
+    differences = (np.array(above) - np.array(below)) / (2 * h)
+    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / case.seeds)
+    assert abs(reverse.mean() - differences.mean()) < SIGMAS * error
+    # A test that could not tell the right answer from zero would prove nothing.
+    assert error < 0.15 * abs(differences.mean())

@@ -1,0 +1,206 @@
+"""Plugins are there in whichever variant is active, whenever it was chosen."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import warnings
+
+import mitsuba as mi
+import pytest
+
+from torchtransient import plugins
+from torchtransient.errors import PluginRegistrationError, VariantError
+from torchtransient.plugins import _registry
+
+JIT_VARIANTS = (
+    "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized",
+)  # fmt: skip
+OWN = [(kind, name) for module in _registry.PLUGIN_MODULES for kind, name in module.plugins]
+
+
+@pytest.fixture(autouse=True)
+def _restore():
+    """Each test starts in llvm_ad_rgb and leaves no third-party module behind."""
+    mi.set_variant("llvm_ad_rgb")
+    yield
+    _registry._state.third_party = []
+    _registry._state.variant = None
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+
+
+def build(name):
+    with plugins.plugin_errors():
+        return mi.load_dict({"type": name})
+
+
+def run(code):
+    result = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.split()
+
+
+@pytest.mark.parametrize("variant", JIT_VARIANTS)
+def test_every_plugin_belongs_to_the_active_variant(variant):
+    mi.set_variant(variant)
+    plugins.sync()
+    assert isinstance(build("transient_hdr_film"), mi.Film)
+    assert isinstance(build("transient_path"), mi.Integrator)
+    assert isinstance(build("diff_dielectric"), mi.BSDF)
+    assert isinstance(build("diff_rough_dielectric"), mi.BSDF)
+
+
+def test_variant_context_there_and_back():
+    rgb = type(build("transient_path"))
+    with mi.variant_context("llvm_ad_mono"):
+        assert isinstance(build("transient_path"), mi.Integrator)
+        assert not isinstance(build("transient_path"), rgb)
+    assert isinstance(build("transient_path"), mi.Integrator)
+
+
+@pytest.mark.parametrize("name", [name for _, name in OWN])
+def test_scalar_variants_register_and_refuse(name):
+    with mi.variant_context("scalar_rgb"):
+        assert plugins.sync() == "scalar_rgb"
+        with pytest.raises(VariantError, match=f"'{name}'.*llvm_ad.*scalar_rgb"):
+            build(name)
+
+
+def test_refusal_reaches_those_who_load_with_mitsuba_alone():
+    with mi.variant_context("scalar_rgb"), pytest.raises(RuntimeError, match="VariantError.*Dr.Jit variant"):
+        mi.load_dict({"type": "transient_path"})
+
+
+def test_sync_is_idempotent_and_reclaims_a_name_that_was_taken():
+    plugins.sync()
+    before = type(build("transient_path"))
+    mi.register_integrator("transient_path", lambda props: mi.load_dict({"type": "path"}))
+    assert not isinstance(build("transient_path"), before)
+    plugins.sync()
+    assert type(build("transient_path")) is before
+
+
+def test_callbacks_cleared_by_someone_else():
+    mi.detail.clear_variant_callbacks()
+    mi.set_variant("llvm_ad_mono")
+    with pytest.raises(RuntimeError):
+        # No callback, no plugins of ours unless an earlier test registered them for this variant: forget those.
+        mi.register_integrator("transient_path", lambda props: 1 / 0)
+        build("transient_path")
+    plugins.sync()
+    assert isinstance(build("transient_path"), mi.Integrator)
+
+
+def test_no_variant_at_import_and_after():
+    out = run("""
+        import torchtransient, mitsuba as mi
+        print(torchtransient.plugins.sync())
+        mi.set_variant("llvm_ad_mono")
+        print(type(mi.load_dict({"type": "transient_path"})).__name__)
+    """)
+    assert out == ["None", "TransientPath"]
+
+
+def test_variant_chosen_before_import():
+    out = run("""
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+        import torchtransient
+        print(type(mi.load_dict({"type": "transient_path"})).__name__)
+    """)
+    assert out == ["TransientPath"]
+
+
+THIRD_PARTY = """
+import mitsuba as mi
+from torchtransient.plugins import register
+class Dim(mi.Texture):
+    def __init__(self, props):
+        super().__init__(props)
+    def to_string(self):
+        return "Dim of " + mi.variant()
+register("texture", "dim", Dim)
+"""
+
+
+@pytest.fixture
+def third_party(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module rewritten within a second would look unchanged
+
+    def write(text, name="their_texture"):
+        (tmp_path / f"{name}.py").write_text(text)
+        sys.modules.pop(name, None)
+        return name
+
+    yield write
+    for name in ("their_texture", "their_rival"):
+        sys.modules.pop(name, None)
+
+
+def test_third_party_module_follows_the_variant(third_party):
+    plugins.register_module(third_party(THIRD_PARTY), (("texture", "dim"),))
+    assert str(build("dim")) == "Dim of llvm_ad_rgb"
+    with mi.variant_context("llvm_ad_mono"):
+        assert str(build("dim")) == "Dim of llvm_ad_mono"
+    with mi.variant_context("scalar_rgb"), pytest.raises(VariantError, match="texture plugin 'dim'"):
+        build("dim")
+
+
+def test_third_party_module_that_does_not_exist():
+    with pytest.raises(PluginRegistrationError, match="no module named 'their.absent'"):
+        plugins.register_module("their.absent")
+
+
+def test_broken_third_party_module_is_refused_and_forgotten(third_party):
+    with pytest.raises(PluginRegistrationError, match=r"their_texture.*llvm_ad_rgb.*ZeroDivisionError"):
+        plugins.register_module(third_party("1 / 0"))
+    assert plugins.sync() == "llvm_ad_rgb"
+    build("transient_path")
+
+
+def test_module_that_registers_less_than_it_says(third_party):
+    with pytest.raises(PluginRegistrationError, match="expected to register texture 'bright'"):
+        plugins.register_module(third_party(THIRD_PARTY), (("texture", "bright"),))
+
+
+def test_two_modules_of_one_name(third_party):
+    plugins.register_module(third_party(THIRD_PARTY))
+    with pytest.raises(PluginRegistrationError, match="'dim' of module their_rival.*already.*their_texture"):
+        plugins.register_module(third_party(THIRD_PARTY, "their_rival"))
+
+
+def test_unknown_kind():
+    with pytest.raises(PluginRegistrationError, match="expected a plugin kind"):
+        plugins.register("lens", "fisheye", object)
+
+
+def test_failure_during_a_switch_warns_and_is_raised_by_the_next_call(third_party):
+    name = third_party(THIRD_PARTY)
+    plugins.register_module(name)
+    text = THIRD_PARTY + "\nif mi.variant() == 'llvm_ad_mono':\n    raise OSError('no table for mono')\n"
+    path = sys.modules[name].__file__
+    with open(path, "w") as f:
+        f.write(text)
+    with pytest.warns(RuntimeWarning, match="no table for mono"):
+        mi.set_variant("llvm_ad_mono")
+    assert mi.variant() == "llvm_ad_mono"
+    for _ in range(2):
+        with pytest.raises(PluginRegistrationError, match="no table for mono"):
+            plugins.sync()
+    mi.set_variant("llvm_ad_rgb")
+    assert plugins.sync() == "llvm_ad_rgb"
+
+
+def test_a_callback_does_not_raise_when_warnings_are_errors(third_party):
+    name = third_party(THIRD_PARTY)
+    plugins.register_module(name)
+    with open(sys.modules[name].__file__, "w") as f:
+        f.write("raise OSError('gone')")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mi.set_variant("llvm_ad_mono")
+    with pytest.raises(PluginRegistrationError, match="gone"):
+        plugins.sync()

@@ -1,0 +1,267 @@
+"""Registers the library's Mitsuba plugins for whichever variant is active.
+
+A Mitsuba plugin written in Python is a class whose base (`mi.Film`, `mi.BSDF`, ...) belongs to one variant. The plugin
+modules therefore define ordinary module-level classes and are executed again (`importlib.reload`) each time the variant
+changes. Mitsuba tells us of a change through a callback. Three of its habits shape this file:
+
+- the callbacks are a set without order, and fire on a change only, so a variant that was active before this module was
+  imported is caught up with in `attach()`;
+- an exception in a callback leaves the new variant active and stops the callbacks of others, so ours never raises: it
+  warns, and `sync()` raises at the next library call;
+- a plugin constructor that raises reaches the caller as a `RuntimeError` with the traceback as text, so the typed error
+  is kept aside and `plugin_errors()` raises it again.
+
+How to write a plugin module::
+
+    import mitsuba as mi
+    from torchtransient.plugins import register
+
+    class MyFilm(mi.Film):
+        ...
+
+    register("film", "my_film", MyFilm)
+
+It looks up variant types when it uses them (`mi.Float`) and never keeps one at module level. To add a module of this
+library, add a line to `PLUGIN_MODULES`; a module of someone else's is added with `register_module("their.module")`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+
+from torchtransient.errors import PluginRegistrationError, TorchTransientError
+from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
+
+KINDS = (
+    "bsdf", "emitter", "film", "integrator", "medium", "phase", "rfilter", "sampler", "sensor", "shape", "texture",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PluginModule:
+    """A module to execute for each variant, and the plugins it registers as pairs `(kind, name)`.
+
+    A module without plugins is listed when others inherit from its classes: it has to be executed again before them.
+    """
+
+    module: str
+    plugins: tuple[tuple[str, str], ...] = ()
+
+
+# In the order of execution: a module comes after those whose classes it inherits from.
+PLUGIN_MODULES: tuple[PluginModule, ...] = (
+    PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
+    PluginModule("torchtransient.plugins.integrators.base"),
+    PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
+    PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
+)
+
+
+@dataclass
+class _State:
+    """What is registered. Guarded by `lock`, since scenes are loaded from several threads."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    third_party: list[PluginModule] = field(default_factory=list)
+    variant: str | None = None  # the variant that the entries below were made for
+    constructors: dict[tuple[str, str], Callable[..., object]] = field(default_factory=dict)
+    owner: dict[tuple[str, str], str] = field(default_factory=dict)
+    loading: str | None = None  # the module that is being executed
+    raised: list[TorchTransientError] = field(default_factory=list)  # by plugin constructors, see plugin_errors()
+
+
+_state = _State()
+
+
+def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
+    """Register a plugin for the active variant. Called at the end of a plugin module.
+
+    `kind` is one of `KINDS`, `name` the plugin's name in scene files, `constructor` the class (or a function) that
+    takes `mi.Properties`. Raises PluginRegistrationError for an unknown kind, or when another module of the library's
+    list already registered the name.
+    """
+    if kind not in KINDS:
+        raise PluginRegistrationError(
+            f"register: expected a plugin kind out of {', '.join(KINDS)}; got {kind!r} for plugin '{name}'."
+        )
+    key = (kind, name)
+    module = _state.loading or getattr(constructor, "__module__", "?")
+    with _state.lock:
+        other = _state.owner.get(key)
+        if _state.loading is not None and other is not None and other != module:
+            raise PluginRegistrationError(
+                f"register: {kind} plugin '{name}' of module {module} was already registered by {other}. "
+                "Give one of them another name."
+            )
+        _state.owner[key] = module
+        _state.constructors[key] = _keeping_errors(constructor)
+        _hand_to_mitsuba(key)
+
+
+def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> None:
+    """Add a plugin module of your own, by its dotted name; it is executed now and at each later change of the variant.
+
+    `plugins` may list what it registers as `(kind, name)`; then the names answer with a clear VariantError in scalar
+    variants too, and a name that the module fails to register is an error. Modules are executed in Dr.Jit variants
+    only. Adding a module twice is the same as adding it once. Raises PluginRegistrationError when the module cannot be
+    found or executed.
+    """
+    with _state.lock:
+        # A name is taken as given: find_spec imports the parent packages and raises for what is not a module.
+        try:
+            found = importlib.util.find_spec(module)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise PluginRegistrationError(f"register_module: no module named {module!r} ({error}).") from error
+        if found is None:
+            raise PluginRegistrationError(
+                f"register_module: no module named {module!r}. Expected a dotted name that Python can import."
+            )
+        entry = PluginModule(module, tuple((kind, name) for kind, name in plugins))
+        known = [m for m in _state.third_party if m.module == module]
+        if known == [entry] or any(m.module == module for m in PLUGIN_MODULES):
+            return
+        before = list(_state.third_party)
+        _state.third_party = [m for m in before if m.module != module] + [entry]
+        _state.variant = None
+        try:
+            sync()
+        except PluginRegistrationError:
+            _state.third_party = before  # one bad module must not block all later scene loads
+            raise
+
+
+def sync() -> str | None:
+    """Make the plugins of this library available in the active variant. Idempotent; called before every scene load.
+
+    Returns the active variant, or None when none is set: then nothing is registered and nothing fails. Raises
+    PluginRegistrationError when a plugin module cannot be executed, also when that happened during an earlier change
+    of the variant.
+    """
+    with _state.lock:
+        attach_callback()
+        variant = active_variant()
+        if variant is None:
+            return None
+        if _state.variant != variant:
+            _load_all(variant)
+        else:
+            # Other packages may have registered plugins of the same name since then; the last one wins.
+            for key in _state.constructors:
+                _hand_to_mitsuba(key)
+        return variant
+
+
+def attach_callback() -> None:
+    """Let Mitsuba call us when its variant changes. Repeating it has no effect (Mitsuba keeps a set)."""
+    mi.detail.add_variant_callback(_on_variant_change)
+
+
+def attach() -> None:
+    """Follow the variant from now on, and catch up with one that is active already. Never raises (see `sync`)."""
+    attach_callback()
+    if active_variant() is not None:
+        _on_variant_change(None, active_variant())
+
+
+@contextlib.contextmanager
+def plugin_errors() -> Iterator[None]:
+    """Raise the typed error of a plugin's constructor instead of the RuntimeError that Mitsuba makes of it.
+
+    Use it around `mi.load_dict` and `mi.load_file`.
+    """
+    with _state.lock:
+        _state.raised.clear()
+        try:
+            yield
+        except RuntimeError as error:
+            if _state.raised and not isinstance(error, TorchTransientError):
+                raise _state.raised[0] from error
+            raise
+        finally:
+            _state.raised.clear()
+
+
+def _on_variant_change(_old: str | None, new: str | None) -> None:
+    with _state.lock:
+        try:
+            if new is not None and new != _state.variant:
+                _load_all(new)
+        except PluginRegistrationError as error:
+            # Under "-W error" the warning itself raises; sync() reports the same problem at the next library call.
+            with contextlib.suppress(RuntimeWarning):
+                warnings.warn(f"torchtransient: {error}", RuntimeWarning, stacklevel=2)
+
+
+def _load_all(variant: str) -> None:
+    """Execute every plugin module for `variant`. Leaves `_state.variant` None when one fails, so sync() tries again."""
+    _state.variant = None
+    _state.constructors.clear()
+    _state.owner.clear()
+    for entry in (*PLUGIN_MODULES, *_state.third_party):
+        if is_jit(variant):
+            _execute(entry, variant)
+        else:
+            for kind, name in entry.plugins:
+                register(kind, name, _refusal(kind, name))
+    _state.variant = variant
+
+
+def _execute(entry: PluginModule, variant: str) -> None:
+    _state.loading = entry.module
+    try:
+        loaded = sys.modules.get(entry.module)
+        if loaded is None:
+            importlib.import_module(entry.module)
+        else:
+            importlib.reload(loaded)
+    except Exception as error:
+        # Whatever the module raised: it is reported under one type, with the module named.
+        raise PluginRegistrationError(
+            f"plugin module {entry.module} could not be executed for variant '{variant}': "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    finally:
+        _state.loading = None
+    missing = [f"{kind} '{name}'" for kind, name in entry.plugins if (kind, name) not in _state.constructors]
+    if missing:
+        raise PluginRegistrationError(
+            f"plugin module {entry.module} was expected to register {', '.join(missing)} for variant '{variant}' and "
+            "did not. End the module with register(kind, name, class)."
+        )
+
+
+def _hand_to_mitsuba(key: tuple[str, str]) -> None:
+    kind, name = key
+    getattr(mi, f"register_{kind}")(name, _state.constructors[key])
+
+
+def _refusal(kind: str, name: str) -> Callable[[object], object]:
+    def refuse(_props: object) -> object:
+        require_jit_variant(f"{kind} plugin '{name}'")
+        raise PluginRegistrationError(
+            f"{kind} plugin '{name}' was set up for a scalar variant but is used in '{active_variant()}'. "
+            "Call torchtransient.plugins.sync() before the scene is loaded."
+        )
+
+    return refuse
+
+
+def _keeping_errors(constructor: Callable[..., object]) -> Callable[[object], object]:
+    def construct(props: object) -> object:
+        try:
+            return constructor(props)
+        except TorchTransientError as error:
+            _state.raised.append(error)
+            raise
+
+    return construct
