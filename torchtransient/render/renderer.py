@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -166,6 +168,28 @@ class TransientRenderer(nn.Module):
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
         return "tent" if moves and self._scene_filter == "box" else self._scene_filter
+
+    def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
+        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one has."""
+        if temporal_filter is not None and temporal_filter not in TEMPORAL_FILTERS:
+            raise SceneError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}.")
+        twin = copy.deepcopy(self)
+        if sampler is not None:
+            twin._options = replace(self._options, sampler=sampler)
+        if temporal_filter is not None:
+            twin.temporal_filter = temporal_filter
+        return twin
+
+    def has_slope_for(self, keys: Sequence[str]) -> bool:
+        """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
+        return self.effective_filter != "box" or not any(self._infos[key].moves_path_length for key in keys)
+
+    def samples_drawn(self, spp: int) -> int:
+        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that they can lay out."""
+        with active_variant(self.scene.variant):
+            sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
+            sampler.set_sample_count(spp)
+            return int(sampler.sample_count())
 
     def forward(
         self,
