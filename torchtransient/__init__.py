@@ -10,6 +10,7 @@ _LAZY = {
     "Scene": "torchtransient.render.scene_handle",
     "TimeAxis": "torchtransient.axes",
     "TransientRenderer": "torchtransient.render.renderer",
+    "cost_of_accuracy": "torchtransient.accuracy.cost",
     "load": "torchtransient.render.scene_handle",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",

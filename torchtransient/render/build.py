@@ -37,6 +37,7 @@ class BuildOptions:
     ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for the integrator, or None.
     ``substitute``: names of BSDFs that are built as their differentiable twins, or ``FLOAT_TEXTURES``. ``merge``: let Mitsuba merge meshes and
     equal materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into transient ones.
+    ``sampler``: plugin name of the sampler of every sensor, or None to keep them.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -44,6 +45,7 @@ class BuildOptions:
     substitute: frozenset[str] = frozenset()
     merge: bool = False
     transient: bool = False
+    sampler: str | None = None
 
 
 @dataclass
@@ -73,6 +75,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
                 _name_nested(state)
             _override_films(state, options)
             _override_integrator(state, options)
+            _override_samplers(state, options)
             _substitute_plugins(state, options.substitute)
             transforms = _mesh_transforms(state)
             integrator = _find_child(state, state.root, _is_integrator)
@@ -270,6 +273,23 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
+
+
+def _override_samplers(state: Any, options: BuildOptions) -> None:
+    """Another sampler with the same number of samples; parameters that only the old one had are dropped."""
+    import mitsuba as mi
+
+    if options.sampler is None:
+        return
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
+        if node.type != mi.ObjectType.Sensor:
+            continue
+        sampler = _find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        if sampler is None:
+            _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
+        else:
+            _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
 
 
 def _substitute_plugins(state: Any, names: frozenset[str]) -> None:
