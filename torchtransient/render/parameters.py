@@ -38,6 +38,7 @@ class ParameterInfo:
     moves_path_length: bool
     reason: str
     substitute: str | None = None
+    bitmap: bool = False
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
@@ -113,6 +114,8 @@ def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
         reason = f"{CORRECT}; built as {twin} when asked for, since Mitsuba's own index is a plain float"
         return ParameterInfo(key, "number", (), float(current), True, True, reason, substitute=node.id())
     differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
+    if name == "data" and class_name.startswith("BitmapTexture"):
+        return ParameterInfo(key, kind, shape, value, differentiable, moves, reason, bitmap=True)
     if not differentiable and isinstance(node, mi.Shape) and name == "faces":
         reason = "a list of vertex numbers"
     return ParameterInfo(key, kind, shape, value, differentiable, moves, reason)

@@ -44,8 +44,10 @@ class Scene:
         """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives a table."""
         with engine_lock:
             if self._table is None:
+                options = BuildOptions(real_bitmaps=True)
                 with active_variant(self.variant):
-                    self._table = parameter_table(self.built(BuildOptions()))
+                    self._table = parameter_table(self.built(options))
+                self.drop(options)  # no renderer uses this build
             return self._table
 
     def built(self, options: BuildOptions) -> BuiltScene:
@@ -81,7 +83,8 @@ class Scene:
                 raise GradientError(f"parameter {key!r} has no derivative: {info.reason}.")
             if info.substitute is not None:
                 substitute.add(info.substitute)
-        return replace(options, substitute=frozenset(substitute), merge=False)
+        real_bitmaps = any(table[key].bitmap for key in keys)
+        return replace(options, substitute=frozenset(substitute), real_bitmaps=real_bitmaps, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
         """How torch values for ``keys`` enter the built scene. Must be called inside ``active_variant(scene.variant)``."""
