@@ -152,17 +152,25 @@ def area_light(shape="rectangle", size=0.3):
     return {"type": shape, "to_world": t.scale(size), "emitter": {"type": "area", "radiance": 9.0}}
 
 
-def glass_slab(bsdf):
+def glass_slab(bsdf, shape="cube"):
     """A slab tilted against the camera's rays, in front of the wall; the light stands beside it."""
     wide = room(sensor=camera(fov=6.0), light={"type": "point", "position": [1.8, 0.0, 2.0], "intensity": 10.0}, depth=5)
     wide["wall"]["to_world"] = transform().scale(3)
     del wide["side"]
     wide["slab"] = {
-        "type": "cube",
+        "type": shape,
         "to_world": transform().translate([0, 0, 2.4]).rotate([0, 1, 0], 35).scale([0.8, 0.8, 0.25]),
         "bsdf": bsdf,
     }
     return wide
+
+
+def mirror_room(bsdf=None):
+    """A large diffuse wall seen in a mirror; light and camera stand before both."""
+    scene = room(bsdf or {"type": "conductor", "material": "none", "specular_reflectance": 0.9}, sensor=camera(fov=8.0, origin=(0.3, 0, 3), start=11.0))
+    scene["side"]["to_world"] = transform().translate([0, 0, 5]).rotate([0, 1, 0], 180).scale(6)
+    scene["light"]["position"] = [0.5, 0.3, 1.0]
+    return scene
 
 
 CASES = [
@@ -180,7 +188,7 @@ CASES = [
         set_color("wall.bsdf.alpha.value"), 0.3, 0.01, spp=4096, fd_spp=4096,
     ),
     Case("wall_distance", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=2048, fd_spp=2048),
-    Case("wall_tilt", "shape to_world", room, rotate("wall.to_world", (0, 1, 0)), 0.0, 0.1, spp=2048, fd_spp=2048),
+    Case("wall_tilt", "shape to_world", room, rotate("wall.to_world", (0, 1, 0)), 0.0, 0.1, spp=4096, fd_spp=32768),
     Case("side_moves", "shape to_world, silhouette seen from a vertex", room, move("side.to_world", (-1, 0, 0.4)), 0.0, 2e-2, spp=4096, fd_spp=16384,
          support="biased where silhouettes move"),
     Case(
@@ -215,7 +223,7 @@ CASES = [
     Case("sensor_translation", "sensor pose", lambda: room(sensor=camera(near=1.0)), move("sensor.to_world", (0.5, 0, 1)), 0.0, 2e-3,
          spp=2048, fd_spp=2048),
     Case("sensor_rotation", "sensor pose", lambda: room(sensor=camera(near=1.0)), rotate("sensor.to_world", (0, 1, 0)), 0.0, 0.1,
-         spp=2048, fd_spp=2048),
+         spp=2048, fd_spp=16384),
     Case("sensor_fov", "sensor pose", lambda: room(sensor=camera(near=1.0)), set_color("sensor.x_fov"), 10.0, 0.05,
          spp=2048, fd_spp=2048),
     Case(
@@ -239,6 +247,51 @@ CASES = [
         "wall_in_sunlight", "shape to_world",
         lambda: room(light={"type": "directional", "direction": [-0.3, 0.1, -1.0], "irradiance": 3.0}, sensor=camera(start=4.0)),
         move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=2048, fd_spp=2048,
+    ),
+    Case(
+        "mirror_reflectance", "specular reflectance (delta lobe)", lambda: mirror_room(), set_color("wall.bsdf.specular_reflectance.value"), 0.9, 0.05,
+        spp=2048, fd_spp=2048,
+    ),
+    Case("mirror_moves", "mirror: to_world", lambda: mirror_room(), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=4096, fd_spp=4096),
+    Case("mirror_tilts", "mirror: to_world", lambda: mirror_room(), rotate("wall.to_world", (0, 1, 0)), 0.0, 0.05, spp=4096, fd_spp=4096),
+    Case(
+        "rough_mirror_moves", "shape to_world",
+        lambda: mirror_room({"type": "roughconductor", "alpha": 0.2, "distribution": "ggx"}), move("wall.to_world", (0, 0, 1)), 0.0, 4e-3,
+        spp=32768, fd_spp=32768,
+    ),
+    Case(
+        "plastic_alpha", "roughness (rough plastic)",
+        lambda: room(bsdf={"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": 0.3}, light=area_light()),
+        set_color("wall.bsdf.alpha"), 0.3, 0.01, spp=4096, fd_spp=4096, support="biased: Mitsuba's transmittance table is not differentiated",
+    ),
+    Case(
+        "principled_roughness", "roughness (principled)",
+        lambda: room(bsdf={"type": "principled", "roughness": 0.5, "base_color": {"type": "rgb", "value": 0.5}, "specular": 0.7}, light=area_light()),
+        set_color("wall.bsdf.roughness.value"), 0.5, 0.02, spp=4096, fd_spp=4096,
+    ),
+    Case(
+        "plastic_moves", "shape to_world",
+        lambda: room(bsdf={"type": "plastic", "diffuse_reflectance": 0.4}, light=area_light()), move("wall.to_world", (0, 0, 1)), 0.0, 4e-3,
+        spp=4096, fd_spp=16384,
+    ),
+    Case(
+        "thin_glass_tilts", "shape to_world",
+        lambda: glass_slab({"type": "thindielectric", "int_ior": 1.5}, "rectangle"), rotate("slab.to_world", (0, 1, 0)), 0.0, 0.5, spp=8192, fd_spp=65536,
+    ),
+    Case(
+        "mask_opacity", "mask opacity",
+        lambda: room(screen={"type": "rectangle", "to_world": transform().translate([0, 0, 0.5]).scale(2),
+                             "bsdf": {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse", "reflectance": 0.5}}}),
+        set_color("screen.bsdf.opacity.value"), 0.4, 0.02, spp=4096, fd_spp=4096,
+    ),
+    Case(
+        "sky_radiance", "environment radiance", lambda: room(light={"type": "constant", "radiance": 1.0}, sensor=camera(start=2.0)),
+        set_color("light.radiance.value"), 1.0, 0.05, spp=4096, fd_spp=4096,
+    ),
+    Case(
+        "ball_moves", "shape to_world",
+        lambda: room(ball={"type": "sphere", "center": [0, 0, -2.0], "radius": 2.2, "bsdf": {"type": "diffuse", "reflectance": 0.5}}),
+        move("ball.to_world", (0, 0, 1)), 0.0, 2e-3, spp=2048, fd_spp=2048,
     ),
     Case("wall_rgb", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, "llvm_ad_rgb", 2048, fd_spp=2048),
     Case("wall_spectral", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, "llvm_ad_spectral", 2048, fd_spp=2048),

@@ -67,7 +67,10 @@ def evaluate_all(bsdf, ctx):
         return (bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, *rest)
 
     if mi.variant().startswith("scalar"):
-        lanes = [call(mi.Vector3f(a), mi.Vector3f(b), float(c), mi.Point2f(d)) for a, b, c, d in zip(*inputs(200), strict=True)]
+        lanes = [
+            call(mi.Vector3f(a), mi.Vector3f(b), float(c), mi.Point2f(d))
+            for a, b, c, d in zip(*inputs(200), strict=True)
+        ]
         return [np.stack([np.array(x, dtype=float) for x in column], -1) for column in zip(*lanes, strict=True)]
     wi, wo, u1, u2 = inputs(LANES)
     result = call(mi.Vector3f(wi.T), mi.Vector3f(wo.T), mi.Float(u1), mi.Point2f(u2.T))
@@ -112,7 +115,9 @@ VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_pol
 def test_smooth_equals_mitsuba(variant):
     activate(variant)
     for material, ctx in product(MATERIALS, contexts()):
-        compare(mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx)
+        compare(
+            mi.load_dict({"type": "diff_dielectric", **material}), mi.load_dict({"type": "dielectric", **material}), ctx
+        )
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -159,7 +164,7 @@ def test_smooth_sample_is_attached():
     """Direction, index, probability and weight of both lobes against autograd in double precision."""
     activate("llvm_ad_mono")
     bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    wi, _, u1, u2 = inputs(LANES)
+    wi, _, u1, _u2 = inputs(LANES)
     steep = np.abs(wi[:, 2]) > 0.8  # no total internal reflection
     wi, u1 = wi[steep], u1[steep]
     u1[::2] *= 0.04  # many reflections
@@ -177,15 +182,22 @@ def test_smooth_sample_is_attached():
     mask = torch.tensor(reflected)
     mirror = w * torch.tensor([-1.0, -1.0, 1.0])
     wo = torch.where(mask[:, None], mirror, refracted_direction(w, eta))
-    expected = [*wo.T, torch.where(mask, F, 1 - F), torch.where(mask, 1.0, eta_it), torch.where(mask, 1.0, eta_it**-2)]
+    probability = torch.where(mask, F, 1 - F)
+    # Mitsuba's convention: the probability is detached, and the weight is the attached value over it.
+    value_over_probability = probability / probability.detach() * torch.where(mask, 1.0, eta_it**-2)
+    expected = [*wo.T, torch.where(mask, 1.0, eta_it), value_over_probability]
+    np.testing.assert_allclose(bs.pdf.numpy(), probability.detach().numpy(), rtol=2e-5, atol=2e-6)
+    assert not dr.grad_enabled(bs.pdf)
 
-    outputs = [*bs.wo, bs.pdf, bs.eta, weight[0]]
+    outputs = [*bs.wo, bs.eta, weight[0]]
     dr.set_grad(params["eta"], 1)
     dr.forward_to(outputs)
     for got, value in zip(outputs, expected, strict=True):
         np.testing.assert_allclose(dr.detach(got).numpy(), value.detach().numpy(), rtol=2e-5, atol=2e-6)
         (slope,) = torch.autograd.grad(value.sum(), eta, retain_graph=True, allow_unused=False)
-        np.testing.assert_allclose(np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5)
+        np.testing.assert_allclose(
+            np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5
+        )
 
 
 def test_smooth_sample_is_attached_to_the_incident_direction():
@@ -194,7 +206,7 @@ def test_smooth_sample_is_attached_to_the_incident_direction():
     wi = mi.Vector3f(0.48, -0.36, 0.8)
     dr.enable_grad(wi)
     for u, lobe in ((0.0, "reflection"), (0.9, "transmission")):
-        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(u), mi.Point2f(0.5))
+        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(u), mi.Point2f(0.5))
         w = torch.tensor([[0.48, -0.36, 0.8]], dtype=torch.float64, requires_grad=True)
         eta = torch.tensor([1.5], dtype=torch.float64)
         expected = w * torch.tensor([-1.0, -1.0, 1.0]) if lobe == "reflection" else refracted_direction(w, eta)
@@ -310,13 +322,15 @@ def test_gradient_passes_through_a_call_by_pointer():
     """The plugins are reached through arrays of pointers in a loop: the index must collect its derivative there too."""
     activate("llvm_ad_rgb")
     for kind in ("diff_dielectric", "diff_rough_dielectric"):
-        scene = mi.load_dict({"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}})
+        scene = mi.load_dict(
+            {"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}}
+        )
         params = mi.traverse(scene)
         dr.enable_grad(params["a.bsdf.eta"])
         params.update()
         rays = mi.Ray3f(mi.Point3f(0.1, 0.2, 2), dr.normalize(mi.Vector3f(mi.Float([0.3, -0.2, 0.1]), 0.1, -1)))
         si = scene.ray_intersect(rays)
-        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
+        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
         dr.backward(dr.sum(bs.eta + bs.pdf * 0))
         assert dr.grad(params["a.bsdf.eta"])[0] == pytest.approx(3, rel=1e-5)
 

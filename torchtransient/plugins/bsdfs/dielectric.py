@@ -19,10 +19,8 @@ class DiffDielectric(mi.BSDF):
     Differentiable: ``eta`` (inside over outside index) and the textures.
 
     Derivatives. ``sample`` chooses the lobe with detached numbers and attaches the rest to ``eta`` and ``si.wi``: the
-    direction ``bs.wo``, the index ``bs.eta``, the discrete probability ``bs.pdf`` of the chosen lobe, and the weight,
-    which is the lobe's value divided by that attached probability (so Fresnel's terms cancel from it). An integrator that
-    draws lobes detached uses ``weight * dr.relative_grad(bs.pdf)``. Mitsuba's own ``dielectric`` detaches ``bs.pdf`` and
-    puts its derivative into the weight: integrators that rely on this lose the derivative of Fresnel's terms here.
+    direction ``bs.wo``, the index ``bs.eta`` and the weight, which is the lobe's value divided by its detached probability. ``bs.pdf`` is
+    detached, as in Mitsuba's own ``dielectric``.
 
     ``eta`` is marked as discontinuous: moving it moves the refracted images of edges, which needs a boundary term that no
     integrator of this library has.
@@ -62,8 +60,10 @@ class DiffDielectric(mi.BSDF):
         if has_r and has_t:
             # The second condition keeps a lobe of zero probability from being drawn when the first one rounds.
             selected_r = (sample1 < dr.detach(terms.reflectance)) | (dr.detach(terms.transmittance) <= 0)
-            bs.pdf = dr.select(selected_r, terms.reflectance, terms.transmittance)
-            factor = mi.Float(1)
+            probability = dr.select(selected_r, terms.reflectance, terms.transmittance)
+            bs.pdf = dr.detach(probability)
+            # The value over its detached probability: one, with the derivative of Fresnel's term.
+            factor = dr.relative_grad(probability)
         else:
             selected_r = mi.Mask(has_r)
             bs.pdf = mi.Float(1)

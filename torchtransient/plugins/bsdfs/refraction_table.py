@@ -40,9 +40,8 @@ class RefractionTable:
         Raises SceneError for a blend of two refractive BSDFs with different indices, where a connection has no single
         optical length, and for a refractive plugin that does not expose ``eta``.
         """
-        outermost = _bsdfs_below(scene)
         size, entries = 1, []
-        for bsdf in outermost:
+        for bsdf in _bsdfs_of_scene(scene):
             number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
             size = max(size, number + 1)
             leaf = _refractive_leaf(bsdf)
@@ -67,6 +66,15 @@ class RefractionTable:
         crosses = active & (si.wi.z * wo.z < 0) & (number < self.size)
         eta = dr.select(crosses, dr.gather(mi.Float, self.table, number, crosses), 1.0)
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))
+
+
+def _bsdfs_of_scene(scene: Any) -> list[Any]:
+    shapes = scene.shapes()
+    if any(shape.class_name() == "Instance" for shape in shapes):
+        # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
+        return _bsdfs_below(scene)
+    found = {bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
+    return list(found.values())
 
 
 def _bsdfs_below(node: Any) -> list[Any]:

@@ -43,7 +43,6 @@ class TransientHDRFilm(mi.Film):
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
         self.start_opl = float(props.get("start_opl", 0.0))
         self._filter_name = str(props.get("temporal_filter", "box"))
-        self._stddev_given = props.has_property("gaussian_stddev")
         self.gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
         self.laser_scan_width = int(props.get("laser_scan_width", 0))

@@ -32,6 +32,7 @@ class SceneFacts:
         self.light_moves = False
         self.emitter_shape_moves = False
         self.sphere_lights = False
+        self.lobe_probability = None
         self.sensor_moves = False
         self.index_moves = False
 
@@ -39,6 +40,14 @@ class SceneFacts:
     def refracts(self) -> bool:
         """Whether next-event estimation can pass an interface between two media."""
         return self.refraction is not None
+
+    def unweighted(self, bsdf, bs):
+        """Factor of one whose derivative puts back the probability of a delta lobe, see :func:`lobe_probability_table`."""
+        if self.lobe_probability is None:
+            return mi.Float(1)
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        hidden = dr.gather(mi.UInt32, self.lobe_probability, number, number < dr.width(self.lobe_probability)) == 1
+        return dr.select(hidden, dr.relative_grad(bs.pdf), 1)
 
     def index_towards(self, bsdf, si, wo, η):
         """Index of the medium that ``wo`` points into, where ``η`` is the one that the path arrived in."""
@@ -69,7 +78,33 @@ class SceneFacts:
         facts.sphere_lights = facts.geometry and any(s.is_emitter() and s.class_name() == "Sphere" for s in scene.shapes())
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
+        facts.lobe_probability = lobe_probability_table(scene) if facts.delta else None
         return facts
+
+
+# Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself. Those of the others
+# (Mitsuba's dielectric and mask, ours) divide by the detached probability.
+_CANCELLING = ("ThinDielectric", "SmoothPlastic")
+
+
+def lobe_probability_table(scene):
+    """Which BSDFs, by their number in Dr.Jit's registry, hide the derivative of their lobes' probability; None if none does.
+
+    Inside ``mask`` the opacity hides in the same place and is attached already; such nested lobes are left as they are.
+    """
+    numbers = []
+    for bsdf in unique_bsdfs(scene):
+        if bsdf.class_name() in _CANCELLING or (bsdf.class_name() == "TwoSided" and _nests(bsdf)):
+            numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]))
+    if not numbers:
+        return None
+    table = dr.zeros(mi.UInt32, max(numbers) + 1)
+    dr.scatter(table, mi.UInt32(1), mi.UInt32(numbers))
+    return table
+
+
+def _nests(bsdf) -> bool:
+    return any(name in str(bsdf) for name in _CANCELLING)
 
 
 def _attached(plugin, names) -> bool:

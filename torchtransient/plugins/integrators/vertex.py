@@ -169,8 +169,7 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     terms.step = dr.select(onward, facts.index_towards(bsdf, si, wo, mi.Float(1)), 1)
     if facts.delta:
         bs, weight = bsdf.sample(ctx, si, v.u_lobe, v.u_dir, terms.mirrored)
-        # The weight has the lobe's probability divided out; its derivative comes back with that of the probability.
-        weight = mi.unpolarized_spectrum(weight) * (dr.relative_grad(bs.pdf) * v.rr)
+        weight = mi.unpolarized_spectrum(weight) * (facts.unweighted(bsdf, bs) * v.rr)
         terms.W = dr.select(terms.mirrored, weight, terms.W)
         terms.p_out, terms.d_out = si.p, si.to_world(bs.wo)
         terms.step = dr.select(terms.mirrored, bs.eta, terms.step)
