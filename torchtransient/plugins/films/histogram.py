@@ -267,13 +267,13 @@ class TransientHDRFilm(mi.Film):
         # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a bin.
         for offset, weight, _ in taps:
             k = first + offset
-            early, late = k < 0, k >= bins
-            before += dr.select(early, weight, 0)
-            after += dr.select(late, weight, 0)
+            before += dr.select(k < 0, weight, 0)
+            after += dr.select(k >= bins, weight, 0)
+            inside = active & (k >= 0) & (k < bins)
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, active & ~early & ~late)
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active):
