@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torchtransient import plugins
+from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -101,6 +102,8 @@ def active_variant(variant: str) -> Iterator[None]:
 def _set_variant(variant: str) -> None:
     import mitsuba as mi
 
+    if variant.startswith("llvm_"):
+        ensure_llvm()
     try:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
