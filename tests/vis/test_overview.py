@@ -7,14 +7,14 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError, UnitError
-from torchtransient.vis.overview import brightest_pixel, light_curve, moments_of_arrival, peak_time, plot_overview
+from torchtransient.vis.overview import light_curve, median_pixel, moments_of_arrival, peak_time, plot_overview
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 AXIS = TimeAxis(2.0, 0.5, 10)
 
 
 def pulse(channels=3, height=40, width=7):
-    """Every pixel sees one pulse in bin (row mod 10), pixel (17, 3) the brightest, and row 39 is dark."""
+    """Every pixel sees one pulse in bin (row mod 10), pixel (17, 3) another of five in bin 7, and row 39 is dark."""
     cube = torch.zeros(height, width, 10, channels)
     for row in range(height - 1):
         cube[row, :, row % 10] = 1.0
@@ -38,10 +38,25 @@ def test_peak_counts_all_channels():
     assert peak_time(cube, AXIS).item() == AXIS.centers_opl[6].item()
 
 
-def test_brightest_pixel_and_light_curve():
-    assert brightest_pixel(pulse()) == (17, 3)
-    curve = light_curve(pulse(1))
-    assert curve.tolist() == [28.0] * 7 + [32.0, 28.0, 21.0]
+def test_light_curve_counts_every_pixel_that_sees_light_alike():
+    cube = torch.zeros(3, 10, 40, 7)
+    cube[:, 2, :20] = 1.0
+    cube[0, 8, 20:] = 1e6  # twenty rows of lamp
+    cube[:, :, 30:] = 0.0  # ten of them dark
+    curve = light_curve(cube)
+    expected = torch.zeros(10, dtype=torch.float64)
+    expected[2], expected[8] = 2 / 3, 1 / 3
+    torch.testing.assert_close(curve, expected)
+    assert light_curve(torch.zeros(1, 10, 2, 2)).tolist() == [0.0] * 10
+
+
+def test_median_pixel_is_neither_lamp_nor_darkness():
+    steady = torch.zeros(3, 6, 5)
+    steady[:, 1:4, 2] = torch.tensor([100.0, 1.0, 0.5])
+    assert median_pixel(steady) == (2, 2)
+    assert median_pixel(torch.zeros(1, 4, 4)) == (1, 3)
+    with pytest.raises(ShapeError, match="steady image"):
+        median_pixel(torch.zeros(4, 4))
 
 
 def test_moments_of_arrival():
@@ -79,7 +94,7 @@ def test_picture(tmp_path, channels):
     cube = pulse(channels)
     path = tmp_path / "overview.png"
     shown = plot_overview(cube, cube.sum(1), AXIS, path, title="pulse")
-    assert shown.pixel == (17, 3)
+    assert shown.pixel == (19, 4)  # the 137th of 273 equal pixels, the brighter one being last
     assert len(shown.frames) == 3
     content = path.read_bytes()
     assert content[:8] == b"\x89PNG\r\n\x1a\n"

@@ -19,9 +19,21 @@ _ROWS_AT_ONCE = 32
 
 
 def light_curve(transient: Tensor) -> Tensor:
-    """(T,) float64: the sum over pixels and channels of a transient (C, T, H, W)."""
+    """(T,) float64: when the light of a pixel arrives, averaged over the pixels; sums to 1, or is 0 without light.
+
+    Every pixel that sees light counts alike, whether it sees the lamp itself or a dark corner. `transient` is
+    (C, T, H, W), else ShapeError.
+    """
     _check(transient)
-    return transient.detach().sum((0, 2, 3), dtype=torch.float64)
+    total = torch.zeros(transient.shape[1], dtype=torch.float64, device=transient.device)
+    lit = 0
+    for part in _row_bands(transient):
+        values = part.sum(0).clamp(min=0)
+        energy = values.sum(0)
+        seen = energy > 0
+        lit += int(seen.sum())
+        total += torch.where(seen, values / energy.where(seen, 1), 0).sum((1, 2), dtype=torch.float64)
+    return total / max(lit, 1)
 
 
 def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
@@ -39,28 +51,34 @@ def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
 
 
 def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5, 0.9)) -> list[int]:
-    """Indices of the bins by which the given shares of all light have arrived, ascending and different if possible.
+    """Indices of the bins by which the given shares of the `light_curve` have arrived; they differ if they can.
 
     Without any light they are spread evenly. Raises ShapeError when the transient is not (C, T, H, W).
     """
-    curve = light_curve(transient).clamp(min=0)
-    bins = curve.numel()
-    total = curve.cumsum(0)
-    if not float(total[-1]) > 0:
+    arrived = light_curve(transient).cumsum(0)
+    bins = arrived.numel()
+    if not float(arrived[-1]) > 0:
         return [int(share * (bins - 1)) for share in shares]
-    wanted = torch.tensor(shares, dtype=torch.float64, device=total.device) * total[-1]
-    found = [min(int(i), bins - 1) for i in torch.searchsorted(total, wanted)]
+    wanted = torch.tensor(shares, dtype=torch.float64, device=arrived.device) * arrived[-1]
+    # Shares that are reached exactly at an edge must not depend on the last digit of a sum.
+    found = [min(int(i), bins - 1) for i in torch.searchsorted(arrived, wanted - 1e-9)]
     for n in range(1, len(found)):
         found[n] = min(max(found[n], found[n - 1] + 1), bins - 1)
     return found
 
 
-def brightest_pixel(transient: Tensor) -> tuple[int, int]:
-    """(row, column) of the pixel with the highest bin (sum over channels). ShapeError when not (C, T, H, W)."""
-    _check(transient)
-    rows = [part.sum(0).amax(0) for part in _row_bands(transient)]
-    flat = int(torch.cat(rows).argmax())
-    return flat // transient.shape[-1], flat % transient.shape[-1]
+def median_pixel(steady: Tensor) -> tuple[int, int]:
+    """(row, column) of the pixel of median brightness among those of a steady image (C, H, W) that see light.
+
+    Neither the lamp nor a corner in the dark. Raises ShapeError for another shape.
+    """
+    if steady.ndim != 3 or steady.numel() == 0:
+        raise ShapeError(f"median_pixel: expected a steady image (C, H, W), got {tuple(steady.shape)}.")
+    brightness = steady.detach().sum(0).flatten()
+    order = brightness.argsort(stable=True)
+    order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
+    flat = int(order[(order.numel() - 1) // 2])
+    return flat // steady.shape[-1], flat % steady.shape[-1]
 
 
 def _row_bands(transient: Tensor) -> Iterator[Tensor]:
@@ -89,7 +107,7 @@ def plot_overview(
     """Write a picture (PNG, or what the ending says) of a render and return what it shows.
 
     `transient` (C, T, H, W) and `steady` (C, H, W), C = 1 or 3 in linear sRGB. `pixel` (row, column) defaults to the
-    one with the highest peak. Each image has its own exposure. Raises ShapeError for other shapes or a pixel outside, and
+    `median_pixel`. Each image has its own exposure. Raises ShapeError for other shapes or a pixel outside, and
     StorageError when the file cannot be written. Needs matplotlib (extra `vis`).
     """
     _check(transient, axis)
@@ -97,17 +115,18 @@ def plot_overview(
     if tuple(steady.shape) != (transient.shape[0], height, width):
         expected = (transient.shape[0], height, width)
         raise ShapeError(f"plot_overview: expected steady of shape {expected}, got {tuple(steady.shape)}.")
-    row, column = brightest_pixel(transient) if pixel is None else pixel
+    row, column = median_pixel(steady) if pixel is None else pixel
     if not (0 <= row < height and 0 <= column < width):
         raise ShapeError(f"plot_overview: pixel ({row}, {column}) lies outside of the image of {height} x {width}.")
     shown = Overview(tuple(moments_of_arrival(transient)), (row, column))
     figure_type = _figure_type()
     figure = figure_type(figsize=(12.0, 7.4), layout="constrained")
-    panels = figure.subplots(2, 3)
-    _draw_steady(panels[0, 0], steady, shown.pixel)
-    _draw_peak_time(figure, panels[0, 1], transient, axis)
-    _draw_histogram(panels[0, 2], transient, axis, shown.pixel)
-    for panel, index in zip(panels[1], shown.frames, strict=True):
+    upper, lower = figure.subfigures(2, 1)
+    panels = upper.subplots(1, 3)
+    _draw_steady(panels[0], steady, shown.pixel)
+    _draw_peak_time(upper, panels[1], transient, axis)
+    _draw_histogram(panels[2], transient, axis, shown.pixel)
+    for panel, index in zip(lower.subplots(1, 3), shown.frames, strict=True):
         panel.imshow(tone_map(transient[:, index].cpu()).numpy(), interpolation="nearest")
         opl, time_s = float(axis.centers_opl[index]), float(axis.centers_s[index])
         panel.set_title(f"{opl:.3f} m = {time_s * _NANOSECONDS:.3f} ns (bin {index})", fontsize=10)
