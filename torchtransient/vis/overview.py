@@ -140,6 +140,19 @@ def plot_overview(
     return shown
 
 
+def check_picture(path: str | Path) -> None:
+    """Raise StorageError when `plot_overview` could not write to `path`. For before a long render."""
+    folder = Path(path).parent
+    if not folder.is_dir():
+        raise StorageError(f"plot_overview: the folder '{folder}' does not exist. Create it first.")
+    _figure_type()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    endings = FigureCanvasAgg.get_supported_filetypes()
+    if Path(path).suffix.lstrip(".").lower() not in endings:
+        raise StorageError(f"plot_overview: expected a name that ends in .png, got '{path}'.")
+
+
 def _draw_steady(panel: Any, steady: Tensor, pixel: tuple[int, int]) -> None:
     panel.imshow(tone_map(steady.cpu()).numpy(), interpolation="nearest")
     panel.plot(pixel[1], pixel[0], marker="o", markersize=9, markerfacecolor="none", color="deepskyblue")
