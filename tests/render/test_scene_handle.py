@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from conftest import CAMERA, COLOUR, VARIANT, make_room, pose
 from torchtransient.render.variant import active_variant
+from torchtransient.testing.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
 
 # As the scenes of mitransient 1.x are written: its plugin and parameter names, and an older version number.
 PEER_XML = """<scene version="3.0.0">

@@ -21,6 +21,8 @@ SILHOUETTES = "correct except where silhouettes move (no boundary term)"
 _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
 # Mitsuba's classes whose index of refraction is a plain float, and the plugin each was made from.
 _INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
+# In spectral variants these keep the coefficients of a smooth spectrum (Jakob and Hanika 2019).
+_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
 _SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
@@ -141,6 +143,8 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
         return True, True, CORRECT
     if flags & mi.ParamFlags.NonDifferentiable:
         return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
+    if mi.is_spectral and node.class_name().startswith(_COEFFICIENT_CLASSES) and name in ("value", "data"):
+        return True, False, f"{CORRECT}; the numbers are coefficients of Mitsuba's spectral model, not a colour"
     return True, False, CORRECT
 
 
