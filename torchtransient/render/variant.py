@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torchtransient import plugins
+from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -27,7 +28,8 @@ _process = {"parent_was_rendering": False}
 def _mark_fork() -> None:
     """Runs in the child of a fork: Dr.Jit's threads did not come along, and waiting for them would never end."""
     mitsuba = sys.modules.get("mitsuba")
-    if mitsuba is not None and (mitsuba.variant() or "scalar").startswith("scalar") is False:
+    active = None if mitsuba is None else mitsuba.variant()
+    if active is not None and not active.startswith("scalar"):
         _process["parent_was_rendering"] = True
 
 
@@ -101,6 +103,8 @@ def active_variant(variant: str) -> Iterator[None]:
 def _set_variant(variant: str) -> None:
     import mitsuba as mi
 
+    if variant.startswith("llvm"):
+        ensure_llvm()
     try:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
