@@ -16,7 +16,11 @@ from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 def run(script: str, *arguments: str) -> str:
     """Run a script file's text in a fresh interpreter; returns what it prints."""
     result = subprocess.run(
-        [sys.executable, *arguments, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=240, check=False
+        [sys.executable, *arguments, "-c", textwrap.dedent(script)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
     assert result.returncode == 0, result.stderr[-4000:]
     return result.stdout.strip()
@@ -33,7 +37,8 @@ def test_pickle_travels_to_a_fresh_process(tmp_path, room_scene):
         renderer = pickle.loads(open({str(tmp_path / "renderer.pkl")!r}, "rb").read())
         out = renderer(seed=2).transient
         out.sum().backward()
-        print(torch.equal(out.detach(), torch.load({str(tmp_path / "expected.pt")!r})), len(list(renderer.parameters())))
+        expected = torch.load({str(tmp_path / "expected.pt")!r})
+        print(torch.equal(out.detach(), expected), len(list(renderer.parameters())))
     """)
     assert printed == "True 1"
 
@@ -50,7 +55,8 @@ def test_spawned_data_loader(tmp_path):
 
         class Rooms(Dataset):
             def __init__(self):
-                self.renderer = tt.TransientRenderer(tt.load(make_room(), variant={VARIANT!r}), parameters=[COLOUR], spp=16)
+                scene = tt.load(make_room(), variant={VARIANT!r})
+                self.renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=16)
 
             def __len__(self):
                 return 4

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.render import memory
-from torchtransient.render.renderer import mix_seed
+from torchtransient.render.arguments import mix_seed
 from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 
 
@@ -48,7 +48,9 @@ def test_statistics(room_scene):
 def test_function_and_module_agree(room_scene):
     x = torch.tensor([0.3, 0.6, 0.9])
     module = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)
-    assert torch.equal(module({COLOUR: x}, seed=4).transient, tt.render(room_scene, {COLOUR: x}, spp=16, seed=4).transient)
+    assert torch.equal(
+        module({COLOUR: x}, seed=4).transient, tt.render(room_scene, {COLOUR: x}, spp=16, seed=4).transient
+    )
     y = x.clone().requires_grad_()
     tt.render(room_scene, {COLOUR: y}, spp=16, seed=4).transient.sum().backward()
     assert y.grad.abs().min() > 0
@@ -63,7 +65,10 @@ def test_start_values_may_be_given(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: [0.1, 0.2, 0.3], GREY: None}, spp=4)
     torch.testing.assert_close(renderer.values[COLOUR].detach(), torch.tensor([0.1, 0.2, 0.3]))
     assert float(renderer.values[GREY].detach()) == 0.5
-    assert [name for name, _ in renderer.named_parameters()] == ["box/bsdf/reflectance/value", "wall/bsdf/reflectance/value"]
+    assert [name for name, _ in renderer.named_parameters()] == [
+        "box/bsdf/reflectance/value",
+        "wall/bsdf/reflectance/value",
+    ]
 
 
 # ------------------------------------------------------------------------------------------------- seeds, batches
@@ -233,7 +238,9 @@ def test_wrong_shapes(room_scene):
         tt.TransientRenderer(room_scene, parameters={COLOUR: torch.rand(2, 3)})
 
 
-@pytest.mark.parametrize("value", [[0.1, 0.2, 0.3], np.zeros(3), torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool()])
+@pytest.mark.parametrize(
+    "value", [[0.1, 0.2, 0.3], np.zeros(3), torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool()]
+)
 def test_values_that_are_not_real_tensors(room_scene, value):
     with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
         tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)({COLOUR: value}, seed=0)

@@ -16,7 +16,9 @@ from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 def run(script: str) -> str:
     """Run a script in a fresh interpreter; returns what it prints."""
-    result = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False
+    )
     assert result.returncode == 0, result.stderr[-3000:]
     return result.stdout.strip()
 
@@ -95,9 +97,9 @@ def test_scenes_of_several_variants_side_by_side(variant, room_scene):
 
 
 def test_unusable_variants():
-    with pytest.raises(tt.errors.VariantError, match="not part of this Mitsuba.*llvm_ad_rgb"):
+    with pytest.raises(tt.errors.VariantError, match=r"not part of this Mitsuba.*llvm_ad_rgb"):
         tt.load(make_room(), variant="llvm_ad_rbg")
-    with pytest.raises(tt.errors.VariantError, match="scalar_rgb.*differentiates"):
+    with pytest.raises(tt.errors.VariantError, match=r"scalar_rgb.*differentiates"):
         tt.load(make_room(), variant="scalar_rgb")
     assert is_differentiable(resolve_variant(None))
 

@@ -1,7 +1,7 @@
 """A scene that renders in milliseconds, for tests of everything around the integrator. Lengths in metres.
 
-A wall seen frontally through 4 x 3 pixels, a coloured cube before it, a point light beside the camera: arrivals lie between 6 and 12 m.
-Plain data; no Mitsuba variant is needed.
+A wall seen frontally through 4 x 3 pixels, a coloured cube before it, a point light beside the camera: arrivals lie
+between 6 and 12 m. Plain data; no Mitsuba variant is needed.
 """
 
 from __future__ import annotations
