@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _runner import environment, report, summary
+from _runner import arguments, environment, report, summary
 
 CHILD = Path(__file__).resolve().parent / "_gpu_child.py"
 ALBEDO, WALL = "red.reflectance.value", "red-wall.to_world"
 
 
-def run(variant: str) -> dict[str, Any]:
+def run(variant: str, quick: bool) -> dict[str, Any]:
     """Results of one variant."""
-    done = subprocess.run([sys.executable, str(CHILD), variant], capture_output=True, text=True, check=False)
+    command = [sys.executable, str(CHILD), variant, *(["--quick"] if quick else [])]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     if done.returncode or not lines:
         print(done.stderr, file=sys.stderr)
@@ -43,7 +44,8 @@ def agree(name: str, cuda: dict[str, Any], llvm: dict[str, Any]) -> bool:
 
 
 def main() -> None:
-    cuda, llvm = run("cuda_ad_rgb"), run("llvm_ad_rgb")
+    options = arguments(__doc__, peer=False).parse_args()
+    cuda, llvm = run("cuda_ad_rgb", options.quick), run("llvm_ad_rgb", options.quick)
     passed = [agree(name, cuda, llvm) for name in ("steady", "transient", "gradient albedo", "gradient wall")]
     for name in ("tensor on the GPU", "tensor is the film's memory", "parameter on the GPU", "gradient on the GPU"):
         passed.append(bool(cuda[name]))
@@ -58,12 +60,8 @@ def main() -> None:
         "checks": len(passed),
         "environment": {**environment("cuda_ad_rgb"), "gpu": cuda["gpu"]},
     }
-    report(
-        "gpu_check",
-        {"resolution": 256, "bins": 300, "spp": 64},
-        results,
-        Path(sys.argv[1]) if len(sys.argv) > 1 else None,
-    )
+    settings = {"resolution": 256, "bins": 300, "spp": 64} if not options.quick else {"quick": True}
+    report("gpu_check", settings, results, options.json)
     sys.exit(0 if all(passed) else 1)
 
 

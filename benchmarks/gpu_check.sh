@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Checks of the CUDA variants on a machine with an NVIDIA GPU: agreement with LLVM, torch CUDA tensors without a copy, speed.
-# Usage: benchmarks/gpu_check.sh [REPORT.json]     (PYTHON names the interpreter, python3 unless set)
+# Usage: benchmarks/gpu_check.sh [--quick] [--json REPORT.json]     (PYTHON names the interpreter, python3 unless set)
 # Exit code 0: every check passed. 1: a check failed. 3: no usable GPU.
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"

@@ -1,5 +1,37 @@
 """torchtransient: time-resolved light transport as differentiable PyTorch tensors."""
 
-from torchtransient import plugins as plugins  # lets Mitsuba tell the plugins of a change of variant
+from torchtransient import _llvm
+
+_llvm.bind()  # chooses the LLVM that Dr.Jit takes at its import, so nothing above may import mitsuba or drjit
+
+from torchtransient import plugins as plugins  # noqa: E402  lets Mitsuba tell the plugins of a change of variant
 
 __version__ = "0.1.0.dev0"
+
+_LAZY = {
+    "RenderOutput": "torchtransient.render.output",
+    "RenderStats": "torchtransient.render.output",
+    "Scene": "torchtransient.render.scene_handle",
+    "TimeAxis": "torchtransient.axes",
+    "TransientRenderer": "torchtransient.render.renderer",
+    "cost_of_accuracy": "torchtransient.accuracy.cost",
+    "load": "torchtransient.render.scene_handle",
+    "render": "torchtransient.render.renderer",
+    "scenes": "torchtransient.scenes",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Public names are imported when they are first used: `import torchtransient` stays cheap."""
+    import importlib
+
+    if name not in _LAZY:
+        raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
+    module = importlib.import_module(_LAZY[name])
+    value = module if name == "scenes" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_LAZY])

@@ -64,8 +64,9 @@ def measure(
             first_seed = seed + 1000 + n * (repeats + 1)
             points += _measure_count(candidates, count, repeats, first_seed, references, bar)
     method = "in pairs of independent runs" if reference_spp is None else f"against a reference of {reference_spp} spp"
-    order = {key: i for i, key in enumerate(dict.fromkeys((p.quantity, p.choice) for p in points))}
-    points.sort(key=lambda p: order[p.quantity, p.choice])
+    quantities = list(dict.fromkeys(p.quantity for p in points))
+    choices = list(candidates)
+    points.sort(key=lambda p: (quantities.index(p.quantity), choices.index(p.choice)))
     return AccuracyReport(points, method, dict(settings or {}))
 
 

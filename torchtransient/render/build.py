@@ -6,12 +6,14 @@ names), and the list is instantiated. The same edits serve XML files and diction
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.render.description import Description
 
@@ -24,6 +26,8 @@ _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# Among the substitutions: every bitmap texture is stored as floats, whatever its file holds.
+FLOAT_TEXTURES = "*bitmap"
 
 
 @dataclass(frozen=True)
@@ -31,8 +35,9 @@ class BuildOptions:
     """What is changed of a description when it is built.
 
     ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for the integrator, or None.
-    ``substitute``: names of BSDFs that are built as their differentiable twins. ``merge``: let Mitsuba merge meshes and
+    ``substitute``: names of BSDFs that are built as their differentiable twins, or ``FLOAT_TEXTURES``. ``merge``: let Mitsuba merge meshes and
     equal materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into transient ones.
+    ``sampler``: plugin name of the sampler of every sensor, or None to keep them.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -40,6 +45,7 @@ class BuildOptions:
     substitute: frozenset[str] = frozenset()
     merge: bool = False
     transient: bool = False
+    sampler: str | None = None
 
 
 @dataclass
@@ -61,42 +67,41 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
     config.merge_equivalent = options.merge
     config.merge_meshes = options.merge
     try:
-        with description.resolved_files():
+        with description.resolved_files(), plugins.plugin_errors():
             state = description.parse(config)
-            _check_root(state, description)
+            _check_root(state)
             name_nodes(state)
+            if not options.merge:
+                _name_nested(state)
             _override_films(state, options)
             _override_integrator(state, options)
+            _override_samplers(state, options)
             _substitute_plugins(state, options.substitute)
             transforms = _mesh_transforms(state)
             integrator = _find_child(state, state.root, _is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
+            _forget_queries(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
-    except TorchTransientError:
-        raise
+            if not isinstance(scene, mi.Scene):
+                raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
+    except TorchTransientError as error:
+        raise type(error)(f"{_location(error.__cause__) or description.name}: {error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
-        raise _scene_error(description, error) from error
-    if not isinstance(scene, mi.Scene):
-        raise SceneError(f"{description.name}: expected one <scene>, got {type(scene).__name__}.")
-    params = mi.traverse(scene)
-    return BuiltScene(scene, params, transforms, plugin)
+        text = str(error).replace("While loading string", f"While loading {description.name}")
+        raise SceneError(f"{description.name}: Mitsuba could not build the scene. {text}") from error
+    return BuiltScene(scene, mi.traverse(scene), transforms, plugin)
 
 
-def _scene_error(description: Description, error: Exception) -> Exception:
-    """The library's own error when a plugin raised one, else a ``SceneError`` with Mitsuba's message, which names file and line."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, TorchTransientError):
-            return type(cause)(f"{description.name}: {cause}")
-        cause = cause.__cause__ or cause.__context__
-    text = str(error).replace("While loading string", f"While loading {description.name}")
-    return SceneError(f"{description.name}: Mitsuba could not build the scene. {text}")
+def _location(error: BaseException | None) -> str | None:
+    """File and line, or dictionary node, that a message of Mitsuba names."""
+    found = re.search(r'(?:At|While loading) (.+? \(line \d+, col \d+\)|dictionary node "[^"]+")', str(error or ""))
+    return found.group(1) if found else None
 
 
-def _check_root(state: Any, description: Description) -> None:
+def _check_root(state: Any) -> None:
     if state.root.props.plugin_name() != "scene":
-        raise SceneError(f"{description.name}: expected a <scene> at the top, got <{state.root.props.plugin_name()}>.")
+        raise SceneError(f"expected a <scene> at the top, got <{state.root.props.plugin_name()}>.")
 
 
 # --------------------------------------------------------------------------------------------------------- nodes
@@ -171,17 +176,17 @@ def name_nodes(state: Any) -> None:
         seen[kind] = number + 1
         taken.add(name)
         node.props.set_id(name)
-    _name_nested_bsdfs(state, taken)
 
 
-def _name_nested_bsdfs(state: Any, taken: set[str]) -> None:
+def _name_nested(state: Any) -> None:
     """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
     import mitsuba as mi
 
     direct = {index for _, index in _children(state, state.root)}
+    taken = {node.props.id() for node in state.nodes}
     for index, node in enumerate(state.nodes):
         if node.type == mi.ObjectType.BSDF and index not in direct:
-            name = f"{node.props.id() or 'bsdf'}#{index}"
+            name = f"{node.props.id()}#{index}"
             while name in taken:
                 name += "'"
             taken.add(name)
@@ -270,8 +275,35 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
 
 
+def _override_samplers(state: Any, options: BuildOptions) -> None:
+    """Another sampler with the same number of samples; parameters that only the old one had are dropped."""
+    import mitsuba as mi
+
+    if options.sampler is None:
+        return
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
+        if node.type != mi.ObjectType.Sensor:
+            continue
+        sampler = _find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        if sampler is None:
+            _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
+        else:
+            _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
+
+
 def _substitute_plugins(state: Any, names: frozenset[str]) -> None:
-    """Build the BSDFs called ``names`` as their differentiable twins, which take the same parameters."""
+    """Build the BSDFs called ``names`` as their differentiable twins, which take the same parameters; store bitmaps as floats if asked for."""
     for node in state.nodes:
-        if node.props.id() in names and node.props.plugin_name() in DIFFERENTIABLE_PLUGINS:
-            node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[node.props.plugin_name()])
+        plugin = node.props.plugin_name()
+        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in names:
+            node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
+        elif plugin == "bitmap" and FLOAT_TEXTURES in names:
+            node.props["format"] = "variant"
+
+
+def _forget_queries(state: Any) -> None:
+    """Looking at a property counts as using it: take that back, so that Mitsuba still reports misspelt ones."""
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            node.props.mark_queried(key, False)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchtransient.errors import GradientError, SceneError, ShapeError, UnitError
+from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.memory import check_fits
 from torchtransient.render.variant import active_variant
@@ -84,8 +84,13 @@ class _Session:
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)
-        with _quiet():
-            self.slots.install(leaves)
+        try:
+            with _quiet():
+                self.slots.install(leaves)
+        except (RuntimeError, ValueError, TypeError) as error:
+            if isinstance(error, TorchTransientError):
+                raise
+            raise SceneError(f"values of {', '.join(self.job.keys)}: Mitsuba refuses them: {error}") from error
         return leaves
 
     def set_filter(self, name: str) -> list[tuple[Any, str]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, BuiltScene
+from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, FLOAT_TEXTURES, BuiltScene
 
 CORRECT = "correct"
 SILHOUETTES = "correct except where silhouettes move (no boundary term)"
@@ -87,7 +87,7 @@ def _short(value: Any) -> str:
 def parameter_table(built: BuiltScene) -> ParameterTable:
     """Read the table off a built scene (unmerged, without substitutions), inside its variant."""
     entries = []
-    for key in built.params.keys():
+    for key in built.params.properties:
         node = built.params.properties[key][2]
         entries.append(_describe(built, key, node))
         if key.endswith(".vertex_positions"):
@@ -112,6 +112,9 @@ def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
         twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
         reason = f"{CORRECT}; built as {twin} when asked for, since Mitsuba's own index is a plain float"
         return ParameterInfo(key, "number", (), float(current), True, True, reason, substitute=node.id())
+    if name == "data" and class_name.startswith("BitmapTextureImpl") and not isinstance(current, mi.TensorXf):
+        reason = f"{CORRECT}; stored as floats when asked for, since {type(current).__name__} has no derivative"
+        return ParameterInfo(key, "tensor", tuple(current.shape), value, True, False, reason, FLOAT_TEXTURES)
     differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
     if not differentiable and isinstance(node, mi.Shape) and name == "faces":
         reason = "a list of vertex numbers"

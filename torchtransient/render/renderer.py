@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -69,7 +71,7 @@ class TransientRenderer(nn.Module):
     ``grad_seed``: None draws the samples of the derivative independently of the render (which makes gradients of squared losses unbiased), "same" takes
     the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto".
+    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second derivatives raise ``GradientError``.
     """
@@ -86,6 +88,7 @@ class TransientRenderer(nn.Module):
         sensors: int | Sequence[int] | str = 0,
         effects: str = "auto",
         grad_seed: int | str | None = None,
+        sampler: str | None = None,
     ):
         super().__init__()
         if effects != "auto":
@@ -99,7 +102,7 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = _grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        self._options = self._build_options(time_axis, max_depth)
+        self._options = self._build_options(time_axis, max_depth, sampler)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -110,13 +113,13 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(self, time_axis: TimeAxis | None, max_depth: int | None) -> BuildOptions:
+    def _build_options(self, time_axis: TimeAxis | None, max_depth: int | None, sampler: str | None) -> BuildOptions:
         if time_axis is not None and not isinstance(time_axis, TimeAxis):
             raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
         axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        return self.scene.options_for(self._keys, BuildOptions(axis, max_depth, transient=True))
+        return self.scene.options_for(self._keys, BuildOptions(axis, max_depth, transient=True, sampler=sampler))
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
         table = self.scene.parameters() if self._keys else {}
@@ -165,6 +168,28 @@ class TransientRenderer(nn.Module):
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
         return "tent" if moves and self._scene_filter == "box" else self._scene_filter
+
+    def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
+        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one has."""
+        if temporal_filter is not None and temporal_filter not in TEMPORAL_FILTERS:
+            raise SceneError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}.")
+        twin = copy.deepcopy(self)
+        if sampler is not None:
+            twin._options = replace(self._options, sampler=sampler)
+        if temporal_filter is not None:
+            twin.temporal_filter = temporal_filter
+        return twin
+
+    def has_slope_for(self, keys: Sequence[str]) -> bool:
+        """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
+        return self.effective_filter != "box" or not any(self._infos[key].moves_path_length for key in keys)
+
+    def samples_drawn(self, spp: int) -> int:
+        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that they can lay out."""
+        with active_variant(self.scene.variant):
+            sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
+            sampler.set_sample_count(spp)
+            return int(sampler.sample_count())
 
     def forward(
         self,

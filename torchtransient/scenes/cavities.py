@@ -59,7 +59,8 @@ def furnace(
     }
     if not emitter_sampling:
         scene["wall"]["emitter"]["sampling_weight"] = 0.0
-        scene["dark"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 0.0}
+        # Not zero: spectral variants refuse a light without any energy. Added to anything in float32 it changes nothing.
+        scene["dark"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1e-30}
     return scene
 
 

@@ -1,0 +1,128 @@
+"""`tt.cost_of_accuracy` on the real renderer, with tiny scenes."""
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.accuracy.cost import cosine_over_the_window
+from torchtransient.accuracy.report import Choice
+from torchtransient.errors import SceneError
+
+ALBEDO, WALL, LIGHT = "wall.bsdf.reflectance.value", "wall.to_world", "light.position"
+
+
+def wall_renderer(**settings):
+    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant="llvm_ad_mono")
+    return tt.TransientRenderer(scene, parameters=[ALBEDO, WALL], **settings)
+
+
+@pytest.fixture(scope="module")
+def report():
+    return tt.cost_of_accuracy(
+        wall_renderer(),
+        spp=(16, 64, 256, 1024),
+        gradients=[ALBEDO, WALL],
+        repeats=8,
+        samplers=("independent", "multijitter"),
+        temporal_filters=("box", "tent"),
+        progress=False,
+    )
+
+
+def test_every_curve_is_there(report):
+    curves = {(quantity, str(choice)) for quantity, choice, _ in report.curves()}
+    names = [f"{sampler}, {name}" for sampler in ("independent", "multijitter") for name in ("box", "tent")]
+    assert {name for quantity, name in curves if quantity == "transient"} == set(names)
+    for key in (ALBEDO, WALL):
+        assert {name for quantity, name in curves if quantity == f"d loss / d {key}"} == {names[1], names[3]}
+    assert report.settings["without_gradients"] == [names[0], names[2]]
+    assert all([p.spp for p in curve] == [16, 64, 256, 1024] for _, _, curve in report.curves())
+    assert all(p.seconds > 0 for p in report.points)
+
+
+def test_independent_samples_converge_as_one_over_spp(report):
+    for name in ("box", "tent"):
+        slope = report.slope("transient", Choice("independent", name))
+        assert abs(slope.slope + 1) < max(4 * slope.standard_error, 0.1)
+
+
+def test_stratified_samples_do_better(report):
+    independent, stratified = (
+        next(
+            curve
+            for quantity, choice, curve in report.curves()
+            if quantity == "transient" and choice == Choice(s, "tent")
+        )
+        for s in ("independent", "multijitter")
+    )
+    assert stratified[-1].squared_error < 0.5 * independent[-1].squared_error
+
+
+def test_the_error_is_the_variance_of_the_renderer():
+    renderer = wall_renderer(temporal_filter="tent").variation(sampler="independent")
+    runs = (
+        torch.stack([renderer(seed=1000 + k, spp=16).transient.detach() for k in range(200)]).numpy().astype(np.float64)
+    )
+    expected = runs.var(axis=0, ddof=1).mean()
+    report = tt.cost_of_accuracy(renderer, spp=(16,), repeats=200, samplers=("independent",), progress=False)
+    (point,) = report.points
+    assert (
+        abs(point.squared_error / expected - 1)
+        < 5 * np.sqrt(2) * point.squared_error_standard_error / point.squared_error
+    )
+
+
+def test_gradients_against_a_reference():
+    report = tt.cost_of_accuracy(
+        wall_renderer(),
+        spp=(16, 64),
+        gradients=[ALBEDO],
+        reference_spp=4096,
+        repeats=20,
+        samplers=("independent",),
+        progress=False,
+    )
+    coarse, fine = (p for p in report.points if p.quantity == f"d loss / d {ALBEDO}")
+    error = np.hypot(
+        coarse.squared_error_standard_error / coarse.squared_error,
+        fine.squared_error_standard_error / fine.squared_error,
+    )
+    assert abs(coarse.squared_error / fine.squared_error / 4 - 1) < 4 * error
+    assert "reference of 4096" in report.method
+
+
+def test_sample_counts_are_those_that_were_drawn():
+    renderer = wall_renderer()
+    assert renderer.variation(sampler="independent").samples_drawn(10) == 10
+    assert renderer.variation(sampler="multijitter").samples_drawn(10) >= 10
+    drawn = renderer.variation(sampler="stratified").samples_drawn(10)
+    assert drawn == 16  # the next square
+    report = tt.cost_of_accuracy(renderer, spp=(10,), repeats=2, samplers=("stratified",), progress=False)
+    assert report.points[0].spp == 16
+
+
+def test_the_renderer_is_left_as_it_was():
+    renderer = wall_renderer(spp=4)
+    before = renderer(seed=3).transient.clone()
+    tt.cost_of_accuracy(renderer, spp=(4,), gradients=[ALBEDO], repeats=2, samplers=("multijitter",), progress=False)
+    assert torch.allclose(renderer(seed=3).transient, before, rtol=1e-5, atol=1e-7)
+    assert all(parameter.grad is None for parameter in renderer.parameters())
+
+
+def test_default_loss_is_linear():
+    out = wall_renderer()(seed=0, spp=4)
+    doubled = type(out)(2 * out.transient, out.steady, None, out.axis, out.stats)
+    assert torch.allclose(cosine_over_the_window(doubled), 2 * cosine_over_the_window(out))
+
+
+def test_errors():
+    renderer = wall_renderer()
+    with pytest.raises(SceneError, match=r"light\.position"):
+        tt.cost_of_accuracy(renderer, gradients=[LIGHT], progress=False)
+    with pytest.raises(SceneError, match="at least one"):
+        tt.cost_of_accuracy(renderer, samplers=(), progress=False)
+    with pytest.raises(SceneError):
+        tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, samplers=("no_such_sampler",), progress=False)
+    with pytest.raises(SceneError, match="temporal_filter"):
+        tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, temporal_filters=("round",), progress=False)

@@ -1,0 +1,212 @@
+"""Parameters: the table, and that a torch value has the effect of the same value written in the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+import torchtransient as tt
+from conftest import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
+from torchtransient.render.variant import active_variant
+
+TURN = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1.0]])
+
+
+def textured_room() -> dict:
+    room = make_room()
+    pixels = np.linspace(0.1, 0.9, 12, dtype=np.float32).reshape(2, 2, 3)
+    room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "data": pixels, "raw": True}}
+    room["box"]["bsdf"] = {"type": "roughconductor", "alpha": 0.4}
+    room["ball"] = {"type": "sphere", "to_world": pose(-0.4, 0.2, 0.4, 0.25)}
+    room["spot"] = {"type": "spot", "to_world": np.diag([1.0, -1, -1, 1]) + pose(-0.3, 0, 3) - np.eye(4), "intensity": 3.0}
+    room["lamp"] = {
+        "type": "rectangle",
+        "to_world": np.diag([0.2, -0.2, -0.2, 1]) + pose(0.2, 0.8, 2.5) - np.eye(4),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 5.0, 6.0]}},
+    }
+    return room
+
+
+def set_pixels(room, value):
+    room["wall"]["bsdf"]["reflectance"]["data"] = value
+
+
+# key -> (new value, how the dictionary says the same)
+WRITTEN = {
+    "wall.bsdf.reflectance.data": (np.full((2, 2, 3), 0.35) + 0.1 * np.arange(3), set_pixels),
+    "box.bsdf.alpha.value": (np.array(0.2), lambda room, v: room["box"]["bsdf"].update(alpha=float(v))),
+    "wall.to_world": (pose(0.1, 0, -0.3, 3.0) @ TURN, lambda room, v: room["wall"].update(to_world=v)),
+    "ball.to_world": (pose(-0.3, 0.1, 0.6, 0.3), lambda room, v: room["ball"].update(to_world=v)),
+    "box.to_world": (pose(0.2, 0.1, 0.4, 0.35) @ TURN, lambda room, v: room["box"].update(to_world=v)),
+    "light.position": (np.array([-0.4, 0.1, 3.5]), lambda room, v: room["light"].update(position=v.tolist())),
+    "spot.to_world": (
+        np.diag([1.0, -1, -1, 1]) + pose(0.3, 0.1, 3.2) - np.eye(4),
+        lambda room, v: room["spot"].update(to_world=v),
+    ),
+    "lamp.emitter.radiance.value": (
+        np.array([1.0, 2.0, 3.0]),
+        lambda room, v: room["lamp"]["emitter"]["radiance"].update(value=v.tolist()),
+    ),
+    "lamp.to_world": (
+        np.diag([0.3, -0.3, -0.3, 1]) + pose(0.1, 0.7, 2.4) - np.eye(4),
+        lambda room, v: room["lamp"].update(to_world=v),
+    ),
+    "sensor.to_world": (CAMERA + pose(0.05, 0.1, 0.2) - np.eye(4), lambda room, v: room["sensor"].update(to_world=v)),
+    "sensor.x_fov": (np.array(15.0), lambda room, v: room["sensor"].update(fov=float(v))),
+}
+
+
+@pytest.fixture(scope="module")
+def textured():
+    return tt.load(textured_room(), variant=VARIANT)
+
+
+@pytest.mark.parametrize("key", list(WRITTEN))
+def test_value_has_the_effect_of_the_same_value_in_the_scene(textured, key):
+    value, write = WRITTEN[key]
+    renderer = tt.TransientRenderer(textured, parameters=[key], spp=16, temporal_filter="tent")
+    before = renderer(seed=2).transient.detach()
+    given = renderer({key: torch.tensor(value, dtype=torch.float32)}, seed=2).transient.detach()
+    room = textured_room()
+    write(room, value)
+    written = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[key], spp=16, temporal_filter="tent")(seed=2)
+    assert (given - before).abs().max() > 1e-3, "the value has no effect: the test would not notice anything"
+    # A few samples graze an edge and land on its other side when a matrix is rounded differently.
+    close = torch.isclose(given, written.transient.detach(), rtol=1e-3, atol=1e-4)
+    assert close.float().mean() > 0.99
+    torch.testing.assert_close(given.sum(), written.transient.detach().sum(), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("key", [*WRITTEN, "box.vertex_positions", "box.vertex_normals", "light.intensity.value"])
+def test_start_value_is_the_scene_and_the_scene_is_restored(textured, key):
+    plain = tt.TransientRenderer(textured, parameters=["wall.bsdf.reflectance.data"], spp=8, temporal_filter="tent")
+    expected = plain(seed=1).transient.detach()
+    renderer = tt.TransientRenderer(textured, parameters=[key], spp=8, temporal_filter="tent")
+    own = renderer(seed=1).transient.detach()
+    close = torch.isclose(own, expected, rtol=1e-3, atol=1e-4)
+    assert close.float().mean() > 0.99
+    renderer(seed=0).transient.sum().backward()
+    assert torch.equal(plain(seed=1).transient.detach(), expected)
+
+
+@pytest.mark.parametrize("key", [*WRITTEN, "box.vertex_positions", "box.vertex_normals", "light.intensity.value"])
+def test_forward_and_reverse_mode_agree(textured, key):
+    renderer = tt.TransientRenderer(textured, parameters=[key], spp=64, grad_seed="same", temporal_filter="tent")
+    x = renderer.values[key]
+    generator = torch.Generator().manual_seed(11)
+    tangent = torch.randn(x.shape, generator=generator)
+    out = renderer(seed=3).transient
+    weights = torch.rand(out.shape, generator=generator).cumsum(-3)
+    (out * weights).sum().backward()
+    with forward_ad.dual_level():
+        pushed = renderer({key: forward_ad.make_dual(x.detach(), tangent)}, seed=3).transient
+        along = forward_ad.unpack_dual((pushed * weights).sum()).tangent.item()
+    scale = float((x.grad * tangent).abs().sum())
+    assert scale > 0
+    assert along == pytest.approx(float((x.grad * tangent).sum()), abs=2e-3 * scale)
+
+
+def test_flat_vertices_are_taken(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=["box.vertex_positions"], spp=8)
+    moved = renderer.values["box.vertex_positions"].detach() + 0.05
+    assert moved.shape == (24, 3)
+    flat = moved.reshape(-1).clone().requires_grad_()
+    out = renderer({"box.vertex_positions": flat}, seed=0).transient
+    assert torch.equal(out, renderer({"box.vertex_positions": moved}, seed=0).transient)
+    out.square().sum().backward()
+    assert flat.grad.shape == (72,) and flat.grad.abs().max() > 0
+    batch = renderer({"box.vertex_positions": flat.detach().expand(2, 72)}, seed=0).transient
+    assert torch.equal(batch[0], out.detach())
+
+
+def test_mesh_pose_keeps_authored_normals(tmp_path):
+    import mitsuba as mi
+
+    with_normals = tmp_path / "smooth.ply"
+    with active_variant(VARIANT):
+        mesh = mi.Mesh("tri", 3, 1, has_vertex_normals=True)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 0, 1, 0]
+        params["faces"] = [0, 1, 2]
+        params.update()
+        params["vertex_normals"] = [0.6, 0, 0.8, -0.6, 0, 0.8, 0, 0.6, 0.8]
+        params.update()
+        mesh.write_ply(str(with_normals))
+    room = make_room()
+    room["box"] = {"type": "ply", "filename": str(with_normals), "to_world": pose(0, 0, 0.5, 0.5)}
+    scene = tt.load(room, variant=VARIANT)
+    plain = tt.TransientRenderer(scene, parameters=[GREY], spp=16, temporal_filter="tent")(seed=0).transient.detach()
+    posed = tt.TransientRenderer(scene, parameters=["box.to_world"], spp=16)(seed=0).transient.detach()
+    torch.testing.assert_close(posed, plain, rtol=1e-3, atol=1e-4)
+
+
+def test_table_says_what_is_differentiable(textured):
+    table = textured.parameters()
+    assert table[WALL_POSE].differentiable and "silhouettes" in table[WALL_POSE].reason
+    assert table["light.position"].differentiable and table["light.position"].moves_path_length
+    assert table["light.position"].reason == "correct"
+    assert not table["lamp.emitter.radiance.value"].moves_path_length
+    assert not table["box.faces"].differentiable
+    assert not table["sensor.near_clip"].differentiable
+    assert table["wall.bsdf.reflectance.data"].shape == (2, 2, 3)
+    assert table["box.vertex_positions"].shape == (24, 3)
+    assert table["ball.to_world"].shape == (4, 4)
+    np.testing.assert_allclose(table["box.to_world"].value, pose(0.4, 0.0, 0.5, 0.3))
+    text = str(table)
+    for word in ("box.to_world", "(24, 3)", "no: ", "silhouettes"):
+        assert word in text
+    assert "sensor.near_clip" not in table.differentiable() and "box.to_world" in table.differentiable()
+
+
+def test_unknown_key_suggests_the_right_one(room_scene):
+    with pytest.raises(tt.errors.SceneError, match="box.bsdf.reflectance.value"):
+        tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])
+
+
+def test_key_without_derivative(room_scene):
+    with pytest.raises(tt.errors.GradientError, match="near_clip.*no derivative"):
+        tt.TransientRenderer(room_scene, parameters=["sensor.near_clip"])
+
+
+def test_two_keys_for_one_thing(room_scene):
+    with pytest.raises(tt.errors.SceneError, match="both set"):
+        tt.TransientRenderer(room_scene, parameters=["box.to_world", "box.vertex_positions"])
+
+
+def test_refused_value_names_the_key(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=["sensor.to_world"], spp=4)
+    good = renderer(seed=0).transient.detach()
+    with pytest.raises(tt.errors.SceneError, match="sensor.to_world"):
+        renderer({"sensor.to_world": torch.eye(4) * 2}, seed=0)
+    assert torch.equal(renderer(seed=0).transient.detach(), good)
+
+
+def test_equal_materials_stay_apart():
+    room = make_room()
+    room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    room["box"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+    keys = ["wall.bsdf.reflectance.value", COLOUR]
+    renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=keys, spp=16)
+    renderer(seed=0).steady.sum().backward()
+    a, b = (renderer.values[k].grad for k in keys)
+    assert a.abs().min() > 0 and b.abs().min() > 0 and not torch.allclose(a, b)
+
+
+def test_shared_material_collects_from_all_its_shapes():
+    def gradient(shared):
+        room = make_room()
+        paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}
+        keys = ["wall.bsdf.reflectance.value", COLOUR]
+        room["wall"]["bsdf"], room["box"]["bsdf"] = dict(paint), dict(paint)
+        if shared:
+            keys = ["paint.reflectance.value"]
+            # Mitsuba names a shared object after the first place where it is met.
+            room = {"type": "scene", "paint": paint, **room}
+            room["wall"]["bsdf"] = room["box"]["bsdf"] = {"type": "ref", "id": "paint"}
+        renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=keys, spp=64, grad_seed=1)
+        renderer(seed=0).steady.sum().backward()
+        return sum(renderer.values[k].grad for k in keys)
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=1e-3, atol=1e-4)

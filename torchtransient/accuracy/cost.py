@@ -1,0 +1,122 @@
+"""`tt.cost_of_accuracy`: what a smaller error of a transient, or of a gradient, costs in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
+from torchtransient.accuracy.report import AccuracyReport, Choice
+from torchtransient.errors import SceneError
+from torchtransient.render.output import RenderOutput
+from torchtransient.render.renderer import TransientRenderer
+
+Loss = Callable[[RenderOutput], torch.Tensor]
+
+
+def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
+    """The default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over pixels.
+
+    It is linear in the transient, so that its gradient has no bias, and it changes with energy and with arrival time.
+    """
+    bins = out.transient.shape[-3]
+    phase = 2.0 * math.pi * (torch.arange(bins, device=out.transient.device) + 0.5) / bins
+    pixels = out.transient.shape[-2] * out.transient.shape[-1]
+    return (out.transient * torch.cos(phase)[:, None, None]).sum() / pixels
+
+
+def cost_of_accuracy(
+    renderer: TransientRenderer,
+    spp: Sequence[int] = (16, 64, 256, 1024),
+    gradients: Sequence[str] = (),
+    *,
+    reference_spp: int | None = None,
+    repeats: int = 4,
+    samplers: Sequence[str] = ("independent", "multijitter"),
+    temporal_filters: Sequence[str] | None = None,
+    loss: Loss = cosine_over_the_window,
+    seed: int = 0,
+    progress: bool = True,
+) -> AccuracyReport:
+    """Measure the error of the transient, and of gradients, against seconds and samples per pixel.
+
+    `renderer` renders at the current values of its parameters; `gradients` are keys among them, each the derivative of `loss`,
+    a scalar of the `RenderOutput`. Every pair of `samplers` (Mitsuba's plugin names) and `temporal_filters` ("box", "tent",
+    "gaussian"; None: the one that the renderer uses) is one curve. Where a filter has no slope in time (box) and a key
+    moves path lengths, there is no gradient: that filter's curve then shows the transient alone, and `settings` of the report
+    names the pair under "without_gradients".
+
+    Errors are squared and relative, over `repeats` independent runs at each of `spp`, either against a reference of
+    `reference_spp` samples (at least four times the largest `spp`) or, with None, in pairs of runs (`repeats` even). Every curve is
+    compared with its own expectation: what a filter blurs does not count as an error. Seconds are medians of wall time: a
+    forward render for the transient, render and backward for gradients; the runs of all curves take turns. A loss that
+    is not linear has a biased gradient, which only a reference shows, and only in part.
+
+    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler that
+    the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held per curve.
+    """
+    missing = [key for key in gradients if key not in renderer.values]
+    if missing:
+        raise SceneError(
+            f"gradients: {missing} are not parameters of this renderer, which has {list(renderer.values)}; "
+            "name them in TransientRenderer(parameters=[...])"
+        )
+    filters = [renderer.effective_filter] if temporal_filters is None else list(temporal_filters)
+    if not samplers or not filters:
+        raise SceneError("expected at least one sampler and one temporal filter, got none")
+    candidates: dict[Choice, Candidate] = {}
+    without: list[str] = []
+    for sampler in samplers:
+        for name in filters:
+            twin = renderer.variation(sampler=sampler, temporal_filter=name)
+            choice = Choice(sampler, twin.effective_filter)
+            candidate = {"values": _values_task(twin)}
+            if gradients and twin.has_slope_for(gradients):
+                candidate["gradients"] = _gradients_task(twin, tuple(gradients), loss)
+            elif gradients:
+                without.append(str(choice))
+            candidates[choice] = candidate
+    settings = {
+        "scene": repr(renderer.scene),
+        "variant": renderer.scene.variant,
+        "spp": list(spp),
+        "gradients": list(gradients),
+        "loss": getattr(loss, "__name__", type(loss).__name__),
+        "time_axis": [renderer.axis.start_opl, renderer.axis.bin_width_opl, renderer.axis.num_bins],
+        "without_gradients": without,
+    }
+    return measure(
+        candidates, spp, reference_spp=reference_spp, repeats=repeats, seed=seed, progress=progress, settings=settings
+    )
+
+
+def _values_task(renderer: TransientRenderer) -> Task:
+    def run(spp: int, seed: int) -> Estimates:
+        with torch.no_grad():
+            out = renderer(seed=seed, spp=spp)
+        return Estimates({"transient": _array(out.transient)}, renderer.samples_drawn(spp))
+
+    return Task(run, {"transient": -3})
+
+
+def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:
+    # The samples of the derivative are as many as those of the render, whatever the renderer was told.
+    renderer.spp_grad = None
+
+    def run(spp: int, seed: int) -> Estimates:
+        values = {key: renderer.values[key].detach().clone().requires_grad_(key in keys) for key in renderer.values}
+        out = renderer(values, seed=seed, spp=spp)
+        found = torch.autograd.grad(loss(out), [values[key] for key in keys])
+        arrays = {f"d loss / d {key}": _array(gradient) for key, gradient in zip(keys, found, strict=True)}
+        return Estimates(arrays, renderer.samples_drawn(spp))
+
+    return Task(run)
+
+
+def _array(tensor: torch.Tensor) -> NDArray[np.float32]:
+    """On the CPU a view; from a GPU a copy, which waits for it."""
+    return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float32)
