@@ -1,11 +1,12 @@
 """Find the index of refraction of the glass box in the Cornell box, from a transient and from a steady image.
 
-The inverse problem of the mitransient paper, with smooth glass: the left box starts at an index of 1.2, the truth is 1.5. The derivative
-goes through Fresnel's weights, the refracted directions and the optical path length in the glass.
+The inverse problem of the mitransient paper, with smooth glass: the left box starts at an index of 1.2, the truth
+is 1.5. The derivative goes through Fresnel's weights, the refracted directions and the optical path length in the
+glass.
 
-A box of glass focuses light: a few paths carry much of it, and the brightest pixels and bins are the noisiest. The measurement is
-therefore repeated, and squared differences are weighted by the inverse of the variance that the repetitions show, for both
-kinds of image alike. The steady image is the sum over the bins of the same renders.
+A box of glass focuses light: a few paths carry much of it, and the brightest pixels and bins are the noisiest. The
+measurement is therefore repeated, and squared differences are weighted by the inverse of the variance that the
+repetitions show, for both kinds of image alike. The steady image is the sum over the bins of the same renders.
 
     python training_examples/fit_glass_index.py --steps 100 --spp 8192 --resolution 8 --output fit_glass_index.png
 """
