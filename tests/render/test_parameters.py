@@ -8,7 +8,7 @@ import torch
 from torch.autograd import forward_ad
 
 import torchtransient as tt
-from conftest import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
+from render_rooms import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 from torchtransient.render.variant import active_variant
 
 TURN = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1.0]])

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from conftest import CAMERA, COLOUR, VARIANT, make_room, pose
+from render_rooms import CAMERA, COLOUR, VARIANT, make_room, pose
 from torchtransient.render.variant import active_variant
 
 # As the scenes of mitransient 1.x are written: its plugin and parameter names, and an older version number.
