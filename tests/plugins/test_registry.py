@@ -69,7 +69,7 @@ def test_scalar_variants_register_and_refuse(name):
 
 
 def test_refusal_reaches_those_who_load_with_mitsuba_alone():
-    with mi.variant_context("scalar_rgb"), pytest.raises(RuntimeError, match="VariantError.*Dr.Jit variant"):
+    with mi.variant_context("scalar_rgb"), pytest.raises(RuntimeError, match=r"VariantError.*Dr.Jit variant"):
         mi.load_dict({"type": "transient_path"})
 
 
@@ -85,9 +85,9 @@ def test_sync_is_idempotent_and_reclaims_a_name_that_was_taken():
 def test_callbacks_cleared_by_someone_else():
     mi.detail.clear_variant_callbacks()
     mi.set_variant("llvm_ad_mono")
-    with pytest.raises(RuntimeError):
-        # No callback, no plugins of ours unless an earlier test registered them for this variant: forget those.
-        mi.register_integrator("transient_path", lambda props: 1 / 0)
+    # An earlier test may have registered the name for this variant; what stands there now must be replaced.
+    mi.register_integrator("transient_path", lambda props: 1 / 0)
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         build("transient_path")
     plugins.sync()
     assert isinstance(build("transient_path"), mi.Integrator)
@@ -150,7 +150,7 @@ def test_third_party_module_follows_the_variant(third_party):
 
 
 def test_third_party_module_that_does_not_exist():
-    with pytest.raises(PluginRegistrationError, match="no module named 'their.absent'"):
+    with pytest.raises(PluginRegistrationError, match=r"no module named 'their\.absent'"):
         plugins.register_module("their.absent")
 
 
@@ -168,7 +168,7 @@ def test_module_that_registers_less_than_it_says(third_party):
 
 def test_two_modules_of_one_name(third_party):
     plugins.register_module(third_party(THIRD_PARTY))
-    with pytest.raises(PluginRegistrationError, match="'dim' of module their_rival.*already.*their_texture"):
+    with pytest.raises(PluginRegistrationError, match=r"'dim' of module their_rival.*already.*their_texture"):
         plugins.register_module(third_party(THIRD_PARTY, "their_rival"))
 
 

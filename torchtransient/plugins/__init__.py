@@ -3,10 +3,10 @@
 Importing this package lets Mitsuba call us whenever its variant changes; see `_registry`.
 """
 
+from torchtransient.plugins._registry import attach as _attach
 from torchtransient.plugins._registry import plugin_errors as plugin_errors
 from torchtransient.plugins._registry import register as register
 from torchtransient.plugins._registry import register_module as register_module
 from torchtransient.plugins._registry import sync as sync
-from torchtransient.plugins._registry import attach as _attach
 
 _attach()

@@ -38,6 +38,7 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 
+from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import PluginRegistrationError, TorchTransientError
 from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
 
@@ -145,13 +146,15 @@ def sync() -> str | None:
 
     Returns the active variant, or None when none is set: then nothing is registered and nothing fails. Raises
     PluginRegistrationError when a plugin module cannot be executed, also when that happened during an earlier change
-    of the variant.
+    of the variant, and VariantError when Dr.Jit is bound to an LLVM that would abort the process.
     """
     with _state.lock:
         attach_callback()
         variant = active_variant()
         if variant is None:
             return None
+        if variant.startswith("llvm_"):
+            ensure_llvm()  # a bad LLVM would end the process at the first kernel
         if _state.variant != variant:
             _load_all(variant)
         else:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.films.temporal_filter import make_temporal_filter
+from torchtransient.plugins.films.temporal_filter import check_stddev, make_temporal_filter
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
+# Above this many samples per pixel single precision sums lose mass: 2^16 equal terms are good to 2e-4 (5e-5 on 16-wide
+# processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double precision.
+MAX_SINGLE_PRECISION_SAMPLES = 2**16
 
 
 class TransientHDRFilm(mi.Film):
@@ -28,11 +32,15 @@ class TransientHDRFilm(mi.Film):
     A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is
     ``(H, W, T, C)`` of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in
     spectral ones); there are no alpha or weight channels. Light outside the window is not stored but counted: ``energy_before``
-    and ``energy_after`` are sums over pixels of the mean over channels.
+    and ``energy_after`` are sums over pixels of the mean over channels. With the sum over the stored bins they make up the
+    steady image, whatever the temporal filter: what it spreads over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter and
     weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the same
-    image as splatting; the noise of neighbouring pixels is independent.
+    image as splatting with ``sample_border`` (which is always on here); the noise of neighbouring pixels is independent.
+
+    Sums are kept in single precision up to 2^16 samples per pixel (rounding at most 2e-4 of a bin, far below the noise), above
+    in double precision, which doubles the memory while rendering.
 
     Not supported: alpha channel, half precision.
     """
@@ -43,12 +51,12 @@ class TransientHDRFilm(mi.Film):
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
         self.start_opl = float(props.get("start_opl", 0.0))
         self._filter_name = str(props.get("temporal_filter", "box"))
-        self.gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
+        self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
         self.laser_scan_width = int(props.get("laser_scan_width", 0))
         self.laser_scan_height = int(props.get("laser_scan_height", 0))
         self._check()
-        self.filter = make_temporal_filter(self._filter_name, self.gaussian_stddev)
+        self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
         self.bands = []
         self.steady = None
         self.outside = None
@@ -65,6 +73,7 @@ class TransientHDRFilm(mi.Film):
             )
         if not abs(self.start_opl) < float("inf"):
             raise SceneError(f"transient_hdr_film: start_opl must be a finite length in metres, got {self.start_opl}.")
+        check_stddev(self._gaussian_stddev)
         laser = self.laser_scan_width, self.laser_scan_height
         if self.exhaustive_scan and min(laser) < 1:
             raise SceneError(
@@ -84,8 +93,19 @@ class TransientHDRFilm(mi.Film):
 
     @temporal_filter.setter
     def temporal_filter(self, name: str):
-        self.filter = make_temporal_filter(name, self.gaussian_stddev)
+        self.filter = make_temporal_filter(name, self._gaussian_stddev)
         self._filter_name = name
+
+    @property
+    def gaussian_stddev(self) -> float:
+        """Standard deviation of the gaussian temporal filter in bins; without effect on the others."""
+        return self._gaussian_stddev
+
+    @gaussian_stddev.setter
+    def gaussian_stddev(self, stddev: float):
+        check_stddev(stddev)
+        self._gaussian_stddev = float(stddev)
+        self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
 
     def end_opl(self) -> float:
         """End of the last bin in metres."""
@@ -130,21 +150,32 @@ class TransientHDRFilm(mi.Film):
             )
         return min(rows, int(self.crop_size()[1]))
 
-    def prepare(self, aovs=()):
-        """Allocate zeroed storage for one render. Returns the number of channels."""
+    def band_layout(self) -> list[tuple[int, int]]:
+        """The storage bands as (first row, rows); one, unless the cube exceeds 32-bit indices."""
+        height, rows = self.cube_shape()[0], self.band_rows()
+        return [(first, min(rows, height - first)) for first in range(0, height, rows)]
+
+    def prepare(self, aovs=(), samples: int = 0):
+        """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"transient_hdr_film: arbitrary output variables are not supported, got {list(aovs)}.")
         if mi.is_polarized:
             raise SceneError("transient_hdr_film: polarized variants are not supported; use the unpolarized one.")
         height, width = self.cube_shape()[:2]
-        rows = self.band_rows()
-        self.bands = []
-        for first in range(0, height, rows):
-            count = min(rows, height - first)
-            self.bands.append((first, count, dr.zeros(mi.Float, count * width * self.entries_per_pixel())))
-        self.steady = dr.zeros(mi.Float, height * width * self.channel_count())
-        self.outside = dr.zeros(mi.Float, 2)
+        real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
+        per_row = width * self.entries_per_pixel()
+        self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
+        self.steady = dr.zeros(real, height * width * self.channel_count())
+        # By pixel: one sum over all samples would drown small terms, and be one address that every thread waits for.
+        self.outside = dr.zeros(real, height * width * 2)
         return self.channel_count()
+
+    def settle(self):
+        """End of a render: sums kept in double precision become single precision."""
+        if dr.type_v(self.steady) != dr.type_v(mi.Float):
+            self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
+            self.steady, self.outside = mi.Float(self.steady), mi.Float(self.outside)
+            dr.eval(self.steady, self.outside, *(band[2] for band in self.bands))
 
     def clear(self):
         """Drop the storage; tensors developed before keep their memory."""
@@ -172,12 +203,15 @@ class TransientHDRFilm(mi.Film):
     @property
     def energy_before(self) -> float:
         """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
-        return float(self.outside[0]) if self.outside is not None else 0.0
+        return self._energy_outside(0)
 
     @property
     def energy_after(self) -> float:
         """Light that arrived at or after :meth:`end_opl`: sum over pixels, mean over channels."""
-        return float(self.outside[1]) if self.outside is not None else 0.0
+        return self._energy_outside(1)
+
+    def _energy_outside(self, side: int) -> float:
+        return 0.0 if self.outside is None else float(np.array(self.outside, dtype=np.float64)[side::2].sum())
 
     # ----------------------------------------------------------------------------------- pixel sampling
 
@@ -193,11 +227,10 @@ class TransientHDRFilm(mi.Film):
             dr.eval(h)
             # A floor keeps the density positive wherever the filter is not zero between two nodes.
             density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
-            fine = dr.linspace(mi.Float, -radius, radius, 1 << 14)
-            mean = dr.mean(rfilter.eval(fine))
+            fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)
             self._offset_distribution = (
                 mi.ContinuousDistribution(mi.ScalarVector2f(-radius, radius), density),
-                float(mean[0] * 2 * radius),
+                float((fine.sum() - 0.5 * (fine[0] + fine[-1])) * 2 * radius / (fine.size - 1)),
             )
         distribution, integral = self._offset_distribution
         x, pdf_x = distribution.sample_pdf(sample.x)
@@ -211,29 +244,37 @@ class TransientHDRFilm(mi.Film):
         """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
         return opl_from_start / mi.Float64(self.bin_width_opl)
 
-    def put(self, cube, base, opl_from_start, value, active):
+    def pixel_base(self, base, laser):
+        """Index of the histogram of one laser position, where ``base`` is that of a pixel's first one."""
+        return base if laser is None else base + laser * (self.temporal_bins * self.channel_count())
+
+    def put(self, cube, base, opl_from_start, value, active, laser=None):
         """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the histogram that begins at ``base``.
 
-        Returns the masks (arrived before the window, arrived after it); what a filter spreads over the rim of the window
-        is lost there, as it would be for a wider window.
+        ``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None otherwise. Returns the
+        fractions of ``value`` that belong to bins before the window and to bins after it; they are not stored.
         """
         x = self.bin_position(opl_from_start)
         bins, channels = self.temporal_bins, self.channel_count()
+        base = self.pixel_base(base, laser)
+        before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
         # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a bin.
         for offset, weight, _ in taps:
             k = first + offset
-            inside = active & (k >= 0) & (k < bins)
+            early, late = k < 0, k >= bins
+            before += dr.select(early, weight, 0)
+            after += dr.select(late, weight, 0)
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, v, index + c, inside)
-        return x < 0, x >= bins
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, active & ~early & ~late)
+        return before, after
 
     def read(self, adjoint, base, opl_from_start, active):
         """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, bin stride, channel stride)``.
+        ``adjoint`` is ``(flat array, bin stride, channel stride)`` and ``base`` the index of the histogram's first value in it.
         """
         flat, bin_stride, channel_stride = adjoint
         x = self.bin_position(opl_from_start)
@@ -251,10 +292,11 @@ class TransientHDRFilm(mi.Film):
                     slope[c] = dr.fma(a, dweight * (1 / self.bin_width_opl), slope[c])
         return A, slope
 
-    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active):
-        """Forward mode: add ``k df + f k' dtau`` to the derivative cube."""
+    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active, laser=None):
+        """Forward mode: add ``k df + f k' dtau`` to the derivative cube; arguments as for :meth:`put`."""
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
+        base = self.pixel_base(base, laser)
         first, taps = self.filter.weights(x)
         for offset, weight, dweight in taps:
             k = first + offset
@@ -262,7 +304,7 @@ class TransientHDRFilm(mi.Film):
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = d_value[c] * weight + value_d_opl[c] * (dweight * (1 / self.bin_width_opl))
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, v, index + c, inside)
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
 
     def to_string(self):
         return (

@@ -26,6 +26,18 @@ NAMES = ("box", "tent", "gaussian")
 CUT_STDDEVS = 4.0
 
 
+def check_stddev(stddev: float):
+    """Raise ``SceneError`` unless ``stddev`` is a positive number of bins."""
+    if not (math.isfinite(stddev) and stddev > 0):
+        raise SceneError(f"gaussian_stddev: expected a positive number of bins, got {stddev!r}.")
+
+
+def check_name(name: str):
+    """Raise ``SceneError`` unless ``name`` is a filter."""
+    if name not in NAMES:
+        raise SceneError(f"temporal_filter: expected one of {', '.join(NAMES)}, got {name!r}.")
+
+
 class BoxFilter:
     """Exact histogram. It has no usable slope in time, hence no gradient through the time of flight."""
 
@@ -60,8 +72,7 @@ class GaussianFilter:
     has_slope = True
 
     def __init__(self, stddev: float):
-        if not (math.isfinite(stddev) and stddev > 0):
-            raise SceneError(f"gaussian_stddev: expected a positive number of bins, got {stddev!r}.")
+        check_stddev(stddev)
         self.stddev = float(stddev)
         self.radius = int(math.ceil(CUT_STDDEVS * stddev))
 
@@ -92,10 +103,7 @@ class GaussianFilter:
 
 def make_temporal_filter(name: str, stddev: float = 0.5):
     """The filter called ``name`` (``box``, ``tent`` or ``gaussian``). Raises ``SceneError`` for another name."""
+    check_name(name)
     if name == "box":
         return BoxFilter()
-    if name == "tent":
-        return TentFilter()
-    if name == "gaussian":
-        return GaussianFilter(stddev)
-    raise SceneError(f"temporal_filter: expected one of {', '.join(NAMES)}, got {name!r}.")
+    return TentFilter() if name == "tent" else GaussianFilter(stddev)

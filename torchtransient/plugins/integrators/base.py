@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
+from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
@@ -20,13 +21,35 @@ MAX_LANES = 2**26
 
 @dataclass
 class Pass:
-    """One kernel launch: ``spp`` samples for the rows of one storage band."""
+    """One kernel launch: ``spp`` of ``total`` samples per pixel for rows of one storage band."""
 
     band: int
     first_row: int
     rows: int
     spp: int
+    total: int
     seed: int
+
+
+def _launch_counts(sampler, spp: int, most: int) -> list[int]:
+    """Samples per pixel of the launches that make up ``spp``, at most ``most`` each, in numbers that the sampler takes.
+
+    Samplers such as multijitter or ldsampler round a number up; what they really draw is what a pixel is divided by.
+    """
+
+    def drawn(count):
+        sampler.set_sample_count(count)
+        return sampler.sample_count()
+
+    if spp <= most:
+        return [drawn(spp)]
+    while most > 1 and drawn(most) > most:
+        # Rounding up would exceed the launch; the sampler takes some smaller number.
+        most -= max(1, most // 16)
+    counts = []
+    while (left := spp - sum(counts)) > 0:
+        counts.append(drawn(min(most, left)))
+    return counts
 
 
 class Lane:
@@ -42,9 +65,8 @@ class Lane:
         """Write a contribution; returns what fell before and after the window (mean over channels)."""
         channels = self.match.to_channels(value)
         before, after = self.film.put(self.cube, self.base, opl, channels, active)
-        energy = mean_of(channels)
-        return dr.select(active & before, energy, 0), dr.select(active & after, energy, 0)
-
+        energy = dr.select(active, mean_of(channels), 0)
+        return energy * before, energy * after
 
     def put_slope(self, opl, d_value, value_d_opl, active):
         """Forward mode: write ``k df + f k' dtau``."""
@@ -89,7 +111,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         self.camera_unwarp = bool(props.get("camera_unwarp", False))
         self.discard_direct_light = bool(props.get("discard_direct_light", False))
         self.temporal_filter = str(props.get("temporal_filter", ""))
-        self.gaussian_stddev = float(props.get("gaussian_stddev", 0.0))
+        if self.temporal_filter:
+            check_name(self.temporal_filter)
+        self.gaussian_stddev = None
+        if "gaussian_stddev" in props:
+            self.gaussian_stddev = float(props["gaussian_stddev"])
+            check_stddev(self.gaussian_stddev)
         self._distant = None
 
     # ----------------------------------------------------------------------------------- preparation
@@ -117,7 +144,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing has "
                 "no laser positions. Remove exhaustive_scan."
             )
-        if self.gaussian_stddev > 0:
+        if self.gaussian_stddev is not None:
             film.gaussian_stddev = self.gaussian_stddev
         if self.temporal_filter:
             film.temporal_filter = self.temporal_filter
@@ -127,40 +154,41 @@ class TransientIntegrator(mi.CppADIntegrator):
         """What the loops may leave out for this scene.
 
         The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the clock. The scene
-        itself is not kept, since it owns the integrator and would never be freed.
+        itself is not kept, since it owns the integrator and would never be freed; one of its shapes is, so that no later scene can be
+        taken for this one because it got the same addresses.
         """
-        key = (scene.ptr, len(scene.shapes()))
+        shapes = scene.shapes()
+        key = (scene.ptr, *(shape.ptr for shape in shapes))
         if self._distant is None or self._distant[0] != key:
-            self._distant = (key, distant_reference(scene))
+            self._distant = (key, distant_reference(scene), shapes[:1])
         return scene_facts(scene, self._distant[1])
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
-        """The launches of a job, and the total number of samples per pixel."""
+        """The launches of a job, and the largest number of samples per pixel.
+
+        Some samplers round the number of samples of a launch, so that storage bands of different heights may get different totals.
+        """
         sampler = sensor.sampler().clone()
         if spp:
             sampler.set_sample_count(spp)
         spp = sampler.sample_count()
         width = int(film.crop_size()[0])
         result = []
-        for band, (first_row, rows, _) in enumerate(film.transient_bands()):
-            per_pass = max(1, min(spp, MAX_LANES // (width * rows)))
-            rows_per_pass = rows if width * rows * per_pass <= MAX_LANES else max(1, MAX_LANES // width)
+        for band, (first_row, rows) in enumerate(film.band_layout()):
+            counts = _launch_counts(sampler, spp, max(1, MAX_LANES // (width * rows)))
+            rows_per_pass = rows if width * rows * max(counts) <= MAX_LANES else max(1, MAX_LANES // width)
             for row in range(first_row, first_row + rows, rows_per_pass):
-                count = min(rows_per_pass, first_row + rows - row)
-                for done in range(0, spp, per_pass):
-                    result.append(Pass(band, row, count, min(per_pass, spp - done), 0))
+                some = min(rows_per_pass, first_row + rows - row)
+                result += [Pass(band, row, some, count, sum(counts), 0) for count in counts]
         for i, p in enumerate(result):
             # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
             p.seed = seed if len(result) == 1 else int(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0][0])
-        return result, spp
+        return result, max(p.total for p in result)
 
-    def start(self, scene, sensor, film, job: Pass, spp_total: int):
+    def start(self, sensor, film, job: Pass):
         """Seeded sampler, primary rays (attached to the sensor), ray weight and pixel indices of one pass."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
-        if sampler.sample_count() != job.spp:
-            # Samplers such as multijitter only take some counts; the pass must know what it really draws.
-            job.spp = sampler.sample_count()
         sampler.set_samples_per_wavefront(job.spp)
         width = int(film.crop_size()[0])
         lanes = width * job.rows * job.spp
@@ -183,16 +211,16 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sensor.sample_ray_differential(
                 time=time, sample1=wavelength, sample2=position, sample3=aperture
             )
-        scale = mi.Float(1 / spp_total) if weight is None else weight / spp_total
+        scale = mi.Float(1 / job.total) if weight is None else weight / job.total
         return sampler, ray, ray_weight, scale, row, column
 
     def lane_bases(self, film, job, row, column):
-        """Index of a pixel's first bin in its band, and of its steady value."""
-        width, channels = int(film.crop_size()[0]), film.channel_count()
-        first = film.transient_bands()[job.band][0]
+        """Index of a pixel's first bin in its band, and of the pixel in the film."""
+        width = int(film.crop_size()[0])
+        first = film.band_layout()[job.band][0]
         pixel = dr.fma(row, width, column)
         in_band = pixel - dr.opaque(mi.UInt32, first * width)
-        return in_band * film.entries_per_pixel(), pixel * channels
+        return in_band * film.entries_per_pixel(), pixel
 
     # ----------------------------------------------------------------------------------- entry points
 
@@ -206,27 +234,28 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
-            film.prepare(self.aov_names())
-            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            jobs, samples = self.passes(sensor, film, int(seed), int(spp))
+            film.prepare(self.aov_names(), samples)
             for i, job in enumerate(jobs):
-                self._render_pass(scene, sensor, film, job, total)
+                self._render_pass(scene, sensor, film, job)
                 if evaluate or len(jobs) > 1:
                     dr.eval(film.bands[job.band][2], film.steady, film.outside)
                 if progress_callback:
                     dr.sync_thread()
                     progress_callback((i + 1) / len(jobs))
+            film.settle()
             return film.develop() if develop else None
 
-    def _render_pass(self, scene, sensor, film, job, total):
-        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+    def _render_pass(self, scene, sensor, film, job):
+        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
         match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
-        base, steady_base = self.lane_bases(film, job, row, column)
+        base, pixel = self.lane_bases(film, job, row, column)
         lane = Lane(film, film.bands[job.band][2], base, match)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
         for c, value in enumerate(match.to_channels(L)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, value, steady_base + c)
-        dr.scatter_reduce(dr.ReduceOp.Add, film.outside, before, mi.UInt32(0))
-        dr.scatter_reduce(dr.ReduceOp.Add, film.outside, after, mi.UInt32(1))
+            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        for side, value in enumerate((before, after)):
+            dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
 
     def _first_opl(self, sensor, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
@@ -251,20 +280,19 @@ class TransientIntegrator(mi.CppADIntegrator):
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:
                 return
-            film.prepare(self.aov_names())
-            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            jobs, _ = self.passes(sensor, film, int(seed), int(spp))
             for job in jobs:
-                self._backward_pass(scene, sensor, film, job, total, g_steady, g_transient, facts)
+                self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
                 dr.eval()
 
-    def _backward_pass(self, scene, sensor, film, job, total, g_steady, g_transient, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+    def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
+        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
         match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
         channels = film.channel_count()
-        _, steady_base = self.lane_bases(film, job, row, column)
+        _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
         if g_steady is not None:
-            steady = [dr.gather(mi.Float, g_steady.array, steady_base + c) for c in range(channels)]
+            steady = [dr.gather(mi.Float, g_steady.array, pixel * channels + c) for c in range(channels)]
         transient, base = None, mi.UInt32(0)
         if g_transient is not None:
             flat, offset, strides = self._adjoint_layout(film, g_transient)
@@ -291,17 +319,18 @@ class TransientIntegrator(mi.CppADIntegrator):
                 facts = self.facts(scene).with_gradients(scene, sensor)
                 settle_tangents(scene, facts)
             self._check_differentiable(film, facts)
-            film.prepare(self.aov_names())
-            jobs, total = self.passes(sensor, film, int(seed), int(spp))
+            jobs, samples = self.passes(sensor, film, int(seed), int(spp))
+            film.prepare(self.aov_names(), samples)
             for job in jobs:
-                self._forward_pass(scene, sensor, film, job, total, facts)
+                self._forward_pass(scene, sensor, film, job, facts)
                 dr.eval(film.bands[job.band][2], film.steady)
+            film.settle()
             return film.develop()
 
-    def _forward_pass(self, scene, sensor, film, job, total, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(scene, sensor, film, job, total)
+    def _forward_pass(self, scene, sensor, film, job, facts):
+        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
         match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
-        base, steady_base = self.lane_bases(film, job, row, column)
+        base, pixel = self.lane_bases(film, job, row, column)
         lane = Lane(film, film.bands[job.band][2], base, match)
         first = self._first_opl(sensor, film, ray)
         t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
@@ -313,7 +342,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 d_first = mi.Float(0) if self.camera_unwarp else t_first
         dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first)
         for c, value in enumerate(match.to_channels(dL)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, value, steady_base + c)
+            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
 
     @staticmethod
     def _adjoint_layout(film, g_transient):

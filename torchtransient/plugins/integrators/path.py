@@ -11,6 +11,7 @@ from torchtransient.plugins.integrators.path_record import allocate, write_verte
 from torchtransient.plugins.integrators.push import push as forward_push
 from torchtransient.plugins.integrators.sweep import sweep as reverse_sweep
 from torchtransient.plugins.integrators.vertex import mis_weight
+from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 
 
 class TransientPath(TransientIntegrator):
@@ -58,9 +59,7 @@ class TransientPath(TransientIntegrator):
         active = mi.Bool(self.max_depth > 0)
         pi = scene.ray_intersect_preliminary(ray, coherent=True)
         if dr.hint(self.hide_emitters_, mode="scalar"):
-            skip = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (a Dr.Jit comparison)
-            si_skip = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
-            pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
+            pi = behind_area_lights(scene, ray, pi)
         store = allocate(self.max_depth, facts) if record else {}
 
         while dr.hint(active, max_iterations=self.max_depth, label="transient_path"):

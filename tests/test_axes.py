@@ -1,0 +1,95 @@
+"""The time axis: its borders, which bin a length belongs to, what it refuses."""
+
+from __future__ import annotations
+
+import pickle
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.units import SPEED_OF_LIGHT
+
+AXIS = TimeAxis(start_opl=3.5, bin_width_opl=0.02, num_bins=300)
+
+
+def test_edges_and_centres():
+    assert AXIS.edges_opl.shape == (301,)
+    assert AXIS.centers_opl.shape == (300,)
+    assert AXIS.edges_opl.dtype == AXIS.centers_s.dtype == torch.float64
+    assert AXIS.edges_opl[0].item() == 3.5
+    assert AXIS.edges_opl[-1].item() == pytest.approx(9.5, abs=1e-14)
+    assert AXIS.end_opl == AXIS.edges_opl[-1].item()
+    torch.testing.assert_close(AXIS.centers_opl, (AXIS.edges_opl[:-1] + AXIS.edges_opl[1:]) / 2, rtol=1e-15, atol=0)
+
+
+def test_edges_do_not_drift():
+    axis = TimeAxis(1000.0, 0.003, 1_000_000)
+    exact = Fraction(1000) + 999_999 * Fraction(0.003)
+    assert abs(Fraction(axis.edges_opl[999_999].item()) - exact) < Fraction(1, 2**41)  # two roundings at 4 km
+
+
+def test_seconds():
+    axis = TimeAxis.from_seconds(start_s=1e-8, bin_width_s=1e-11, num_bins=7)
+    assert axis.start_opl == pytest.approx(2.99792458, rel=1e-15)
+    assert axis.start_s == pytest.approx(1e-8, rel=1e-15)
+    assert axis.bin_width_s == pytest.approx(1e-11, rel=1e-15)
+    torch.testing.assert_close(axis.centers_s * SPEED_OF_LIGHT, axis.centers_opl, rtol=1e-15, atol=0)
+    torch.testing.assert_close(axis.edges_s, 1e-8 + 1e-11 * torch.arange(8, dtype=torch.float64), rtol=1e-14, atol=0)
+
+
+def test_every_edge_starts_its_bin():
+    edges = AXIS.edges_opl
+    assert torch.equal(AXIS.bin_index(edges), torch.arange(301))
+    below = torch.nextafter(edges, torch.tensor(-torch.inf, dtype=torch.float64))
+    assert torch.equal(AXIS.bin_index(below), torch.arange(301) - 1)
+
+
+def test_index_of_numbers_and_outside():
+    assert AXIS.bin_index(3.51).item() == 0
+    assert AXIS.bin_index(3.49999).item() == -1
+    assert AXIS.bin_index(-torch.inf).item() == -1
+    assert AXIS.bin_index(torch.inf).item() == 300
+    got = AXIS.bin_index(torch.tensor([[3.5, 4.0], [9.49, 12.0]], dtype=torch.float32))
+    assert got.dtype == torch.int64
+    assert got.tolist() == [[0, 25], [299, 300]]
+
+
+def test_index_of_nan():
+    with pytest.raises(UnitError, match="NaN"):
+        AXIS.bin_index(torch.tensor([1.0, torch.nan]))
+
+
+def test_equal_hashable_picklable_frozen():
+    same = TimeAxis(np.float64(3.5), torch.tensor(0.02, dtype=torch.float64), np.int32(300))
+    assert same == AXIS
+    assert len({same, AXIS}) == 1
+    assert pickle.loads(pickle.dumps(AXIS)) == AXIS
+    assert type(same.start_opl) is float
+    assert type(same.num_bins) is int
+    with pytest.raises(AttributeError):
+        AXIS.start_opl = 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((0.0, 0.0, 5), UnitError, "bin_width_opl > 0"),
+        ((0.0, -1.0, 5), UnitError, "bin_width_opl > 0"),
+        ((float("nan"), 1.0, 5), UnitError, "start_opl to be finite"),
+        ((0.0, float("inf"), 5), UnitError, "bin_width_opl to be finite"),
+        (("far", 1.0, 5), UnitError, "start_opl to be one number"),
+        ((torch.zeros(2), 1.0, 5), UnitError, "start_opl to be one number"),
+        ((1e9, 1e-9, 5), UnitError, "cannot be told apart"),
+        ((0.0, 1e308, 5), UnitError, "cannot be told apart"),
+        ((0.0, 1.0, 0), ShapeError, "num_bins >= 1"),
+        ((0.0, 1.0, 2.5), ShapeError, "whole number"),
+        ((0.0, 1.0, True), ShapeError, "whole number"),
+    ],
+)
+def test_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        TimeAxis(*arguments)

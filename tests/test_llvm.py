@@ -1,0 +1,225 @@
+"""An LLVM that Dr.Jit can use is found before Dr.Jit is imported, and a bad one never ends the process."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from torchtransient import _llvm
+
+with open(os.path.realpath(sys.executable), "rb") as _python:
+    THIS_MACHINE = struct.unpack("<H", _python.read(20)[18:])[0]
+
+
+def write_elf(path, soname, kind=3, machine=THIS_MACHINE):
+    """A shared library that consists of nothing but its own name. Loading it fails; reading its version does not."""
+    strings = b"\0" + soname.encode() + b"\0"
+    load_at = 0x10000  # addresses differ from file offsets, as in real libraries
+    dynamic_at = 64 + 2 * 56
+    tags = [(14, 1), (5, load_at + dynamic_at + 3 * 16), (0, 0)]  # DT_SONAME, DT_STRTAB, DT_NULL
+    dynamic = b"".join(struct.pack("<QQ", *tag) for tag in tags)
+    size = dynamic_at + len(dynamic) + len(strings)
+    header = (
+        b"\x7fELF\x02\x01\x01"
+        + bytes(9)
+        + struct.pack("<HHIQQQIHHHHHH", kind, machine, 1, 0, 64, 0, 0, 64, 56, 2, 0, 0, 0)
+    )
+    segments = struct.pack("<IIQQQQQQ", 1, 5, 0, load_at, load_at, size, size, 4096)
+    segments += struct.pack("<IIQQQQQQ", 2, 4, dynamic_at, load_at + dynamic_at, 0, len(dynamic), len(dynamic), 8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(header + segments + dynamic + strings)
+    return path
+
+
+def run(code, root, **variables):
+    """Run code in a Python that sees the folder `root` as the root of the file system when it searches for LLVM."""
+    prologue = f"""
+        import glob
+        real = glob.glob
+        glob.glob = lambda pattern, **options: real({str(root)!r} + pattern, **options)
+    """
+    environment = {k: v for k, v in os.environ.items() if k != _llvm.VARIABLE} | variables
+    command = [sys.executable, "-c", textwrap.dedent(prologue) + textwrap.dedent(code)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+
+
+REFUSED = """
+    import torchtransient
+    from torchtransient import _llvm
+    import mitsuba as mi
+    try:
+        mi.set_variant("llvm_ad_rgb")
+    except ImportError:
+        print("inactive")
+    try:
+        _llvm.ensure_llvm()
+    except torchtransient.errors.VariantError as error:
+        print(error)
+    mi.set_variant("scalar_rgb")
+    print(torchtransient.plugins.sync())
+"""
+
+
+def good_library():
+    return _llvm.ensure_llvm().path
+
+
+@pytest.mark.parametrize(
+    ("soname", "version"),
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-15.so", (15,)),
+        ("libLLVM-16.0.6.so.1", (16, 0, 6)),
+        ("libLLVM.so.18.1", (18, 1)),
+        ("libLLVM.so.23.1", (23, 1)),
+    ],
+)
+def test_version_from_the_name_a_library_gives_itself(tmp_path, soname, version):
+    assert _llvm.library_version(str(write_elf(tmp_path / "renamed.so", soname))) == version
+
+
+def test_version_of_the_real_library_agrees_with_what_dr_jit_reports():
+    library = _llvm.ensure_llvm()
+    read = _llvm.library_version(library.path)
+    assert library.version[0] >= _llvm.MIN_MAJOR
+    assert read == library.version[: len(read)]
+
+
+def test_a_library_that_names_no_version_is_asked_in_another_process(monkeypatch):
+    expected = _llvm.ensure_llvm().version
+    monkeypatch.setattr(_llvm, "_soname", lambda path: None)
+    monkeypatch.setattr(_llvm, "_version_in_name", lambda name: ())
+    assert _llvm.library_version(good_library()) == expected
+
+
+@pytest.mark.parametrize("content", [b"", b"\x7fELF", b"not a library" * 20, b"\x7fELF\x02\x01" + b"\xff" * 200])
+def test_a_file_that_is_no_library_has_no_version(tmp_path, content):
+    path = tmp_path / "libLLVM.so"
+    path.write_bytes(content)
+    assert _llvm.library_version(str(path)) == ()
+
+
+def test_the_newest_of_a_folder_comes_first_and_every_file_once(tmp_path, monkeypatch):
+    for name in ("libLLVM-9.so.1", "libLLVM-18.so.1", "libLLVM.so.20.1"):
+        write_elf(tmp_path / name, name)
+    write_elf(tmp_path / "libLLVMCore.so.19", "libLLVMCore.so.19")  # one component, not the library
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.20.1")
+    monkeypatch.setattr(_llvm, "_folders", lambda: iter([str(tmp_path), str(tmp_path)]))
+    found = [os.path.basename(os.path.realpath(p)) for p in _llvm.candidates()]
+    assert found == ["libLLVM.so.20.1", "libLLVM-18.so.1", "libLLVM-9.so.1"]
+
+
+def test_a_library_for_another_processor_is_passed_over(tmp_path, monkeypatch):
+    write_elf(tmp_path / "libLLVM-19.so.1", "libLLVM-19.so.1", machine=21)  # 64-bit PowerPC
+    monkeypatch.setattr(_llvm, "_folders", lambda: iter([str(tmp_path)]))
+    assert list(_llvm.candidates()) == []
+
+
+def test_search_finds_a_distribution_library_beside_an_older_one(tmp_path):
+    write_elf(tmp_path / "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1", "libLLVM-15.so.1")
+    good = tmp_path / "usr/lib/llvm-19/lib/libLLVM.so"
+    good.parent.mkdir(parents=True)
+    good.symlink_to(good_library())
+    result = run(
+        "import torchtransient, os\nprint(torchtransient._llvm.ensure_llvm().path, os.environ['DRJIT_LIBLLVM_PATH'])",
+        tmp_path,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == [good_library()] * 2
+
+
+def test_only_an_old_library_switches_llvm_off_instead_of_ending_the_process(tmp_path):
+    old = write_elf(tmp_path / "usr/lib/llvm-14/lib/libLLVM.so", "libLLVM-14.so.1")
+    result = run(REFUSED, tmp_path)
+    assert result.returncode == 0, result.stderr
+    inactive, message, scalar = result.stdout.strip().splitlines()
+    assert inactive == "inactive"
+    assert f"LLVM >= 17 (older ones abort the process); torchtransient only found LLVM 14 ({old})" in message
+    assert "pip install 'torchtransient[cpu]'" in message
+    assert scalar == "scalar_rgb"
+
+
+def test_no_library_at_all(tmp_path):
+    # Dr.Jit would search by itself; it is sent to an empty place, as on a machine without any LLVM.
+    code = REFUSED.replace("import torchtransient\n", "import drjit, torchtransient\n", 1)
+    result = run(code, tmp_path, DRJIT_LIBLLVM_PATH=str(tmp_path / "nothing"))
+    assert result.returncode == 0, result.stderr
+    inactive, message, scalar = result.stdout.strip().splitlines()
+    assert inactive == "inactive"
+    assert "Dr.Jit was imported before torchtransient and has bound no LLVM" in message
+    assert "pip install" in message
+    assert scalar == "scalar_rgb"
+
+
+def test_search_that_finds_nothing_says_what_to_install(tmp_path):
+    code = "import torchtransient\n_llvm = torchtransient._llvm\n_llvm._search()\nprint(_llvm._outcome.problem)"
+    result = run(code, tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "torchtransient found none" in result.stdout
+    assert "pip install" in result.stdout
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_the_users_own_choice_is_refused_and_left_as_it_was(tmp_path, exists):
+    path = tmp_path / "mine" / "libLLVM.so"
+    if exists:
+        write_elf(path, "libLLVM-16.so.1")
+    result = run(
+        REFUSED + "\n    import os; print(os.environ['DRJIT_LIBLLVM_PATH'])", tmp_path, DRJIT_LIBLLVM_PATH=str(path)
+    )
+    assert result.returncode == 0, result.stderr
+    inactive, message, _scalar, variable = result.stdout.strip().splitlines()
+    assert inactive == "inactive"
+    assert variable == str(path)
+    expected = f"points to LLVM 16 ({path})" if exists else f"'{path}', which does not exist"
+    assert expected in message
+
+
+def test_the_users_own_good_choice_is_taken(tmp_path):
+    result = run(
+        "import torchtransient as t\nprint(t._llvm.ensure_llvm().path)", tmp_path, DRJIT_LIBLLVM_PATH=good_library()
+    )
+    assert result.stdout.strip() == good_library(), result.stderr
+
+
+def test_a_library_that_dr_jit_cannot_load_is_reported(tmp_path):
+    fake = write_elf(tmp_path / "usr/lib/llvm-19/lib/libLLVM.so", "libLLVM.so.19.1", kind=1)  # not a shared object
+    result = run(REFUSED, tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert f"LLVM 19.1 ({fake}) was found but Dr.Jit could not load it" in result.stdout
+
+
+def test_dr_jit_imported_first_with_an_old_library():
+    code = """
+        import drjit
+        drjit.detail.llvm_version = lambda: (15, 0, 6)
+        import torchtransient
+        try:
+            torchtransient._llvm.ensure_llvm()
+        except torchtransient.errors.VariantError as error:
+            print(error)
+    """
+    environment = {k: v for k, v in os.environ.items() if k != _llvm.VARIABLE}
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120, env=environment
+    )
+    assert "imported before torchtransient and has bound LLVM 15.0.6" in result.stdout, result.stderr
+    assert "set DRJIT_LIBLLVM_PATH=" in result.stdout
+
+
+HEAVY = ("matplotlib", "h5py", "kornia", "scipy", "imageio", "click", "rich", "tqdm", "pandas", "mitransient")
+
+
+def test_import_leaves_heavy_packages_alone():
+    code = "import torch, mitsuba, sys\nbefore = set(sys.modules)\nimport torchtransient\n"
+    code += f"print(*sorted({set(HEAVY)!r} & (set(sys.modules) - before)))\nprint(len(set(sys.modules) - before))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    heavy, count = result.stdout.split("\n")[:2]
+    assert heavy == ""
+    assert int(count) < 120  # the package's own modules and a few of the standard library

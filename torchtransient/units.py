@@ -1,0 +1,44 @@
+"""Optical path length and time. The one place where the speed of light stands.
+
+Time is optical path length (`opl`) in metres everywhere in the library, unless a name ends in `_s` (seconds). The
+optical path length of a flight is its geometric length times the index of refraction along it, so that dividing by the
+speed of light in vacuum gives the time of flight, in any medium.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from torchtransient.errors import UnitError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+SPEED_OF_LIGHT = 299_792_458.0  # m/s in vacuum, exact by the definition of the metre (SI)
+
+Quantity = TypeVar("Quantity", "float", "Tensor", "NDArray[Any]")
+
+
+def opl_to_seconds(opl: Quantity) -> Quantity:
+    """Time of flight in seconds of an optical path length in metres. Keeps the type, shape and dtype given.
+
+    A half-precision tensor is refused with UnitError: a metre is 3.3e-9 s, below the smallest float16.
+    """
+    _refuse_half(opl, "opl_to_seconds")
+    return opl / SPEED_OF_LIGHT
+
+
+def seconds_to_opl(time_s: Quantity) -> Quantity:
+    """Optical path length in metres of a time of flight in seconds. Keeps the type, shape and dtype given.
+
+    A half-precision tensor is refused with UnitError, as in `opl_to_seconds`.
+    """
+    _refuse_half(time_s, "seconds_to_opl")
+    return time_s * SPEED_OF_LIGHT
+
+
+def _refuse_half(value: object, name: str) -> None:
+    dtype = str(getattr(value, "dtype", ""))
+    if dtype.endswith(("float16", "bfloat16")):
+        raise UnitError(f"{name}: expected float32 or float64, got {dtype}, which cannot hold nanoseconds in seconds.")
