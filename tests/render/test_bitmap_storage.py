@@ -20,7 +20,10 @@ def textured_wall(tmp_path: Path) -> tt.Scene:
     pixels = np.random.default_rng(0).integers(40, 220, (6, 8, 3), dtype=np.uint8)
     mi.Bitmap(pixels).write(str(tmp_path / "wall.png"))
     scene = tt.scenes.moving_wall(num_bins=40, bin_width_opl=0.1, spp=16, max_depth=2)
-    scene["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": str(tmp_path / "wall.png")}}
+    scene["wall"]["bsdf"] = {
+        "type": "diffuse",
+        "reflectance": {"type": "bitmap", "filename": str(tmp_path / "wall.png")},
+    }
     return tt.load(scene, variant="llvm_ad_rgb")
 
 
