@@ -13,11 +13,25 @@ VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral"]
 
 
 def load(objects, target=(0, 0, 0)):
-    film = {"type": "transient_hdr_film", "width": 3, "height": 2, "rfilter": {"type": "gaussian"}, "temporal_bins": 20,
-            "bin_width_opl": 0.5, "start_opl": 0.0, "temporal_filter": "tent"}  # fmt: skip
-    view = {"type": "perspective", "fov": 30, "film": film,
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], list(target), [0, 1, 0])}  # fmt: skip
-    return mi.load_dict({"type": "scene", "integrator": {"type": "transient_path", "max_depth": 4}, "sensor": view, **objects})
+    film = {
+        "type": "transient_hdr_film",
+        "width": 3,
+        "height": 2,
+        "rfilter": {"type": "gaussian"},
+        "temporal_bins": 20,
+        "bin_width_opl": 0.5,
+        "start_opl": 0.0,
+        "temporal_filter": "tent",
+    }
+    view = {
+        "type": "perspective",
+        "fov": 30,
+        "film": film,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], list(target), [0, 1, 0]),
+    }
+    return mi.load_dict(
+        {"type": "scene", "integrator": {"type": "transient_path", "max_depth": 4}, "sensor": view, **objects}
+    )
 
 
 def wall(reflectance=0.5):
@@ -30,14 +44,17 @@ DARK = {
     "no light": ({"wall": wall()}, (0, 0, 0)),
     "black wall": ({"wall": wall(0.0), "light": LIGHT}, (0, 0, 0)),
     "camera looks away": ({"wall": wall(), "light": LIGHT}, (0, 0, 9)),
-    "light of no intensity": ({"wall": wall(), "light": LIGHT | {"intensity": {"type": "uniform", "value": 0.0}}}, (0, 0, 0)),
+    "light of no intensity": (
+        {"wall": wall(), "light": LIGHT | {"intensity": {"type": "uniform", "value": 0.0}}},
+        (0, 0, 0),
+    ),
     "light behind the wall": ({"wall": wall(), "light": LIGHT | {"position": [0.0, 0.0, -1.0]}}, (0, 0, 0)),
 }
 
 
 def attached(scene):
     params = mi.traverse(scene)
-    keys = [k for k in params.keys() if k in ("wall.to_world", "wall.bsdf.reflectance.value", "light.position")]
+    keys = [k for k, _ in params if k in ("wall.to_world", "wall.bsdf.reflectance.value", "light.position")]
     for key in keys:
         dr.enable_grad(params[key])
     params.update()

@@ -21,14 +21,33 @@ def T():
 
 
 def sensor(origin, target, fov=20.0, size=4, start=0.0, bins=100, width=0.1, filter="tent"):
-    film = {"type": "transient_hdr_film", "width": size, "height": size, "rfilter": {"type": "box"}, "temporal_bins": bins,
-            "bin_width_opl": width, "start_opl": start, "temporal_filter": filter}  # fmt: skip
-    return {"type": "perspective", "fov": fov, "near_clip": 1e-3, "film": film, "to_world": T().look_at(origin, target, [0, 1, 0])}
+    film = {
+        "type": "transient_hdr_film",
+        "width": size,
+        "height": size,
+        "rfilter": {"type": "box"},
+        "temporal_bins": bins,
+        "bin_width_opl": width,
+        "start_opl": start,
+        "temporal_filter": filter,
+    }
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "near_clip": 1e-3,
+        "film": film,
+        "to_world": T().look_at(origin, target, [0, 1, 0]),
+    }
 
 
 def load(view, objects, **arguments):
     return mi.load_dict(
-        {"type": "scene", "integrator": {"type": "transient_path", "max_depth": 6, "rr_depth": 100} | arguments, "sensor": view, **objects},
+        {
+            "type": "scene",
+            "integrator": {"type": "transient_path", "max_depth": 6, "rr_depth": 100} | arguments,
+            "sensor": view,
+            **objects,
+        },
         optimize=False,
     )
 
@@ -85,13 +104,17 @@ def test_grazing_view_and_light(material, height):
 
 
 def test_corner():
-    """Guards against segments of no length: paths in the corner of two walls bounce between points that nearly coincide."""
+    """Guards against segments of no length: paths in the corner of two walls bounce between points that nearly
+    coincide.
+    """
     objects = {
         "floor": floor(),
         "wall": {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 90).scale(20)},
         "light": point([2, 1, 2]),
     }
-    check_finite(load(sensor([2, 0, 2], [0, 0, 0], fov=0.05), objects), ["floor.to_world", "wall.to_world", "light.position"])
+    check_finite(
+        load(sensor([2, 0, 2], [0, 0, 0], fov=0.05), objects), ["floor.to_world", "wall.to_world", "light.position"]
+    )
 
 
 @pytest.mark.parametrize("height", [1e-3, 1e-6, 0.0])
@@ -105,21 +128,28 @@ def test_light_next_to_the_surface(height):
 
 def test_area_light_on_the_surface():
     lamp = {"type": "rectangle", "to_world": T().scale(0.2), "emitter": {"type": "area", "radiance": 2.0}}
-    other = {"type": "rectangle", "to_world": T().translate([1, 0, 1]).rotate([0, 1, 0], -60), "bsdf": {"type": "diffuse"}}
+    other = {
+        "type": "rectangle",
+        "to_world": T().translate([1, 0, 1]).rotate([0, 1, 0], -60),
+        "bsdf": {"type": "diffuse"},
+    }
     scene = load(sensor([0, 0, 4], [0, 0, 0]), {"floor": floor(), "lamp": lamp, "other": other})
     check_finite(scene, ["lamp.emitter.radiance.value", "floor.to_world", "lamp.to_world", "other.to_world"])
 
 
 @pytest.mark.parametrize("angle", [0.0, 60.0, 85.0, 89.0])
 def test_length_is_that_between_hit_points(angle):
-    """Guards against shadow rays and paths measured from origins that were lifted off the surface: 1e-4 m and more at these
-    distances, in the direction of the normal."""
+    """Guards against shadow rays and paths measured from origins that were lifted off the surface: 1e-4 m and more at
+    these distances, in the direction of the normal.
+    """
     a = np.radians(angle)
     origin = np.float32([np.sin(a) * 3, 0, np.cos(a) * 3]).astype(float)
     light = np.float32([0.4, 0.3, 1.7]).astype(float)
     expected = np.linalg.norm(origin) + np.linalg.norm(light)
     width = 1e-6
-    view = sensor(list(origin), [0, 0, 0], fov=1e-5, size=1, start=expected - 50 * width, bins=100, width=width, filter="box")
+    view = sensor(
+        list(origin), [0, 0, 0], fov=1e-5, size=1, start=expected - 50 * width, bins=100, width=width, filter="box"
+    )
     scene = load(view, {"floor": floor(), "light": point(light)}, max_depth=2)
     steady, transient = scene.integrator().render(scene, spp=64)
     bins = np.array(transient, dtype=float)[0, 0, :, 0]

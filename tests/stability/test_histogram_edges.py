@@ -19,8 +19,12 @@ def _variant():
 
 
 def put(opl, width, filter="box"):
-    """Histograms (n, T) of single arrivals at ``opl`` metres after the start, and the fractions before and after the window."""
-    film = mi.load_dict({"type": "transient_hdr_film", "temporal_bins": BINS, "bin_width_opl": width, "temporal_filter": filter})
+    """Histograms (n, T) of single arrivals at ``opl`` metres after the start, and the fractions before and after the
+    window.
+    """
+    film = mi.load_dict(
+        {"type": "transient_hdr_film", "temporal_bins": BINS, "bin_width_opl": width, "temporal_filter": filter}
+    )
     n = len(opl)
     # guards on both sides: an index that wrapped would land there
     cube = dr.zeros(mi.Float, (n + 2) * BINS)
@@ -51,8 +55,23 @@ def test_an_edge_belongs_to_the_bin_that_it_opens():
 
 @pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
 def test_outside_is_dropped_not_clamped(filter):
-    """Guards against negative bins that wrap to large unsigned ones, and against clamping into the first or the last bin."""
-    far = np.array([-1e-3 - 8, -2.0**31, -2.0**32 - 5, -(2.0**32) * 3 + 1.5, -1e18, BINS + 8.0, 2.0**31, 2.0**32 + 3, 2.0**33 + 1, 1e18])
+    """Guards against negative bins that wrap to large unsigned ones, and against clamping into the first or the last
+    bin.
+    """
+    far = np.array(
+        [
+            -1e-3 - 8,
+            -(2.0**31),
+            -(2.0**32) - 5,
+            -(2.0**32) * 3 + 1.5,
+            -1e18,
+            BINS + 8.0,
+            2.0**31,
+            2.0**32 + 3,
+            2.0**33 + 1,
+            1e18,
+        ]
+    )
     cube, before, after = put(far, 1.0, filter)
     assert not cube.any()
     np.testing.assert_allclose(before, far < 0, atol=1e-6)
@@ -72,13 +91,29 @@ def test_rendered_light_before_and_after_the_window():
     """Guards against a window that opens late and shows the early light in its first bin."""
     t = mi.ScalarTransform4f()
     for start, side in ((8.5, "before"), (4.0, "after")):
-        film = {"type": "transient_hdr_film", "width": 2, "height": 2, "rfilter": {"type": "box"}, "temporal_bins": 8,
-                "bin_width_opl": 0.25, "start_opl": start}  # fmt: skip
-        scene = mi.load_dict({
-            "type": "scene", "integrator": {"type": "transient_path"},
-            "sensor": {"type": "perspective", "fov": 5, "film": film, "to_world": t.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])},
-            "wall": {"type": "rectangle"}, "light": {"type": "point", "position": [0.0, 0.0, 4.0]},
-        })  # fmt: skip
+        film = {
+            "type": "transient_hdr_film",
+            "width": 2,
+            "height": 2,
+            "rfilter": {"type": "box"},
+            "temporal_bins": 8,
+            "bin_width_opl": 0.25,
+            "start_opl": start,
+        }
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "transient_path"},
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 5,
+                    "film": film,
+                    "to_world": t.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                },
+                "wall": {"type": "rectangle"},
+                "light": {"type": "point", "position": [0.0, 0.0, 4.0]},
+            }
+        )
         steady, transient = (np.array(v, dtype=float) for v in scene.integrator().render(scene, spp=64))
         film = scene.sensors()[0].film()
         energy = {"before": film.energy_before, "after": film.energy_after}

@@ -21,7 +21,9 @@ def _variant():
 
 def mass(samples, count, packets=True):
     """Sum of ``count`` equal terms that are one together, in the storage for ``samples`` samples per pixel."""
-    film = mi.load_dict({"type": "transient_hdr_film", "width": 1, "height": 1, "temporal_bins": 4, "bin_width_opl": 1.0})
+    film = mi.load_dict(
+        {"type": "transient_hdr_film", "width": 1, "height": 1, "temporal_bins": 4, "bin_width_opl": 1.0}
+    )
     film.prepare(samples=samples)
     # 1.3: not a power of two, so that every addition rounds
     value = dr.opaque(mi.Float, np.float32(1 / (1.3 * count)))
@@ -35,8 +37,10 @@ def mass(samples, count, packets=True):
 
 @pytest.mark.parametrize("packets", [True, False])
 def test_sixteen_million_terms_keep_their_mass(packets):
-    """Guards against single precision sums that stall: once the sum is 2^24 times a term, terms are no longer counted at all, and
-    long before they are rounded to few digits (0.3 % lost or won at 2^24 terms, even though processors add up packets first)."""
+    """Guards against single precision sums that stall: once the sum is 2^24 times a term, terms are no longer counted
+    at all, and long before they are rounded to few digits (0.3 % lost or won at 2^24 terms, even though processors add
+    up packets first).
+    """
     count = 1 << 24
     # the result itself is single precision
     assert abs(mass(count, count, packets)) < 1e-7
@@ -51,14 +55,28 @@ def test_bound_of_single_precision(packets):
 
 
 def glow(width, height, start=0.0):
-    film = {"type": "transient_hdr_film", "width": width, "height": height, "rfilter": {"type": "box"}, "temporal_bins": 2,
-            "bin_width_opl": 10.0, "start_opl": start}  # fmt: skip
-    return mi.load_dict({
-        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 1},
-        "sensor": {"type": "perspective", "fov": 1, "film": film,
-                   "to_world": mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])},
-        "wall": {"type": "rectangle", "emitter": {"type": "area", "radiance": 1 / 1.3}},
-    })  # fmt: skip
+    film = {
+        "type": "transient_hdr_film",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "temporal_bins": 2,
+        "bin_width_opl": 10.0,
+        "start_opl": start,
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "transient_path", "max_depth": 1},
+            "sensor": {
+                "type": "perspective",
+                "fov": 1,
+                "film": film,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0]),
+            },
+            "wall": {"type": "rectangle", "emitter": {"type": "area", "radiance": 1 / 1.3}},
+        }
+    )
 
 
 @pytest.mark.parametrize("passes", [1, 8])

@@ -16,21 +16,41 @@ def problem(filter):
     mi.set_variant("llvm_ad_mono")
     plugins.sync()
     t = mi.ScalarTransform4f()
-    film = {"type": "transient_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"}, "temporal_bins": 100,
-            "bin_width_opl": 0.05, "start_opl": 5.513, "temporal_filter": filter, "gaussian_stddev": 1.5}  # fmt: skip
-    return mi.load_dict({
-        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 2},
-        "sensor": {"type": "perspective", "fov": 0.1, "near_clip": 0.5, "film": film,
-                   "to_world": t.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])},
-        "wall": {"type": "rectangle"}, "light": {"type": "point", "position": [0.0, 0.0, 4.0], "intensity": 5.0},
-    })  # fmt: skip
+    film = {
+        "type": "transient_hdr_film",
+        "width": 1,
+        "height": 1,
+        "rfilter": {"type": "box"},
+        "temporal_bins": 100,
+        "bin_width_opl": 0.05,
+        "start_opl": 5.513,
+        "temporal_filter": filter,
+        "gaussian_stddev": 1.5,
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "transient_path", "max_depth": 2},
+            "sensor": {
+                "type": "perspective",
+                "fov": 0.1,
+                "near_clip": 0.5,
+                "film": film,
+                "to_world": t.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            },
+            "wall": {"type": "rectangle"},
+            "light": {"type": "point", "position": [0.0, 0.0, 4.0], "intensity": 5.0},
+        }
+    )
 
 
 def attach(scene):
     z = mi.Float(0.0)
     dr.enable_grad(z)
     params = mi.traverse(scene)
-    params["wall.to_world"] = mi.AffineTransform4f().translate(mi.Vector3f(0, 0, z)) @ mi.AffineTransform4f(params["wall.to_world"])
+    params["wall.to_world"] = mi.AffineTransform4f().translate(mi.Vector3f(0, 0, z)) @ mi.AffineTransform4f(
+        params["wall.to_world"]
+    )
     params.update()
     return params, z
 

@@ -47,7 +47,9 @@ def test_truncated_series(depth):
 
 @pytest.mark.parametrize("depth, rr_depth", [(64, 1), (64, 5), (-1, 1), (-1, 10)])
 def test_roulette_is_unbiased(depth, rr_depth):
-    """Guards against survivors that are not weighted up (or are, twice): the mean is that of the series, with or without a bound."""
+    """Guards against survivors that are not weighted up (or are, twice): the mean is that of the series, with or
+    without a bound.
+    """
     scene = furnace(depth, rr_depth)
     steady = [np.array(scene.integrator().render(scene, spp=1024, seed=k)[0], dtype=float).mean() for k in range(12)]
     exact = RADIANCE * (1 - (REFLECTANCE**depth if depth > 0 else 0)) / (1 - REFLECTANCE)

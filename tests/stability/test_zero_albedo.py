@@ -13,21 +13,26 @@ SIDE, WALL = "side.bsdf.reflectance.value", "wall.bsdf.reflectance.value"
 
 
 def problem(key, value, scene):
-    case = dataclasses.replace(BASE, name="albedo", scene=scene, apply=set_color(key), value=value, step=0.05, spp=512, fd_spp=512)
+    case = dataclasses.replace(
+        BASE, name="albedo", scene=scene, apply=set_color(key), value=value, step=0.05, spp=512, fd_spp=512
+    )
     return Problem(case)
 
 
 @pytest.mark.parametrize("albedo", [0.0, 1e-8, 1e-3])
 @pytest.mark.parametrize("key", [SIDE, WALL])
 def test_gradient_against_finite_differences(key, albedo):
-    """Guards against dividing the light beyond a vertex by its BSDF value: at zero that gives 0 (or 0 / 0) although the derivative is
-    not zero, and just above it an amplification by up to 1e8.
+    """Guards against dividing the light beyond a vertex by its BSDF value: at zero that gives 0 (or 0 / 0) although the
+    derivative is not zero, and just above it an amplification by up to 1e8.
 
-    Same seed, same paths, and a polynomial in the albedo: central differences with Richardson's correction are exact to rounding.
+    Same seed, same paths, and a polynomial in the albedo: central differences with Richardson's correction are exact to
+    rounding.
     """
-    scene = (lambda: room(side_reflectance=albedo)) if key == SIDE else (
-        lambda: room(bsdf={"type": "diffuse", "reflectance": albedo}, side_reflectance=0.8)
-    )  # fmt: skip
+    scene = (
+        (lambda: room(side_reflectance=albedo))
+        if key == SIDE
+        else (lambda: room(bsdf={"type": "diffuse", "reflectance": albedo}, side_reflectance=0.8))
+    )
     p = problem(key, albedo, scene)
     h = p.case.step
     for seed in (1, 2):
