@@ -157,7 +157,8 @@ def test_what_lies_behind_a_hidden_light_is_seen_at_its_own_distance():
     hidden = load(sensor, wall | lamp, hide_emitters=True, max_depth=2)
     steady, transient = hidden.integrator().render(hidden, spp=256)
     bins = np.array(transient)[0, 0, :, 0]
-    # 4 m to the wall and 1 m to the point light; the lamp is off its own axis, hence dark itself at depth 2 from the front
+    # 4 m to the wall and 1 m to the point light; the lamp is off its own axis, hence dark itself at depth 2 from the
+    # front
     assert bins[0] > 0.5 * np.array(steady)[0, 0, 0]
     assert hidden.sensors()[0].film().energy_before == 0.0
 

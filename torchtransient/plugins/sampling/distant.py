@@ -1,8 +1,8 @@
 """Arrival time of light from infinitely distant emitters.
 
-Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches the sphere around
-the scene: the plane with normal ``d`` (towards the light) at ``center + radius d``. A point ``x`` is reached
-after ``radius - dot(x - center, d)``, which a plane wave demands and which no choice of path can change.
+Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches
+the sphere around the scene: the plane with normal ``d`` (towards the light) at ``center + radius d``. A point ``x`` is
+reached after ``radius - dot(x - center, d)``, which a plane wave demands and which no choice of path can change.
 """
 
 from __future__ import annotations
