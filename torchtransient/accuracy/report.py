@@ -30,8 +30,8 @@ class Choice:
 class CostPoint:
     """One point of a curve.
 
-    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time of one
-    run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
+    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time
+    of one run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
     """
 
     choice: Choice
@@ -74,7 +74,8 @@ class AccuracyReport:
         return None
 
     def gain(self, quantity: str, choice: Choice) -> float:
-        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal time.
+        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal
+        time.
 
         Geometric mean over the runs with equal position in the list of samples; NaN where an error is not positive.
         """
