@@ -1,5 +1,28 @@
-"""Fixtures of this folder."""
+"""Fixtures around the small room."""
 
-from render_rooms import room as room
-from render_rooms import room_scene as room_scene
-from render_rooms import weights as weights
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import VARIANT, make_room
+
+
+@pytest.fixture
+def room() -> dict:
+    """The room as a dictionary that a test may change."""
+    return make_room()
+
+
+@pytest.fixture(scope="session")
+def room_scene() -> tt.Scene:
+    """The room loaded once; scenes are immutable."""
+    return tt.load(make_room(), variant=VARIANT)
+
+
+@pytest.fixture
+def weights() -> torch.Tensor:
+    """A fixed linear functional of the room's transient (3, 24, 3, 4)."""
+    generator = torch.Generator().manual_seed(7)
+    return torch.rand((3, 24, 3, 4), generator=generator) - 0.3

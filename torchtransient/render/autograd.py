@@ -1,8 +1,8 @@
 """The three autograd functions: a render, its reverse derivative and its forward derivative.
 
-``Render`` keeps no Dr.Jit graph. It saves its inputs, and its derivatives are renders of their own: ``RenderVJP`` and ``RenderJVP``, linear in
-the cotangents and tangents. They are functions of torch too, so that ``torch.func`` can batch them; differentiating *them* is
-refused, since the integrators have no second derivatives.
+``Render`` keeps no Dr.Jit graph. It saves its inputs, and its derivatives are renders of their own: ``RenderVJP``
+and ``RenderJVP``, linear in the cotangents and tangents. They are functions of torch too, so that ``torch.func`` can
+batch them; differentiating *them* is refused, since the integrators have no second derivatives.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from torchtransient.render.engine import RenderJob
 
 def _refuse_second(what: str) -> NoReturn:
     raise GradientError(
-        f"second derivatives of a render are not available: {what}. Expected a first derivative; for curvature use finite "
-        "differences of gradients, or a Gauss-Newton product J^T J v from torch.func.jvp and torch.func.vjp."
+        f"second derivatives of a render are not available: {what}. Expected a first derivative; for curvature use "
+        "finite differences of gradients, or a Gauss-Newton product J^T J v from torch.func.jvp and torch.func.vjp."
     )
 
 
-def _each(function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def _each(
+    function: Any, info: Any, in_dims: tuple[Any, ...], args: tuple[Any, ...]
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """``vmap`` by one call per entry, with the seed of the job for each: what a loop over the entries would give."""
     columns = []
     for i in range(info.batch_size):

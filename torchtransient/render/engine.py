@@ -1,9 +1,10 @@
 """Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
 
-Every run installs its values in the scene, renders, reads the result and puts the described values back, under one lock: between two runs a
-scene is always in the state of its description, and no Dr.Jit graph outlives a run.
+Every run installs its values in the scene, renders, reads the result and puts the described values back, under one
+lock: between two runs a scene is always in the state of its description, and no Dr.Jit graph outlives a run.
 
-Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items when there are several.
+Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items
+when there are several.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Item:
 class RenderJob:
     """Everything about a call that is not a tensor.
 
-    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects what the primal
-    run reports (seconds, energy outside the window) and belongs to one call.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects
+    what the primal run reports (seconds, energy outside the window) and belongs to one call.
     """
 
     scene: Scene
@@ -74,13 +75,11 @@ class _Session:
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
         """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
         import drjit as dr
-        import mitsuba as mi
 
         leaves = []
         for value, batched, need in zip(values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
-            # A copy: the scene must neither alias nor misalign memory that belongs to the caller.
-            leaf = mi.Float(entry.detach().reshape(-1).clone())
+            leaf = _own_array(entry)
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)
@@ -103,9 +102,26 @@ class _Session:
         return before
 
 
+def _own_array(tensor: torch.Tensor) -> Any:
+    """A flat Dr.Jit copy: the scene must not alias memory that belongs to the caller."""
+    import mitsuba as mi
+
+    flat = tensor.detach().reshape(-1).clone()
+    _wait_for_torch(flat)
+    return mi.Float(flat)
+
+
+def _wait_for_torch(tensor: torch.Tensor) -> None:
+    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
+    if tensor.is_cuda:
+        torch.cuda.current_stream(tensor.device).synchronize()
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is in our own table."""
+    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is
+    in our own table.
+    """
     import mitsuba as mi
 
     logger = mi.logger()
@@ -163,7 +179,12 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
         film = session.film(item)
         with dr.suspend_grad():
             session.integrator.render(
-                session.scene, sensor=item.sensor, seed=item.seed, spp=job.spp, develop=False, progress_callback=_fraction(job, n)
+                session.scene,
+                sensor=item.sensor,
+                seed=item.seed,
+                spp=job.spp,
+                develop=False,
+                progress_callback=_fraction(job, n),
             )
             before.append(film.energy_before)
             after.append(film.energy_after)
@@ -171,7 +192,10 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
         if count == 1:
             steady_all, transient_all = steady, transient
         elif steady_all is None or transient_all is None:
-            steady_all, transient_all = steady.new_empty((count, *steady.shape)), transient.new_empty((count, *transient.shape))
+            steady_all, transient_all = (
+                steady.new_empty((count, *steady.shape)),
+                transient.new_empty((count, *transient.shape)),
+            )
         if count > 1:
             steady_all[n].copy_(steady)
             transient_all[n].copy_(transient)
@@ -215,11 +239,14 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
         if not 0 <= item.sensor < len(sensors):
             raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
         if not hasattr(sensors[item.sensor].film(), "cube_shape"):
-            raise SceneError("the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...).")
+            raise SceneError(
+                "the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...)."
+            )
     shapes = {item.sensor: tuple(sensors[item.sensor].film().cube_shape()) for item in items}
     if len(set(shapes.values())) > 1:
         raise SceneError(
-            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one TransientRenderer per sensor."
+            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one "
+            "TransientRenderer per sensor."
         )
 
 
@@ -227,7 +254,9 @@ def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
     for key, value in zip(job.keys, values, strict=True):
         if not bool(torch.isfinite(value).all()):
             bad = int((~torch.isfinite(value)).sum())
-            raise UnitError(f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite.")
+            raise UnitError(
+                f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
+            )
 
 
 # ----------------------------------------------------------------------------------------------------- derivatives
@@ -239,7 +268,9 @@ def vjp(
     """Gradients of ``<g_steady, steady> + <g_transient, transient>`` for the values that need one, in their shapes."""
     import drjit as dr
 
-    grads: list[torch.Tensor | None] = [torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)]
+    grads: list[torch.Tensor | None] = [
+        torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)
+    ]
     if g_steady is not None or g_transient is not None:
         with _session(job) as session:
             _check_slope(session)
@@ -273,10 +304,11 @@ def _finish_backward(session: _Session, leaves: Sequence[Any]) -> None:
     dr.sync_thread()
 
 
-def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+def jvp(
+    job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Derivatives of (steady, transient) along ``tangents``, given for the values that need one."""
     import drjit as dr
-    import mitsuba as mi
 
     steady_all, transient_all = [], []
     with _session(job) as session:
@@ -288,7 +320,7 @@ def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch
                 if need:
                     tangent = next(given)
                     tangent = tangent[item.entry] if batched else tangent
-                    dr.set_grad(leaf, mi.Float(tangent.detach().reshape(-1).clone()))
+                    dr.set_grad(leaf, _own_array(tangent))
                     dr.enqueue(dr.ADMode.Forward, leaf)
             # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
@@ -308,7 +340,11 @@ def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch
 def _check_slope(session: _Session) -> None:
     """A path length that changes needs a temporal filter with a slope."""
     table = session.job.scene.parameters()
-    moving = [key for key, need in zip(session.job.keys, session.job.needs, strict=True) if need and table[key].moves_path_length]
+    moving = [
+        key
+        for key, need in zip(session.job.keys, session.job.needs, strict=True)
+        if need and table[key].moves_path_length
+    ]
     film = session.film(session.job.items[0])
     if moving and not film.filter.has_slope:
         raise GradientError(no_slope(moving, film.temporal_filter))
@@ -317,15 +353,18 @@ def _check_slope(session: _Session) -> None:
 def no_slope(keys: Sequence[str], temporal_filter: str) -> str:
     """The message for a derivative through the time of flight that the temporal filter does not have."""
     return (
-        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has no slope: the derivative "
-        "through the time of flight would be lost. Use temporal_filter='auto', 'tent' or 'gaussian'."
+        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has "
+        "no slope: the derivative through the time of flight would be lost. Use temporal_filter='auto', 'tent' or "
+        "'gaussian'."
     )
 
 
 def _steady_adjoint(g: torch.Tensor) -> Any:
     import mitsuba as mi
 
-    return mi.TensorXf(g.detach().contiguous())
+    g = g.detach().contiguous()
+    _wait_for_torch(g)
+    return mi.TensorXf(g)
 
 
 def _cube_adjoint(g: torch.Tensor) -> Any:
@@ -333,6 +372,7 @@ def _cube_adjoint(g: torch.Tensor) -> Any:
     import mitsuba as mi
 
     g = g.detach()
+    _wait_for_torch(g)
     span = 1 + sum((size - 1) * stride for size, stride in zip(g.shape, g.stride(), strict=True))
     if span >= 2**32:
         # Beyond 32-bit indices only the film's own layout is understood.

@@ -1,7 +1,8 @@
 """The parameters of a scene: what they are, which of them have derivatives, and how torch values enter the scene.
 
-Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key ``<mesh>.to_world`` is offered
-for them all the same: the matrix replaces the one of the description, and vertices and normals follow.
+Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
+``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
+and normals follow.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, FLOAT_TEXTURES, BuiltScene
+from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, BuiltScene
 
 CORRECT = "correct"
 SILHOUETTES = "correct except where silhouettes move (no boundary term)"
@@ -23,6 +24,7 @@ _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords
 _INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
 # In spectral variants these keep the coefficients of a smooth spectrum (Jakob and Hanika 2019).
 _COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
+_BIASED = {("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated"}
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
 _SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
@@ -68,7 +70,10 @@ class ParameterTable(Mapping[str, ParameterInfo]):
             mark = "" if entry.differentiable else "no: "
             rows.append((entry.key, shape, _short(entry.value), mark + entry.reason))
         widths = [max(len(row[i]) for row in rows) for i in range(3)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3] for row in rows]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3]
+            for row in rows
+        ]
         lines.insert(1, "-" * max(len(line) for line in lines))
         return "\n".join(lines)
 
@@ -87,7 +92,7 @@ def _short(value: Any) -> str:
 
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
-    """Read the table off a built scene (unmerged, without substitutions), inside its variant."""
+    """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
@@ -112,11 +117,12 @@ def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
     kind, shape, value = classify(key, current)
     if class_name in _INDEX_CLASSES and name == "eta":
         twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
-        reason = f"{CORRECT}; built as {twin} when asked for, since Mitsuba's own index is a plain float"
-        return ParameterInfo(key, "number", (), float(current), True, True, reason, substitute=node.id())
-    if name == "data" and class_name.startswith("BitmapTextureImpl") and not isinstance(current, mi.TensorXf):
-        reason = f"{CORRECT}; stored as floats when asked for, since {type(current).__name__} has no derivative"
-        return ParameterInfo(key, "tensor", tuple(current.shape), value, True, False, reason, FLOAT_TEXTURES)
+        reason = (
+            f"{CORRECT}; built as {twin} when asked for, which follows the index through direction, weight and length"
+        )
+        return ParameterInfo(
+            key, "number", (), float(np.array(current).reshape(-1)[0]), True, True, reason, substitute=node.id()
+        )
     differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
     if not differentiable and isinstance(node, mi.Shape) and name == "faces":
         reason = "a list of vertex numbers"
@@ -134,13 +140,19 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
     if flags & mi.ParamFlags.ReadOnly:
         return False, False, "read-only in Mitsuba"
     if isinstance(node, mi.Shape) and name in _SHAPE_KEYS:
+        if node.is_emitter() and node.is_mesh() and not node.has_vertex_texcoords():
+            return True, True, f"{SILHOUETTES}; rigid motion only: the area of an emitting mesh is not differentiated"
         return True, True, SILHOUETTES
     if isinstance(node, mi.Sensor) and name in _SENSOR_KEYS:
         return True, True, SILHOUETTES
     if name in _LIGHT_KEYS.get(node.class_name(), ()):
         return True, True, CORRECT
-    if name == "eta" and isinstance(node, mi.BSDF):
+    if name == "eta" and type(node).__name__.startswith("Diff"):
         return True, True, CORRECT
+    if name == "eta" and isinstance(node, mi.BSDF):
+        return True, True, "biased where light is refracted: the path length does not follow this index"
+    if (node.class_name(), name) in _BIASED:
+        return True, False, _BIASED[node.class_name(), name]
     if flags & mi.ParamFlags.NonDifferentiable:
         return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
     if mi.is_spectral and node.class_name().startswith(_COEFFICIENT_CLASSES) and name in ("value", "data"):
@@ -149,7 +161,9 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
 
 
 def is_transform(value: Any) -> bool:
-    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of component letters."""
+    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of
+    component letters.
+    """
     return "Transform" in type(value).__name__
 
 
@@ -270,7 +284,9 @@ class SlotTable:
         for slot in self.slots:
             for target in slot.targets:
                 if target in owner:
-                    raise SceneError(f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them.")
+                    raise SceneError(
+                        f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them."
+                    )
                 owner[target] = slot.key
 
     def install(self, leaves: list[Any]) -> None:

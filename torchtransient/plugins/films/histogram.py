@@ -185,6 +185,14 @@ class TransientHDRFilm(mi.Film):
         """The storage as (first row, rows, flat array) for each band."""
         return self.bands
 
+    def check_one_band(self):
+        """Raise ``StorageError`` when the cube does not fit into one tensor."""
+        if self.band_rows() < int(self.crop_size()[1]):
+            raise StorageError(
+                f"transient_hdr_film: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with develop=False "
+                "and read the film's transient_bands(), or use a smaller crop."
+            )
+
     def develop(self, raw: bool = False):
         """The pair (steady ``(H, W, C)``, transient ``cube_shape()``), without a copy.
 
@@ -192,10 +200,7 @@ class TransientHDRFilm(mi.Film):
         """
         if self.steady is None:
             raise SceneError("transient_hdr_film: nothing was rendered yet; call render() first.")
-        if len(self.bands) > 1:
-            raise StorageError(
-                f"transient_hdr_film: the cube {self.cube_shape()} exceeds one array; read it by transient_bands()."
-            )
+        self.check_one_band()
         shape = self.cube_shape()
         steady = mi.TensorXf(self.steady, (shape[0], shape[1], shape[-1]))
         return steady, mi.TensorXf(self.bands[0][2], shape)

@@ -234,6 +234,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
+            if develop:
+                film.check_one_band()
             jobs, samples = self.passes(sensor, film, int(seed), int(spp))
             film.prepare(self.aov_names(), samples)
             for i, job in enumerate(jobs):

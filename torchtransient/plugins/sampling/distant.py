@@ -24,7 +24,14 @@ class DistantReference:
 
 def distant_reference(scene) -> DistantReference:
     """The sphere around all shapes of ``scene``."""
-    box = scene.bbox()
+    box = mi.ScalarBoundingBox3f()
+    for shape in scene.shapes():
+        bounds = shape.bbox()
+        if not bounds.valid() and isinstance(shape, mi.Mesh):
+            # Mitsuba leaves out the bounds of a mesh that it merged from rectangles, and the scene's bounds lack it.
+            shape.recompute_bbox()
+            bounds = shape.bbox()
+        box.expand(bounds)
     if not box.valid():
         return DistantReference((0.0, 0.0, 0.0), 0.0)
     sphere = box.bounding_sphere()
