@@ -281,9 +281,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             jobs, _ = self.passes(sensor, film, int(seed), int(spp))
-            for job in jobs:
-                self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
-                dr.eval()
+            # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
+            # edges, and the first pass would be the only one to arrive.
+            with dr.isolate_grad():
+                for job in jobs:
+                    self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
+                    dr.eval()
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
