@@ -1,7 +1,7 @@
 """Renders on demand in a process of its own; driven by `_runner.Worker` through one JSON object per line.
 
-Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only the named
-library, so that each side of a comparison runs in its own environment. Requests:
+Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only
+the named library, so that each side of a comparison runs in its own environment. Requests:
   {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
   {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}

@@ -130,6 +130,17 @@ def test_table_json_and_plot(tmp_path):
             write(tmp_path / "missing" / "file.png")
 
 
+def test_noise_without_a_signal_has_no_relative_error():
+    def run(spp, seed):
+        sign = 1.0 if seed % 2 else -1.0
+        return Estimates({"transient": np.array([sign])}, spp)
+
+    report = measure({INDEPENDENT: {"values": Task(run)}}, (4,), repeats=2, progress=False)
+    (point,) = report.points
+    assert point.squared_error == 2.0 and np.isnan(point.relative_error)
+    assert "nan" not in report.table() and "hides the quantity" in report.table()
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [

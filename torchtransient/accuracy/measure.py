@@ -50,10 +50,10 @@ def measure(
 ) -> AccuracyReport:
     """Run every task of every candidate at every `spp`, `repeats` times, and report errors and median seconds.
 
-    Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the candidates
-    take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with itself: with
-    its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of independent runs; then
-    `repeats` must be even. Raises UnitError for values out of range.
+    Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the
+    candidates take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with
+    itself: with its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of
+    independent runs; then `repeats` must be even. Raises UnitError for values out of range.
     """
     counts = _checked(spp, repeats, reference_spp)
     total = len(candidates) * sum(counts) * (repeats + 1) + len(candidates) * (reference_spp or 0)

@@ -30,8 +30,8 @@ class Choice:
 class CostPoint:
     """One point of a curve.
 
-    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time of one
-    run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
+    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time
+    of one run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
     """
 
     choice: Choice
@@ -74,7 +74,8 @@ class AccuracyReport:
         return None
 
     def gain(self, quantity: str, choice: Choice) -> float:
-        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal time.
+        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal
+        time.
 
         Geometric mean over the runs with equal position in the list of samples; NaN where an error is not positive.
         """
@@ -98,17 +99,16 @@ class AccuracyReport:
             tail = f"slope {slope.slope:+.2f} +- {slope.standard_error:.2f}, " if slope is not None else ""
             lines += [f"{quantity} [{choice}]  {tail}gain {self.gain(quantity, choice):.2f}", header]
             for p in curve:
-                spread = (
-                    f"+- {p.squared_error_standard_error:.1e}"
-                    if p.squared_error_standard_error == p.squared_error_standard_error
-                    else ""
-                )
+                deviation = p.squared_error_standard_error
+                spread = f"+- {deviation:.1e}" if math.isfinite(deviation) else ""
                 lines.append(
                     f"{p.spp:>7} {p.seconds:>10.4g} {p.squared_error:>11.3e} {spread:>10} "
-                    f"{p.relative_error:>10.2%} {p.median_bin_error:>11.2%}"
+                    f"{_percent(p.relative_error):>10} {_percent(p.median_bin_error):>11}"
                 )
             lines.append("")
         lines.append(f"error {self.method}; gain: squared error x seconds of the first choice over this one")
+        if any(math.isnan(p.relative_error) for p in self.points):
+            lines.append("-: the noise hides the quantity itself, so that there is nothing to be relative to")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -151,6 +151,10 @@ class AccuracyReport:
             for quantity, choice, curve in self.curves()
         ]
         plot_accuracy(curves, path)
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.2%}"
 
 
 def _without_nan(value: Any) -> Any:
