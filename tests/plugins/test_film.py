@@ -1,4 +1,6 @@
-"""`transient_hdr_film` by itself: how arrivals spread over bins, how the adjoint reads them back, parameters and layout."""
+"""`transient_hdr_film` by itself: how arrivals spread over bins, how the adjoint reads them back, parameters and
+layout.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,15 @@ def _variant():
 
 def make_film(**arguments):
     description = {
-        "type": "transient_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"},
-        "temporal_bins": BINS, "bin_width_opl": WIDTH, "start_opl": START, **arguments,
-    }  # fmt: skip
+        "type": "transient_hdr_film",
+        "width": 1,
+        "height": 1,
+        "rfilter": {"type": "box"},
+        "temporal_bins": BINS,
+        "bin_width_opl": WIDTH,
+        "start_opl": START,
+        **arguments,
+    }
     with plugins.plugin_errors():
         return mi.load_dict(description)
 
@@ -115,7 +123,9 @@ def test_slope_is_the_derivative_of_what_is_read(name, stddev):
         return [np.array(v, dtype=float) for v in A], [np.array(v, dtype=float) for v in slope]
 
     _, slope = read(0)
-    near, far = [[(a - b) / (2 * s * h * WIDTH) for a, b in zip(read(s * h)[0], read(-s * h)[0])] for s in (0.5, 1)]
+    near, far = [
+        [(a - b) / (2 * s * h * WIDTH) for a, b in zip(read(s * h)[0], read(-s * h)[0], strict=True)] for s in (0.5, 1)
+    ]
     for c in range(3):
         # the cut of the gaussian at four standard deviations is a kink of exp(-8) of its height
         np.testing.assert_allclose(slope[c], (4 * near[c] - far[c]) / 3, atol=2e-3 * np.abs(slope[c]).max())
@@ -150,7 +160,9 @@ def test_exhaustive_layout():
     base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
     value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
     flat = film.bands[0][2]
-    film.put(flat, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column))
+    film.put(
+        flat, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
+    )
     steady, transient = film.develop()
     assert steady.shape == (2, 3, 3)
     cube = np.array(transient)

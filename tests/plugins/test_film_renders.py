@@ -1,4 +1,6 @@
-"""`transient_hdr_film` under renders: crop, spatial filters, storage bands, passes, samplers, energy outside the window."""
+"""`transient_hdr_film` under renders: crop, spatial filters, storage bands, passes, samplers, energy outside the
+window.
+"""
 
 from __future__ import annotations
 
@@ -26,21 +28,32 @@ def film(kind="transient_hdr_film", rfilter="box", **arguments):
     return {"type": kind, "width": 9, "height": 6, "rfilter": {"type": rfilter}, **time, **arguments}
 
 
-def glowing_wall(film_node, integrator="transient_path", radiance=None, sampler="independent", spp=16, **integrator_arguments):
+def glowing_wall(
+    film_node, integrator="transient_path", radiance=None, sampler="independent", spp=16, **integrator_arguments
+):
     """A camera at 4 m looks at a wall that glows in the colours of a picture (or in one)."""
     if radiance is None:
         picture = np.random.default_rng(7).uniform(0.0, 1.0, (24, 24, 3)).astype(np.float32)
         radiance = {"type": "bitmap", "data": mi.TensorXf(picture), "raw": True, "filter_type": "nearest"}
     t = mi.ScalarTransform4f()
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": integrator, "max_depth": 1, **integrator_arguments},
-        "sensor": {
-            "type": "perspective", "fov": 40, "film": film_node, "sampler": {"type": sampler, "sample_count": spp},
-            "to_world": t.look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]),
-        },
-        "wall": {"type": "rectangle", "to_world": t.scale([2.5, 2.5, 1]), "emitter": {"type": "area", "radiance": radiance}},
-    })  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 1, **integrator_arguments},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "film": film_node,
+                "sampler": {"type": sampler, "sample_count": spp},
+                "to_world": t.look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]),
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": t.scale([2.5, 2.5, 1]),
+                "emitter": {"type": "area", "radiance": radiance},
+            },
+        }
+    )
 
 
 def runs(scene, count=6, spp=64):
@@ -131,7 +144,9 @@ def gradient_of_radiance(scene, seed, spp=16):
     adjoint = (mi.TensorXf(g_steady), mi.TensorXf(g))
     scene.integrator().render_backward(scene, params, adjoint, seed=seed, spp=spp)
     slope = np.array(dr.grad(params[key]), dtype=float).sum()
-    assert np.concatenate([np.array(b[2]) for b in target.transient_bands()]).any()  # backward left the render in the film
+    assert np.concatenate(
+        [np.array(b[2]) for b in target.transient_bands()]
+    ).any()  # backward left the render in the film
     return slope, loss
 
 
@@ -194,8 +209,15 @@ def test_total_weight_in_bands_of_different_height(monkeypatch):
 def cornell(start, bins, filter):
     description = mi.cornell_box()
     description["integrator"] = {"type": "transient_path", "max_depth": 5}
-    description["sensor"]["film"] = film(width=8, height=8, temporal_bins=bins, bin_width_opl=0.25, start_opl=start,
-                                         temporal_filter=filter, gaussian_stddev=0.8)  # fmt: skip
+    description["sensor"]["film"] = film(
+        width=8,
+        height=8,
+        temporal_bins=bins,
+        bin_width_opl=0.25,
+        start_opl=start,
+        temporal_filter=filter,
+        gaussian_stddev=0.8,
+    )
     return mi.load_dict(description)
 
 

@@ -30,12 +30,11 @@ class TransientHDRFilm(mi.Film):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
-    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is
-    ``(H, W, T, C)`` of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in
-    spectral ones); there are no alpha or weight channels. Light outside the window is not stored but counted:
-    ``energy_before`` and ``energy_after`` are sums over pixels of the mean over channels. With the sum over the stored
-    bins they make up the steady image, whatever the temporal filter: what it spreads over the rim of the window counts
-    as outside.
+    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
+    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
+    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
+    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
+    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
@@ -148,8 +147,8 @@ class TransientHDRFilm(mi.Film):
         rows = MAX_ARRAY_ENTRIES // per_row
         if rows < 1:
             raise StorageError(
-                f"transient_hdr_film: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} values "
-                "each exceeds 2^32 values; use fewer bins, a narrower crop or a smaller laser grid."
+                f"transient_hdr_film: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} "
+                "values each exceeds 2^32 values; use fewer bins, a narrower crop or a smaller laser grid."
             )
         return min(rows, int(self.crop_size()[1]))
 
@@ -192,8 +191,8 @@ class TransientHDRFilm(mi.Film):
         """Raise ``StorageError`` when the cube does not fit into one tensor."""
         if self.band_rows() < int(self.crop_size()[1]):
             raise StorageError(
-                f"transient_hdr_film: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with develop=False "
-                "and read the film's transient_bands(), or use a smaller crop."
+                f"transient_hdr_film: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
+                "develop=False and read the film's transient_bands(), or use a smaller crop."
             )
 
     def develop(self, raw: bool = False):
@@ -272,13 +271,13 @@ class TransientHDRFilm(mi.Film):
         # bin.
         for offset, weight, _ in taps:
             k = first + offset
-            early, late = k < 0, k >= bins
-            before += dr.select(early, weight, 0)
-            after += dr.select(late, weight, 0)
+            before += dr.select(k < 0, weight, 0)
+            after += dr.select(k >= bins, weight, 0)
+            inside = active & (k >= 0) & (k < bins)
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, active & ~early & ~late)
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active):
