@@ -60,7 +60,8 @@ def albedos_of(renderer: tt.TransientRenderer) -> torch.Tensor:
 
 def fit_albedo(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
     """Run the fit; `target_spp` samples per pixel make the target, `spp` every step."""
-    # The axis starts after the lamp's own light has arrived (4.0 m): it is bright, noisy at its rim, and says nothing of the paints.
+    # The axis starts after the lamp's own light has arrived (4.0 m): that is bright, noisy at the lamp's rim, and says
+    # nothing of the paints.
     box = tt.scenes.cornell_box(resolution, start_opl=4.2, bin_width_opl=0.08, num_bins=75, max_depth=8)
     scene = tt.load(box, variant="llvm_ad_rgb")
     truth = tt.TransientRenderer(scene, parameters=list(KEYS.values()))

@@ -1,9 +1,9 @@
 """Find the distance and the tilt of a wall from the time of flight alone.
 
-The measurement is when the light comes back, never how much of it: every pixel's histogram is divided by its sum, and what
-is compared is its mean arrival. To prove the point, the measured wall is painted brighter than the model's. The model starts
-0.3 m and 6 degrees off. Its 4x4 matrix is made from distance and tilt by torch operations, so the gradient goes from the
-arrival times through the path lengths and the matrix to the two numbers.
+The measurement is when the light comes back, never how much of it: every pixel's histogram is divided by its sum, and
+what is compared is its mean arrival. To prove the point, the measured wall is painted brighter than the model's. The
+model starts 0.3 m and 6 degrees off. Its 4x4 matrix is made from distance and tilt by torch operations, so the gradient
+goes from the arrival times through the path lengths and the matrix to the two numbers.
 
     python training_examples/fit_wall.py --output demo_output
 """
@@ -76,7 +76,7 @@ def wall_to_world(distance: torch.Tensor, tilt_deg: torch.Tensor) -> torch.Tenso
 def mean_arrival(transient: torch.Tensor, axis: tt.TimeAxis) -> torch.Tensor:
     """Mean optical path length of every pixel's light, metres: (1, T, H, W) -> (H, W).
 
-    The histogram is divided by its sum first, so that brightness drops out: a wall twice as bright gives the same number.
+    The histogram is divided by its sum first: a wall twice as bright gives the same number.
     """
     histogram = transient[0]
     share = histogram / histogram.sum(dim=0)
@@ -178,9 +178,10 @@ def main(argv: Sequence[str] | None = None) -> Fit:
     fit = fit_wall(options.steps, options.spp, options.resolution, options.target_spp)
     picture = options.output / "fit_wall.png"
     draw(fit, picture)
+    millimetres = [1e3 * error for error in fit.distance_errors]
     print(
-        f"fit_wall: distance error {1e3 * fit.distance_errors[-1]:.3f} mm, tilt error {fit.tilt_errors[-1]:.4f} degrees "
-        f"after {options.steps} steps (start {1e3 * fit.distance_errors[0]:.0f} mm, {fit.tilt_errors[0]:.1f} degrees); {picture}"
+        f"fit_wall: distance error {millimetres[-1]:.3f} mm, tilt error {fit.tilt_errors[-1]:.4f} degrees after "
+        f"{options.steps} steps (start {millimetres[0]:.0f} mm, {fit.tilt_errors[0]:.1f} degrees); {picture}"
     )
     return fit
 

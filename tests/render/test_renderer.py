@@ -11,7 +11,10 @@ import torch
 import torchtransient as tt
 from torchtransient.render import memory
 from torchtransient.render.arguments import mix_seed
+from torchtransient.render.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
+
+START = torch.tensor([0.8, 0.5, 0.2])
 
 
 def test_output(room_scene):
@@ -304,6 +307,44 @@ def test_batch_that_does_not_fit_counts_all_its_films(monkeypatch):
 def test_available_memory_is_known_here():
     available = memory.available_bytes(VARIANT)
     assert available is not None and 2**20 < available < 2**50
+
+
+def small_bands(monkeypatch):
+    """As if arrays were limited to two rows of pixels: two bands. Holds while the scene's variant stays active."""
+    from torchtransient.plugins.films import histogram
+
+    monkeypatch.setattr(histogram, "MAX_ARRAY_ENTRIES", 2 * 4 * 24 * 3)
+
+
+def small_launches(monkeypatch):
+    """At most 64 samples per pixel in one kernel launch. Holds while the scene's variant stays active."""
+    from torchtransient.plugins.integrators import base
+
+    monkeypatch.setattr(base, "MAX_LANES", 64 * 12)
+
+
+@pytest.mark.parametrize("split", [small_bands, small_launches])
+def test_jobs_of_several_passes(room_scene, monkeypatch, split):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=512, grad_seed="same")
+    x = renderer.values[COLOUR]
+    with active_variant(VARIANT):
+        whole = renderer(seed=0).transient
+        whole_slope = torch.autograd.grad(whole.sum(), x)[0]
+        split(monkeypatch)
+        several = renderer(seed=0).transient
+        slope = torch.autograd.grad(several.sum(), x)[0]
+        pushed = torch.func.jvp(lambda y: renderer({COLOUR: y}, seed=0).transient.sum(), (START,), (torch.ones(3),))[1]
+    assert several.shape == whole.shape and not torch.equal(several, whole)
+    # Every pass has its own samples: amounts can be compared, row by row.
+    torch.testing.assert_close(several.sum((0, 1, 3)), whole.sum((0, 1, 3)), rtol=0.05, atol=0)
+    torch.testing.assert_close(slope, whole_slope, rtol=0.05, atol=0)
+    torch.testing.assert_close(pushed, slope.sum(), rtol=1e-4, atol=0)
+
+
+def test_statistics_tell_the_samples_that_are_drawn(room):
+    room["sensor"]["sampler"] = {"type": "stratified", "sample_count": 16}
+    stats = tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=10)(seed=0).stats
+    assert stats.spp == 16
 
 
 def test_progress_bar(room_scene, capsys):

@@ -156,14 +156,15 @@ def _session(job: RenderJob) -> Iterator[_Session]:
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, transient); a single item is a view of the film's own memory."""
-    started = time.perf_counter()
     _check_finite(job, values)
     with _session(job) as session:
+        started = time.perf_counter()
         check_items(session.sensors, job.items)
         check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
         result = _render_items(session, values)
+        job.log["seconds"] = time.perf_counter() - started
         job.log["integrator"] = session.slots.built.integrator
-    job.log["seconds"] = time.perf_counter() - started
+        job.log["spp"] = _drawn_samples(session)
     return result
 
 
@@ -204,6 +205,13 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
     if steady_all is None or transient_all is None:
         raise ShapeError("a batch must have at least one entry, got 0.")
     return steady_all, transient_all
+
+
+def _drawn_samples(session: _Session) -> int:
+    """Samples per pixel that are really drawn: stratified samplers round the number that is asked for."""
+    sampler = session.sensors[session.job.items[0].sensor].sampler().clone()
+    sampler.set_sample_count(session.job.spp)
+    return int(sampler.sample_count())
 
 
 def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
@@ -324,13 +332,12 @@ def jvp(
                     dr.enqueue(dr.ADMode.Forward, leaf)
             # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-            d_steady, d_transient = session.integrator.render_forward(
-                session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
+            session.integrator.render_forward(
+                session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad, develop=False
             )
-            dr.eval(d_steady, d_transient)
-            dr.sync_thread()
-            steady_all.append(d_steady.torch())
-            transient_all.append(d_transient.torch())
+            d_steady, d_transient = _take(session.film(item), None)
+            steady_all.append(d_steady)
+            transient_all.append(d_transient)
             del leaves, d_steady, d_transient
     if len(job.items) == 1:
         return steady_all[0], transient_all[0]

@@ -13,7 +13,7 @@ from torchtransient.axes import TimeAxis
 class RenderStats:
     """How a result was made.
 
-    ``seconds`` is wall time with loading excluded and the wait for other threads included; ``samples_per_second``
+    ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
     counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
     axis: sum over pixels of the mean over channels. ``seeds`` are the items' seeds.
     """

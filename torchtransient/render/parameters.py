@@ -24,6 +24,8 @@ _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords
 _INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
 # In spectral variants these keep the coefficients of a smooth spectrum (Jakob and Hanika 2019).
 _COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
+# Larger values are not copied into the table: textures of a real scene would fill the memory once more.
+_MAX_LISTED = 65536
 _BIASED = {("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated"}
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
 _SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -32,7 +34,8 @@ _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric."""
+    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric.
+    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``."""
 
     key: str
     kind: str
@@ -81,6 +84,8 @@ class ParameterTable(Mapping[str, ParameterInfo]):
 
 
 def _short(value: Any) -> str:
+    if value is None:
+        return "(large)"
     if isinstance(value, np.ndarray):
         if value.size > 4:
             return f"mean {float(np.mean(value)):.4g}"
@@ -114,15 +119,15 @@ def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
     current = built.params[key]
     name = key.rsplit(".", 1)[-1]
     class_name = node.class_name()
-    kind, shape, value = classify(key, current)
+    kind, shape = classify(key, current)
+    few = shape is None or int(np.prod(shape, dtype=np.int64)) <= _MAX_LISTED
+    value = read_value(current, shape) if few else None
     if class_name in _INDEX_CLASSES and name == "eta":
         twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
         reason = (
             f"{CORRECT}; built as {twin} when asked for, which follows the index through direction, weight and length"
         )
-        return ParameterInfo(
-            key, "number", (), float(np.array(current).reshape(-1)[0]), True, True, reason, substitute=node.id()
-        )
+        return ParameterInfo(key, "number", (), float(np.reshape(value, ())), True, True, reason, node.id())
     differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
     if not differentiable and isinstance(node, mi.Shape) and name == "faces":
         reason = "a list of vertex numbers"
@@ -167,33 +172,40 @@ def is_transform(value: Any) -> bool:
     return "Transform" in type(value).__name__
 
 
-def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None, Any]:
-    """(kind, shape of the torch value, current value as numpy) of a Mitsuba value."""
+def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
+    """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
     import drjit as dr
 
     if is_transform(current):
-        matrix = np.array(current.matrix)
-        matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
-        return "transform" if dr.is_jit_v(current.matrix) else "plain", tuple(matrix.shape), matrix
+        size = len(current.matrix)
+        return "transform" if dr.is_jit_v(current.matrix) else "plain", (size, size)
     if not dr.is_jit_v(current):
-        if isinstance(current, (bool, int, float)):
-            return "plain", (), current
         if dr.is_array_v(current):
-            return "plain", (len(current),), np.array(current)
-        return "plain", None, type(current).__name__
-    if not dr.is_float_v(current):
-        return "integer", tuple(np.array(current).shape), np.array(current)
+            return "plain", (len(current),)
+        return "plain", () if isinstance(current, (bool, int, float)) else None
     if dr.is_tensor_v(current):
-        return "tensor", tuple(int(n) for n in current.shape), np.array(current)
-    value = np.array(current)
+        return "tensor" if dr.is_float_v(current) else "integer", tuple(int(n) for n in current.shape)
+    if not dr.is_float_v(current):
+        return "integer", (dr.width(current),)
     if dr.depth_v(current) == 2:
-        return "vector", (len(current),), value.reshape(len(current), -1)[:, 0]
+        return "vector", (len(current),)
+    size = dr.width(current)
     columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
     if columns is not None:
-        return "vertices", (value.size // columns, columns), value.reshape(-1, columns)
-    if value.size == 1:
-        return "number", (), value.reshape(())
-    return "list", (value.size,), value
+        return "vertices", (size // columns, columns)
+    return ("number", ()) if size == 1 else ("list", (size,))
+
+
+def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
+    """A Mitsuba value as numpy in the shape of its torch value; plain Python values as they are."""
+    import drjit as dr
+
+    if is_transform(current):
+        current = current.matrix
+    elif not dr.is_array_v(current):
+        return current if shape == () else type(current).__name__
+    # Arrays of width one come with a trailing dimension of one.
+    return np.array(current).reshape(shape)
 
 
 # ---------------------------------------------------------------------------------------------- values in a scene
@@ -207,7 +219,8 @@ class Slot:
         self._built = built
         params = built.params
         if key in params:
-            self.kind, shape, self.initial = classify(key, params[key])
+            self.kind, shape = classify(key, params[key])
+            self.initial = read_value(params[key], shape)
             self.targets = [key]
         else:
             self.kind, shape = "mesh_transform", (4, 4)

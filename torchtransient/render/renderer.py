@@ -324,9 +324,9 @@ class TransientRenderer(nn.Module):
     def _stats(self, job: RenderJob) -> RenderStats:
         log = job.log
         pixels = self._cube_shape[0] * self._cube_shape[1]
-        paths = job.spp * pixels * len(job.items)
+        paths = log["spp"] * pixels * len(job.items)
         return RenderStats(
-            spp=job.spp,
+            spp=log["spp"],
             seconds=log["seconds"],
             samples_per_second=paths / log["seconds"],
             variant=self.scene.variant,

@@ -45,15 +45,13 @@ class Scene:
         """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives
         a table.
         """
-        return self._parameters(BuildOptions(real_bitmaps=True), keep=False)
+        return self._parameters(BuildOptions(real_bitmaps=True))
 
-    def _parameters(self, options: BuildOptions, keep: bool) -> ParameterTable:
+    def _parameters(self, options: BuildOptions) -> ParameterTable:
         with engine_lock:
             if self._table is None:
                 with active_variant(self.variant):
                     self._table = parameter_table(self.built(options))
-                    if not keep:
-                        self.drop(options)
             return self._table
 
     def built(self, options: BuildOptions) -> BuiltScene:
@@ -80,7 +78,7 @@ class Scene:
         if not keys:
             return replace(options, merge=True)
         # The build that most keys need anyway, so that looking them up costs nothing.
-        table = self._parameters(replace(options, real_bitmaps=True, merge=False), keep=True)
+        table = self._parameters(replace(options, real_bitmaps=True, merge=False))
         substitute = set(options.substitute)
         for key in keys:
             info = table.get(key)

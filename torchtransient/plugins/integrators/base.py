@@ -286,9 +286,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             jobs, _ = self.passes(sensor, film, int(seed), int(spp))
-            for job in jobs:
-                self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
-                dr.eval()
+            # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
+            # edges, and the first pass would be the only one to arrive.
+            with dr.isolate_grad():
+                for job in jobs:
+                    self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
+                    dr.eval()
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
@@ -313,10 +316,11 @@ class TransientIntegrator(mi.CppADIntegrator):
                     objective += a_first * length_to_sensor_origin(sensor, ray)
                 dr.backward_from(objective)
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
 
-        One pass over the samples for one tangent. ``params`` is not used. Errors as in :meth:`render_backward`.
+        One pass over the samples for one tangent. ``params`` is not used; with ``develop=False`` the
+        result stays in the film. Errors as in :meth:`render_backward`.
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
@@ -330,7 +334,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 self._forward_pass(scene, sensor, film, job, facts)
                 dr.eval(film.bands[job.band][2], film.steady)
             film.settle()
-            return film.develop()
+            return film.develop() if develop else None
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
