@@ -112,7 +112,9 @@ def cuda() -> list[Finding]:
     import torch
 
     if not dr.has_backend(dr.JitBackend.CUDA):
-        return [Finding("note", "cuda_ad_rgb", "no NVIDIA driver that Dr.Jit can use: only the llvm variants work here")]
+        return [
+            Finding("note", "cuda_ad_rgb", "no NVIDIA driver that Dr.Jit can use: only the llvm variants work here")
+        ]
     if not torch.cuda.is_available():
         text = f"Dr.Jit sees a GPU and torch {torch.__version__} does not: cuda variants need a torch built for CUDA"
         return [Finding("note", "cuda_ad_rgb", text)]

@@ -69,7 +69,9 @@ def time_axis(start_opl: float | None, bin_width_opl: float | None, num_bins: in
     if given == (None, None, None):
         return None
     if start_opl is None or bin_width_opl is None or num_bins is None:
-        raise click.UsageError("--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all.")
+        raise click.UsageError(
+            "--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all."
+        )
     from torchtransient.axes import TimeAxis
 
     return TimeAxis(start_opl, bin_width_opl, num_bins)

@@ -84,8 +84,8 @@ def _report_energy(output: Any) -> None:
     if total > 0 and before + after > 0.001 * total:
         axis = output.axis
         click.echo(
-            f"note: the axis from {axis.start_opl:g} m to {axis.end_opl:g} m misses light: {before / total:.1%} arrives "
-            f"before it and {after / total:.1%} after it."
+            f"note: the axis from {axis.start_opl:g} m to {axis.end_opl:g} m misses light: "
+            f"{before / total:.1%} arrives before it and {after / total:.1%} after it."
         )
 
 

@@ -47,15 +47,21 @@ def check_target(path: str | Path) -> Path:
     target = Path(path)
     if target.suffix.lower() not in _ENDINGS:
         raise StorageError(f"result file: expected a name that ends in {', '.join(_ENDINGS)}, got '{target}'.")
+    check_folder(target)
+    if target.suffix.lower() in _HDF5:
+        _h5py()
+    return target
+
+
+def check_folder(path: str | Path) -> None:
+    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
+    target = Path(path)
     folder = target.parent
     if not folder.is_dir():
         raise StorageError(f"result file: the folder '{folder}' does not exist. Create it first.")
     if target.is_dir() or not os.access(folder, os.W_OK):
         what = "is a folder" if target.is_dir() else f"cannot be written: no permission in '{folder}'"
         raise StorageError(f"result file: '{target}' {what}. Choose another place.")
-    if target.suffix.lower() in _HDF5:
-        _h5py()
-    return target
 
 
 def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, Any] | None = None) -> Path:

@@ -119,8 +119,7 @@ def plot_overview(
     if not (0 <= row < height and 0 <= column < width):
         raise ShapeError(f"plot_overview: pixel ({row}, {column}) lies outside of the image of {height} x {width}.")
     shown = Overview(tuple(moments_of_arrival(transient)), (row, column))
-    figure_type = _figure_type()
-    figure = figure_type(figsize=(12.0, 7.4), layout="constrained")
+    figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1)
     panels = upper.subplots(1, 3)
     _draw_steady(panels[0], steady, shown.pixel)
@@ -145,7 +144,7 @@ def check_picture(path: str | Path) -> None:
     folder = Path(path).parent
     if not folder.is_dir():
         raise StorageError(f"plot_overview: the folder '{folder}' does not exist. Create it first.")
-    _figure_type()
+    figure_type()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     endings = FigureCanvasAgg.get_supported_filetypes()
@@ -178,12 +177,13 @@ def _draw_histogram(panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[
     panel.margins(x=0)
 
 
-def _figure_type() -> Any:
+def figure_type() -> Any:
+    """matplotlib's Figure, which draws without a window; StorageError when matplotlib is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise StorageError(
-            "plot_overview: pictures need the package matplotlib. Install it with pip install 'torchtransient[vis]'."
+            "pictures need the package matplotlib. Install it with pip install 'torchtransient[vis]'."
         ) from error
     return Figure
 
