@@ -1,7 +1,7 @@
 """Renders on demand in a process of its own; driven by `_runner.Worker` through one JSON object per line.
 
-Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only the named
-library, so that each side of a comparison runs in its own environment. Requests:
+Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only
+the named library, so that each side of a comparison runs in its own environment. Requests:
   {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
   {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
@@ -22,9 +22,9 @@ os.dup2(2, 1)
 if sys.argv[1] == "torchtransient":
     import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported)
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import numpy as np  # noqa: E402
 
 
 def start(library, variant):

@@ -1,8 +1,8 @@
 """Render and backward: ours with gradients through the time of flight against mitransient without them.
 
-Cornell box, 128 x 128, 64 spp, depth 8, 300 bins. Ours differentiates the red albedo and the position of the red wall along its normal
-(tent filter); the peer, whose time of flight has no derivative, the red albedo alone. Our albedo alone is shown too.
-Bar: 1.0 x the peer. Without `--peer-python` only our own cases are compared with each other.
+Cornell box, 128 x 128, 64 spp, depth 8, 300 bins. Ours differentiates the red albedo and the position of the red wall
+along its normal (tent filter); the peer, whose time of flight has no derivative, the red albedo alone. Our albedo alone
+is shown too. Bar: 1.0 x the peer. Without `--peer-python` only our own cases are compared with each other.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Forward: `transient_path` against Mitsuba's steady `path` and `prb`, and mitransient against its own `path`.
 
-Cornell box, 256 x 256, 64 spp, depth 8, 300 and 2048 bins. Bars: 1.22 x the steady `path` at 300 bins and 1.38 x at 2048.
-With `--peer-python` the peer runs between our runs, in its own process and environment, and is compared with its own `path`.
+Cornell box, 256 x 256, 64 spp, depth 8, 300 and 2048 bins. Bars: 1.22 x the steady `path` at 300 bins and 1.38 x at
+2048. With `--peer-python` the peer runs between our runs, in its own process and environment, and is compared with its
+own `path`.
 """
 
 from __future__ import annotations

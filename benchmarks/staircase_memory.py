@@ -1,9 +1,9 @@
 """Peak memory of the wood staircase, 720 x 1280 pixels x 400 bins x 3 channels, over the size of its cube.
 
-Needs the scene: `--archive staircase_ccby.tar.gz` (The Wooden Staircase by Wig42, CC-BY 3.0). Every case renders once in a process
-of its own, whose peak resident set is read at the end; what was resident before the render is shown beside it. Cases: the
-integrator alone, the torch layer (`TransientRenderer`, the cube as a torch tensor), and with `--peer-python` mitransient.
-Bar: 1.3 x the cube. The full size needs about 8 GB of memory, the peer about 11 GB.
+Needs the scene: `--archive staircase_ccby.tar.gz` (The Wooden Staircase by Wig42, CC-BY 3.0). Every case renders once
+in a process of its own, whose peak resident set is read at the end; what was resident before the render is shown beside
+it. Cases: the integrator alone, the torch layer (`TransientRenderer`, the cube as a torch tensor), and with
+`--peer-python` mitransient. Bar: 1.3 x the cube. The full size needs about 8 GB of memory, the peer about 11 GB.
 """
 
 from __future__ import annotations

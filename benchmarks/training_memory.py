@@ -1,7 +1,7 @@
 """Memory and compiled kernels over 200 training steps of the torch layer with `torch.optim.Adam`.
 
-Cornell box, two parameters (an albedo and the red wall's position, tent filter). Bars: the resident set after step 20 grows by less than 2 %
-until the last step, and no kernel is compiled after the second step.
+Cornell box, two parameters (an albedo and the red wall's position, tent filter). Bars: the resident set after step 20
+grows by less than 2 % until the last step, and no kernel is compiled after the second step.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ def test_furnace_bins(emitter_sampling):
         rows, exact = transient.mean(axis=0)[first + 1 :], expected[first + 1 :]
         assert 1.0 < rows.sum() / exact.sum() < 1.004
         return
-    # Mitsuba lifts the origin of a ray off the wall, 1.8e-4 of the radius here; a grazing chord is then never shorter than
-    # 0.019 radii, which empties the part of the first bin that is not the delta.
+    # Mitsuba lifts the origin of a ray off the wall, 1.8e-4 of the radius here; a grazing chord is then never shorter
+    # than 0.019 radii, which empties the part of the first bin that is not the delta.
     check_bins(transient, expected, minimum=0.02, one_group_until=first + 5)
     # the comparison would notice a half percent more of reflectance
     brighter = cf.furnace(edges, 1.0, 0.804, 2.0, max_bounces=47)

@@ -1,7 +1,7 @@
 """Renders with mitransient in its own environment: `python peer_render.py REQUEST.pickle RESULT.npz`.
 
-The request holds `variant`, `scene` (a dictionary with (4, 4) arrays as transforms), `seeds` and `spp`. The result holds `steady`
-(K, H, W, C) and `transient` (K, H, W, T, C) for the K seeds, and the peer's `version`.
+The request holds `variant`, `scene` (a dictionary with (4, 4) arrays as transforms), `seeds` and `spp`. The result
+holds `steady` (K, H, W, C) and `transient` (K, H, W, T, C) for the K seeds, and the peer's `version`.
 """
 
 import pickle

@@ -40,7 +40,8 @@ def with_film(description, **changes):
 
 
 def enough_events(a, b, relative):
-    """Entries where both sides hold at least `relative` of the brightest: few events in a bin are not normally distributed."""
+    """Entries where both sides hold at least `relative` of the brightest: few events in a bin are not normally
+    distributed."""
     mean = (a.mean(axis=0) + b.mean(axis=0)) / 2
     return mean > relative * mean.max()
 
@@ -112,8 +113,8 @@ def test_environment_light_arrives(peer):
     for steady in (steady_a, steady_b):
         result = z_test(steady.mean(axis=(1, 2, 3)), 0.5, rounding=1e-5)
         assert result.passed, str(result)
-    # Light starts at the sphere around the square, of radius sqrt(2), and every direction reaches its centre after that;
-    # 2.03 m more to the camera make 3.444 m. The pixels are 9 mm wide, which spreads the arrival by as much.
+    # Light starts at the sphere around the square, of radius sqrt(2), and every direction reaches its centre after
+    # that; 2.03 m more to the camera make 3.444 m. The pixels are 9 mm wide, which spreads the arrival by as much.
     total = a.sum(axis=3)
     np.testing.assert_allclose(total, steady_a, rtol=1e-5)
     np.testing.assert_allclose(a[:, :, :, 34], total, rtol=1e-5)

@@ -14,12 +14,14 @@ from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.errors import SceneError
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
+from torchtransient.render.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 
 
 def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
-    """The default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over pixels.
+    """The default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over
+    pixels.
 
     It is linear in the transient, so that its gradient has no bias, and it changes with energy and with arrival time.
     """
@@ -44,20 +46,21 @@ def cost_of_accuracy(
 ) -> AccuracyReport:
     """Measure the error of the transient, and of gradients, against seconds and samples per pixel.
 
-    `renderer` renders at the current values of its parameters; `gradients` are keys among them, each the derivative of `loss`,
-    a scalar of the `RenderOutput`. Every pair of `samplers` (Mitsuba's plugin names) and `temporal_filters` ("box", "tent",
-    "gaussian"; None: the one that the renderer uses) is one curve. Where a filter has no slope in time (box) and a key
-    moves path lengths, there is no gradient: that filter's curve then shows the transient alone, and `settings` of the report
-    names the pair under "without_gradients".
+    `renderer` renders at the current values of its parameters; `gradients` are keys among them, each the derivative of
+    `loss`, a scalar of the `RenderOutput`. Every pair of `samplers` (Mitsuba's plugin names) and `temporal_filters`
+    ("box", "tent", "gaussian"; None: the one that the renderer uses) is one curve. Where a filter has no slope in time
+    (box) and a key moves path lengths, there is no gradient: that filter's curve then shows the transient alone, and
+    `settings` of the report names the pair under "without_gradients".
 
     Errors are squared and relative, over `repeats` independent runs at each of `spp`, either against a reference of
-    `reference_spp` samples (at least four times the largest `spp`) or, with None, in pairs of runs (`repeats` even). Every curve is
-    compared with its own expectation: what a filter blurs does not count as an error. Seconds are medians of wall time: a
-    forward render for the transient, render and backward for gradients; the runs of all curves take turns. A loss that
-    is not linear has a biased gradient, which only a reference shows, and only in part.
+    `reference_spp` samples (at least four times the largest `spp`) or, with None, in pairs of runs (`repeats` even).
+    Every curve is compared with its own expectation: what a filter blurs does not count as an error. Seconds are
+    medians of wall time: a forward render for the transient, render and backward for gradients; the runs of all curves
+    take turns. A loss that is not linear has a biased gradient, which only a reference shows, and only in part.
 
-    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler that
-    the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held per curve.
+    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler
+    that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
+    per curve.
     """
     missing = [key for key in gradients if key not in renderer.values]
     if missing:
@@ -89,9 +92,17 @@ def cost_of_accuracy(
         "time_axis": [renderer.axis.start_opl, renderer.axis.bin_width_opl, renderer.axis.num_bins],
         "without_gradients": without,
     }
-    return measure(
-        candidates, spp, reference_spp=reference_spp, repeats=repeats, seed=seed, progress=progress, settings=settings
-    )
+    # One switch of variant for all runs: a switch within each would be timed with it.
+    with active_variant(renderer.scene.variant):
+        return measure(
+            candidates,
+            spp,
+            reference_spp=reference_spp,
+            repeats=repeats,
+            seed=seed,
+            progress=progress,
+            settings=settings,
+        )
 
 
 def _values_task(renderer: TransientRenderer) -> Task:

@@ -2,12 +2,12 @@
 
 Two ways to the same number, the expected squared error per entry:
 
-* against a *reference* of two independent halves A and B: mean of (x - (A + B) / 2)^2 less the reference's own variance,
-  (A - B)^2 / 4. It contains the bias of the estimate, if the reference has none.
+* against a *reference* of two independent halves A and B: mean of (x - (A + B) / 2)^2 less the reference's own
+  variance, (A - B)^2 / 4. It contains the bias of the estimate, if the reference has none.
 * from *pairs* of independent runs: mean of (x1 - x2)^2 / 2, the variance. It sees no bias.
 
-The power that a relative error divides by is the product of two independent runs, A B or x1 x2, whose expectation is the squared
-truth; a squared estimate would add its variance.
+The power that a relative error divides by is the product of two independent runs, A B or x1 x2, whose expectation is
+the squared truth; a squared estimate would add its variance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Reference:
 
 @dataclass
 class ErrorTally:
-    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is none."""
+    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is
+    none."""
 
     time_dim: int | None = None
     reference: Reference | None = None
@@ -108,8 +109,8 @@ class ErrorTally:
 class ErrorEstimate:
     """`squared`: expected squared error per entry, and its standard error over the runs (NaN for one run or pair).
 
-    `relative`: root of squared error over power, all entries together: what bright bins decide. `median_bin`: the same per
-    time bin, median over the bins that hold light: what dim, late bins decide. NaN where there is no light at all.
+    `relative`: root of squared error over power, all entries together: what bright bins decide. `median_bin`: the same
+    per time bin, median over the bins that hold light: what dim, late bins decide. NaN where there is no light at all.
     """
 
     squared: float

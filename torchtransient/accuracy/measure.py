@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import ArrayLike
-from tqdm import tqdm  # type: ignore[import-untyped]
+from tqdm import tqdm
 
 from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
@@ -50,10 +50,10 @@ def measure(
 ) -> AccuracyReport:
     """Run every task of every candidate at every `spp`, `repeats` times, and report errors and median seconds.
 
-    Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the candidates
-    take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with itself: with
-    its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of independent runs; then
-    `repeats` must be even. Raises UnitError for values out of range.
+    Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the
+    candidates take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with
+    itself: with its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of
+    independent runs; then `repeats` must be even. Raises UnitError for values out of range.
     """
     counts = _checked(spp, repeats, reference_spp)
     total = len(candidates) * sum(counts) * (repeats + 1) + len(candidates) * (reference_spp or 0)
@@ -139,7 +139,8 @@ def _checked(spp: Sequence[int], repeats: int, reference_spp: int | None) -> lis
         raise UnitError(f"spp: expected different sample counts of at least 1, got {list(spp)}")
     if repeats < 2 or (reference_spp is None and repeats % 2):
         raise UnitError(
-            f"repeats: expected at least 2, and an even number without a reference (runs are compared in pairs), got {repeats}"
+            "repeats: expected at least 2, and an even number without a reference (runs are compared in pairs), "
+            f"got {repeats}"
         )
     if reference_spp is not None and reference_spp < 4 * max(counts):
         raise UnitError(

@@ -30,8 +30,8 @@ class Choice:
 class CostPoint:
     """One point of a curve.
 
-    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time of one
-    run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
+    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time
+    of one run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
     """
 
     choice: Choice
@@ -65,7 +65,8 @@ class AccuracyReport:
             yield quantity, choice, sorted(curve, key=lambda p: p.spp)
 
     def slope(self, quantity: str, choice: Choice) -> Slope | None:
-        """Line through log squared error against log spp; -1 for independent samples. None with fewer than three points."""
+        """Line through log squared error against log spp; -1 for independent samples. None with fewer than three
+        points."""
         for name, candidate, curve in self.curves():
             if (name, candidate) == (quantity, choice):
                 good = [p for p in curve if p.squared_error > 0]
@@ -74,7 +75,8 @@ class AccuracyReport:
         return None
 
     def gain(self, quantity: str, choice: Choice) -> float:
-        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal time.
+        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal
+        time.
 
         Geometric mean over the runs with equal position in the list of samples; NaN where an error is not positive.
         """
@@ -136,7 +138,8 @@ class AccuracyReport:
             raise StorageError(f"accuracy report: cannot write {path}: {error}; choose a writable place") from error
 
     def plot(self, path: str | Path) -> None:
-        """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope -1."""
+        """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope
+        -1."""
         from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
 
         curves = [

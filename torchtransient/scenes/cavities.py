@@ -37,13 +37,14 @@ def furnace(
 ) -> SceneDict:
     """A diffuse sphere that emits `radiance` from its whole inner side, seen from its centre. Lengths in metres.
 
-    Every pixel sees the same thing. Russian roulette starts at `rr_depth`, beyond `max_depth` by default, so that the only
-    bias is the truncation at `max_depth` segments: the energy left out is `radiance * reflectance**max_depth / (1 - reflectance)`.
-    Closed form: `closed_forms.furnace`.
+    Every pixel sees the same thing. Russian roulette starts at `rr_depth`, beyond `max_depth` by default, so that the
+    only bias is the truncation at `max_depth` segments: the energy left out is `radiance * reflectance**max_depth / (1
+    - reflectance)`. Closed form: `closed_forms.furnace`.
 
-    Mitsuba's sphere light (3.9.1) gives some points of its own surface the density of a sphere seen from outside, which makes
-    a furnace 0.17 % too bright when the wall is sampled as an emitter. By default a dark point light at the centre takes the
-    emitter samples instead, and emission is found by BSDF sampling alone; `emitter_sampling=True` samples the wall itself.
+    Mitsuba's sphere light (3.9.1) gives some points of its own surface the density of a sphere seen from outside, which
+    makes a furnace 0.17 % too bright when the wall is sampled as an emitter. By default a dark point light at the
+    centre takes the emitter samples instead, and emission is found by BSDF sampling alone; `emitter_sampling=True`
+    samples the wall itself.
     """
     scene: SceneDict = {
         "type": "scene",
@@ -59,7 +60,8 @@ def furnace(
     }
     if not emitter_sampling:
         scene["wall"]["emitter"]["sampling_weight"] = 0.0
-        # Not zero: spectral variants refuse a light without any energy. Added to anything in float32 it changes nothing.
+        # Not zero: spectral variants refuse a light without any energy. Added to anything in float32 it changes
+        # nothing.
         scene["dark"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1e-30}
     return scene
 
@@ -77,7 +79,8 @@ def integrating_sphere(
     max_depth: int = 64,
     rr_depth: int = 1000,
 ) -> SceneDict:
-    """A diffuse sphere lit by a point source of `intensity` (W/sr) at its centre and seen from there. Lengths in metres.
+    """A diffuse sphere lit by a point source of `intensity` (W/sr) at its centre and seen from there. Lengths in
+    metres.
 
     Light reaches the wall at `radius` everywhere with irradiance `intensity / radius**2`, then crosses the sphere along
     independent chords. Closed form: `closed_forms.integrating_sphere_radiance`.
@@ -112,10 +115,10 @@ def parallel_plates(
 ) -> SceneDict:
     """Two emitting diffuse squares facing each other, the camera half-way between them. Lengths in metres.
 
-    The plates stand at z = -separation / 2 and +separation / 2 and reach `half_extent` to each side. The camera looks at one
-    of them through a field of view of 0.5 degrees, so that the first leg is separation / 2 to 1e-5. Of a flight's
-    energy at most `(separation / half_extent)**2` leaves through the open sides; arrivals before `half_extent` do not
-    notice the edges. Closed form: `closed_forms.parallel_plates`.
+    The plates stand at z = -separation / 2 and +separation / 2 and reach `half_extent` to each side. The camera looks
+    at one of them through a field of view of 0.5 degrees, so that the first leg is separation / 2 to 1e-5. Of a
+    flight's energy at most `(separation / half_extent)**2` leaves through the open sides; arrivals before `half_extent`
+    do not notice the edges. Closed form: `closed_forms.parallel_plates`.
     """
     gap = positive("separation", separation)
     size = scale(positive("half_extent", half_extent))

@@ -39,8 +39,9 @@ def transient_film(
 ) -> SceneDict:
     """A `transient_hdr_film` with a box reconstruction filter.
 
-    `resolution` is one side of a square film or (width, height) in pixels; `start_opl` and `bin_width_opl` are metres of
-    optical path length. Raises SceneError or UnitError for sizes below one, a width of zero or a start that is not finite.
+    `resolution` is one side of a square film or (width, height) in pixels; `start_opl` and `bin_width_opl` are metres
+    of optical path length. Raises SceneError or UnitError for sizes below one, a width of zero or a start that is not
+    finite.
     """
     width, height = (resolution, resolution) if isinstance(resolution, int) else resolution
     if not math.isfinite(start_opl):
@@ -59,7 +60,8 @@ def transient_film(
 def perspective(
     to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent", near_clip: float = 1e-3
 ) -> SceneDict:
-    """A pinhole camera; `fov` in degrees along the smaller side of the film, `near_clip` in metres, `spp` samples per pixel."""
+    """A pinhole camera; `fov` in degrees along the smaller side of the film, `near_clip` in metres, `spp` samples per
+    pixel."""
     return {
         "type": "perspective",
         "fov_axis": "smaller",

@@ -1,7 +1,7 @@
 """Affine transforms as float64 arrays of shape (4, 4), column vectors, in Mitsuba's conventions.
 
-They need no Mitsuba variant, pickle, and compose with `@`: `translate(t) @ rotate(axis, angle) @ scale(s)` scales first,
-as `mi.ScalarTransform4f().translate(t).rotate(axis, angle).scale(s)` does.
+They need no Mitsuba variant, pickle, and compose with `@`: `translate(t) @ rotate(axis, angle) @ scale(s)` scales
+first, as `mi.ScalarTransform4f().translate(t).rotate(axis, angle).scale(s)` does.
 """
 
 from __future__ import annotations

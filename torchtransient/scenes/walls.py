@@ -24,9 +24,9 @@ def moving_wall(
     """A diffuse square at height `z` under a camera at z = 4 and a point light at (0.5, 0, 4). Lengths in metres.
 
     The wall fills the film (field of view 10 degrees). `side_panel=True` adds a fixed diffuse panel beside it, which
-    brings several bounces. Keys for gradients: `wall.to_world`, `wall.bsdf.reflectance.value`, `side.bsdf.reflectance.value`,
-    `light.position`. For the derivative of the arrival time with respect to `z`: each of the two legs grows by the cosine
-    between it and the wall's normal, about -2 together.
+    brings several bounces. Keys for gradients: `wall.to_world`, `wall.bsdf.reflectance.value`,
+    `side.bsdf.reflectance.value`, `light.position`. For the derivative of the arrival time with respect to `z`: each of
+    the two legs grows by the cosine between it and the wall's normal, about -2 together.
     """
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     scene: SceneDict = {
@@ -55,9 +55,9 @@ def light_over_plane(
 ) -> SceneDict:
     """A point light and an irradiance meter at the same place, `height` above a diffuse plane. Lengths in metres.
 
-    The plane is z = 0 and reaches `half_extent` to each side. The meter is a square of side 2e-4 `height` facing
-    the plane; the light hangs 1e-4 `height` below it, so that the meter casts no shadow on the plane. Film: one pixel, direct
-    light only. Closed form: `closed_forms.light_over_plane`.
+    The plane is z = 0 and reaches `half_extent` to each side. The meter is a square of side 2e-4 `height` facing the
+    plane; the light hangs 1e-4 `height` below it, so that the meter casts no shadow on the plane. Film: one pixel,
+    direct light only. Closed form: `closed_forms.light_over_plane`.
     """
     h = positive("height", height)
     meter = translate([0.0, 0.0, h]) @ rotate([0, 1, 0], 180) @ scale(1e-4 * h)
@@ -99,10 +99,10 @@ def etalon_slab(
 ) -> SceneDict:
     """A smooth glass slab met head-on by the camera, with an area light behind or in front of it. Lengths in metres.
 
-    The slab fills 0 <= z <= thickness, the camera stands at z = thickness + 1 and looks along -z through a field of view of 0.1
-    degrees. `light="behind"` puts a black emitting square at z = -1: the camera sees the transmitted orders, after 2 m of
-    air. `light="front"` puts it at z = thickness + 2, behind the camera: the camera sees the reflected orders, after 3 m
-    of air. Closed form: `closed_forms.etalon_slab`.
+    The slab fills 0 <= z <= thickness, the camera stands at z = thickness + 1 and looks along -z through a field of
+    view of 0.1 degrees. `light="behind"` puts a black emitting square at z = -1: the camera sees the transmitted
+    orders, after 2 m of air. `light="front"` puts it at z = thickness + 2, behind the camera: the camera sees the
+    reflected orders, after 3 m of air. Closed form: `closed_forms.etalon_slab`.
     """
     d = positive("thickness", thickness)
     if light == "behind":
@@ -112,7 +112,8 @@ def etalon_slab(
     else:
         raise SceneError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
-    # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along it.
+    # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along
+    # it.
     slab_to_world = translate([3.0, 0.0, d / 2]) @ scale([10.0, 10.0, d / 2])
     return {
         "type": "scene",
@@ -147,8 +148,9 @@ def glass_slab_before_wall(
 ) -> SceneDict:
     """A tilted smooth glass slab between a camera at z = 4 and a diffuse wall at z = 0. Lengths in metres.
 
-    The point light at (1.8, 0, 2) reaches the wall past the slab. The slab is 0.5 m thick; its refractive index changes the
-    direction, the Fresnel weight and the optical path length of what the camera sees. Key for the gradient: the slab's `eta`.
+    The point light at (1.8, 0, 2) reaches the wall past the slab. The slab is 0.5 m thick; its refractive index changes
+    the direction, the Fresnel weight and the optical path length of what the camera sees. Key for the gradient: the
+    slab's `eta`.
     """
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     slab = translate([0.0, 0.0, 2.4]) @ rotate([0, 1, 0], tilt_deg) @ scale([0.8, 0.8, 0.25])

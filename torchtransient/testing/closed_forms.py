@@ -1,8 +1,8 @@
 """Exact transients, integrated over the bins of a time axis: what a renderer must return on the scenes of `tt.scenes`.
 
-Every function takes `edges_opl` (T + 1,), the bin edges in metres of optical path length (`TimeAxis.edges_opl`), and returns
-float64 energies (T,): the integral of the arriving radiance (or irradiance) over each half-open bin, for emitters that
-fire one delta pulse at t = 0. Summed over an axis that covers everything, a row is the steady value.
+Every function takes `edges_opl` (T + 1,), the bin edges in metres of optical path length (`TimeAxis.edges_opl`), and
+returns float64 energies (T,): the integral of the arriving radiance (or irradiance) over each half-open bin, for
+emitters that fire one delta pulse at t = 0. Summed over an axis that covers everything, a row is the steady value.
 
 Numpy only. Wrong axes raise ShapeError or UnitError, quantities outside their range UnitError. Not covered: motion,
 wavelength dependence, coherence, participating media.
@@ -49,9 +49,9 @@ def integrating_sphere_irradiance(
 ) -> Array:
     """Irradiance per bin (T,) on the wall of a Lambertian sphere after `energy` reached the wall at t = 0.
 
-    E_n(tau) = energy rho^(n-1) / (4 pi R^2) p^{*n}(tau), n >= 1 flights with p(l) = l / (2 R^2) on [0, 2R]; the steady sum is
-    energy / (4 pi R^2 (1 - rho)). `energy` is what leaves the wall for its first flight, in J; `radius` in metres;
-    result in J/m^2. `max_flights` cuts the series after that many flights. Source: Fry et al. 2006; Labsphere
+    E_n(tau) = energy rho^(n-1) / (4 pi R^2) p^{*n}(tau), n >= 1 flights with p(l) = l / (2 R^2) on [0, 2R]; the steady
+    sum is energy / (4 pi R^2 (1 - rho)). `energy` is what leaves the wall for its first flight, in J; `radius` in
+    metres; result in J/m^2. `max_flights` cuts the series after that many flights. Source: Fry et al. 2006; Labsphere
     integrating sphere guide.
     """
     area = 4.0 * math.pi * _positive("radius", radius) ** 2
@@ -62,11 +62,13 @@ def integrating_sphere_irradiance(
 def integrating_sphere_radiance(
     edges_opl: ArrayLike, radius: float, reflectance: float, intensity: float, max_bounces: int | None = None
 ) -> Array:
-    """Radiance per bin (T,) seen from the centre of a Lambertian sphere with a point light of `intensity` at the centre.
+    """Radiance per bin (T,) seen from the centre of a Lambertian sphere with a point light of `intensity` at the
+    centre.
 
-    L(tau) = (rho / pi) (I / R^2) [ delta(tau - 2R) + sum_{n>=1} rho^n p^{*n}(tau - 2R) ], steady rho I / (pi R^2 (1 - rho)).
-    `radius` in metres, `intensity` in W/sr, result in W/(m^2 sr). `max_bounces` counts reflections at the wall (one for the
-    delta), as a renderer with `max_depth = max_bounces + 1` does. The scene is `tt.scenes.integrating_sphere`.
+    L(tau) = (rho / pi) (I / R^2) [ delta(tau - 2R) + sum_{n>=1} rho^n p^{*n}(tau - 2R) ], steady rho I / (pi R^2 (1 -
+    rho)). `radius` in metres, `intensity` in W/sr, result in W/(m^2 sr). `max_bounces` counts reflections at the wall
+    (one for the delta), as a renderer with `max_depth = max_bounces + 1` does. The scene is
+    `tt.scenes.integrating_sphere`.
     """
     r = _positive("radius", radius)
     last = None if max_bounces is None else max_bounces - 1
@@ -77,8 +79,8 @@ def integrating_sphere_radiance(
 def integrating_sphere_decay(radius: float, reflectance: float) -> float:
     """Optical path length, metres, over which the late signal of a Lambertian sphere falls by 1/e.
 
-    1/s with reflectance [e^{2Rs} (2Rs - 1) + 1] / (2 R^2 s^2) = 1, the pole of the renewal equation of p(l) = l / (2 R^2).
-    At reflectance 0.5 it is 2R exactly. Raises UnitError unless 0 < reflectance < 1.
+    1/s with reflectance [e^{2Rs} (2Rs - 1) + 1] / (2 R^2 s^2) = 1, the pole of the renewal equation of p(l) = l / (2
+    R^2). At reflectance 0.5 it is 2R exactly. Raises UnitError unless 0 < reflectance < 1.
     """
     if not 0.0 < reflectance < 1.0:
         raise UnitError(f"reflectance: expected a number between 0 and 1, both excluded, got {reflectance!r}")
@@ -107,9 +109,9 @@ def furnace(
 ) -> Array:
     """Radiance per bin (T,) seen from the centre of a Lambertian sphere whose wall emits `radiance` at t = 0.
 
-    L(tau) = Le [ delta(tau - R) + sum_{n>=1} rho^n p^{*n}(tau - R) ], steady Le / (1 - rho). `radius` in metres. `max_bounces`
-    counts reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` does. The scene is
-    `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
+    L(tau) = Le [ delta(tau - R) + sum_{n>=1} rho^n p^{*n}(tau - R) ], steady Le / (1 - rho). `radius` in metres.
+    `max_bounces` counts reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` does. The
+    scene is `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
     """
     r = _positive("radius", radius)
     return radiance * _bounce_series(sphere_chord(r), edges_opl, r, reflectance, first=0, last=max_bounces)
@@ -125,9 +127,9 @@ def parallel_plates(
 ) -> Array:
     """Radiance per bin (T,) seen at normal incidence between infinite Lambertian plates that emit `radiance` at t = 0.
 
-    L(tau) = Le [ delta(tau - z) + sum_{n>=1} rho^n p^{*n}(tau - z) ], p(r) = 2 h^2 / r^3 for r >= h, steady Le / (1 - rho).
-    `separation` h and `first_leg` z (camera to plate, h / 2 unless given) in metres. Source: the view factor of parallel
-    planes. The scene is `tt.scenes.parallel_plates`.
+    L(tau) = Le [ delta(tau - z) + sum_{n>=1} rho^n p^{*n}(tau - z) ], p(r) = 2 h^2 / r^3 for r >= h, steady Le / (1 -
+    rho). `separation` h and `first_leg` z (camera to plate, h / 2 unless given) in metres. Source: the view factor of
+    parallel planes. The scene is `tt.scenes.parallel_plates`.
     """
     h = _positive("separation", separation)
     z = h / 2.0 if first_leg is None else _positive("first_leg", first_leg)
@@ -137,8 +139,8 @@ def parallel_plates(
 def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[float, float]:
     """Power reflectances (Rs, Rp) of a smooth interface met from the side of index 1, for a real relative `index`.
 
-    Rs = ((cos_i - n cos_t) / (cos_i + n cos_t))^2, Rp = ((n cos_i - cos_t) / (n cos_i + cos_t))^2 (Fresnel). Total reflection
-    (index < 1 beyond the critical angle) gives (1, 1).
+    Rs = ((cos_i - n cos_t) / (cos_i + n cos_t))^2, Rp = ((n cos_i - cos_t) / (n cos_i + cos_t))^2 (Fresnel). Total
+    reflection (index < 1 beyond the critical angle) gives (1, 1).
     """
     n = _positive("index", index)
     cos_i = math.cos(math.radians(incidence_deg))
@@ -168,11 +170,12 @@ def etalon_orders(
 ) -> list[EtalonOrder]:
     """Reflected or transmitted orders of a plane-parallel slab in air, incoherent, down to 1e-18 of the light.
 
-    With R, T = 1 - R at one interface and the travelled path q = index * thickness / cos_t: reflected m = 0: R at 0; m >= 1:
-    T^2 R^(2m-1) at 2 m q; transmitted m >= 0: T^2 R^(2m) at (2m + 1) q; absorption multiplies by exp(-alpha * length). Totals
-    without absorption 2R / (1 + R) and (1 - R) / (1 + R). `side` is "reflected" or "transmitted"; `polarisation` "s",
-    "p" or None for the mean of both. Lengths in metres, `absorption_per_m` per metre of length in the glass. The path is the one
-    light travels, not the delay of a wavefront, 2 n d cos_t; dispersion (group index) is not covered.
+    With R, T = 1 - R at one interface and the travelled path q = index * thickness / cos_t: reflected m = 0: R at 0; m
+    >= 1: T^2 R^(2m-1) at 2 m q; transmitted m >= 0: T^2 R^(2m) at (2m + 1) q; absorption multiplies by exp(-alpha *
+    length). Totals without absorption 2R / (1 + R) and (1 - R) / (1 + R). `side` is "reflected" or "transmitted";
+    `polarisation` "s", "p" or None for the mean of both. Lengths in metres, `absorption_per_m` per metre of length in
+    the glass. The path is the one light travels, not the delay of a wavefront, 2 n d cos_t; dispersion (group index) is
+    not covered.
     """
     if side not in ("reflected", "transmitted"):
         raise UnitError(f"side: expected 'reflected' or 'transmitted', got {side!r}")
@@ -202,8 +205,8 @@ def etalon_slab(
 ) -> Array:
     """Radiance per bin (T,) of a uniform light of `radiance` seen through, or in, a slab at normal incidence.
 
-    The orders of `etalon_orders` shifted by `air_opl`, the path in air in metres: 2 for `tt.scenes.etalon_slab(light="behind")`
-    with side="transmitted", 3 for light="front" with side="reflected".
+    The orders of `etalon_orders` shifted by `air_opl`, the path in air in metres: 2 for
+    `tt.scenes.etalon_slab(light="behind")` with side="transmitted", 3 for light="front" with side="reflected".
     """
     edges = checked_edges(edges_opl)
     total = np.zeros(edges.size - 1)
@@ -217,8 +220,8 @@ def _bounce_series(
 ) -> Array:
     """sum over n = first .. last of rho^(n - first) p^{*n}(tau - start_opl), per bin; None: until nothing is added.
 
-    The mass of n flights within the axis falls faster than geometrically once n exceeds the longest possible number of typical
-    flights, so that the series ends by itself, at reflectance 1 too.
+    The mass of n flights within the axis falls faster than geometrically once n exceeds the longest possible number of
+    typical flights, so that the series ends by itself, at reflectance 1 too.
     """
     rho = _albedo(reflectance)
     edges = checked_edges(edges_opl)

@@ -1,8 +1,8 @@
 """Central differences with common random numbers: the yardstick for every gradient of the library.
 
 Both sides of a difference use the same seed, so that most of the noise cancels; the error that is left is measured over
-independent seeds. Where a path jumps between the two sides (a silhouette, a box filter's bin edge) the variance grows like
-1 / step: take a step that spans many such events, or more seeds.
+independent seeds. Where a path jumps between the two sides (a silhouette, a box filter's bin edge) the variance grows
+like 1 / step: take a step that spans many such events, or more seeds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ Render = Callable[[float, int], ArrayLike]
 
 @dataclass(frozen=True)
 class Derivative:
-    """A derivative by finite differences: `per_seed` (K, ...) in the shape of what was rendered, and the `step` that was used."""
+    """A derivative by finite differences: `per_seed` (K, ...) in the shape of what was rendered, and the `step` that
+    was used."""
 
     per_seed: Array
     step: float
@@ -45,12 +46,13 @@ class Derivative:
 def central_difference(
     render: Render, value: float, step: float, seeds: Sequence[int], richardson: bool = False
 ) -> Derivative:
-    """d render(value, seed) / d value at `value`, from render(value + step, seed) - render(value - step, seed), per seed.
+    """d render(value, seed) / d value at `value`, from render(value + step, seed) - render(value - step, seed), per
+    seed.
 
-    `render(x, seed)` returns a number or an array of any fixed shape. `richardson=True` renders twice as often, at `step` and
-    `step / 2`, and cancels the error of second order: (4 D(step / 2) - D(step)) / 3. At least two different seeds (UnitError
-    otherwise, since no error can be told). For the derivative with respect to a direction in many parameters, let
-    `value` be the coordinate along it.
+    `render(x, seed)` returns a number or an array of any fixed shape. `richardson=True` renders twice as often, at
+    `step` and `step / 2`, and cancels the error of second order: (4 D(step / 2) - D(step)) / 3. At least two different
+    seeds (UnitError otherwise, since no error can be told). For the derivative with respect to a direction in many
+    parameters, let `value` be the coordinate along it.
     """
     if not step > 0.0:
         raise UnitError(f"step: expected a number greater than zero, got {step!r}")

@@ -1,7 +1,8 @@
 """Sums of independent flight lengths: the n-fold convolutions behind every cavity with a closed form.
 
-In a closed Lambertian cavity whose form factors do not depend on the point (a sphere, a pair of infinite plates) the lengths of
-successive flights are independent and share one density p. The optical path of n flights then has the density p^{*n}.
+In a closed Lambertian cavity whose form factors do not depend on the point (a sphere, a pair of infinite plates) the
+lengths of successive flights are independent and share one density p. The optical path of n flights then has the
+density p^{*n}.
 
 The density is held on pieces of width `unit`, each by its values at Gauss-Legendre nodes. Both densities here
 break only at multiples of that width, so every piece of every convolution is smooth and the quadrature converges
@@ -81,8 +82,8 @@ def delta_mass(edges_opl: ArrayLike, opl: float) -> Array:
 def flight_masses(law: FlightLaw, edges_opl: ArrayLike, start_opl: float = 0.0) -> Iterator[Array]:
     """Yield for n = 0, 1, 2, ... the probability (T,) that `start_opl` plus n flights end in each bin.
 
-    Row 0 is a delta at `start_opl`. Rows are integrals over the bins, not densities times widths; what lies beyond the last
-    edge is not in any bin. Endless: the caller stops.
+    Row 0 is a delta at `start_opl`. Rows are integrals over the bins, not densities times widths; what lies beyond the
+    last edge is not in any bin. Endless: the caller stops.
     """
     edges = checked_edges(edges_opl)
     yield delta_mass(edges, start_opl)
@@ -137,8 +138,8 @@ class _Grid:
     def _operator(self, shift: int) -> Array | None:
         """What the density on piece i, (NODES,), adds at the nodes of piece i + shift; None if nothing.
 
-        q(t) = int_0^t p(v) k(shift + t - v) dv + int_t^1 p(v) k(shift + t - v) dv: the first integral sees the flight's piece
-        `shift`, the second the piece before it, so each integrand is smooth.
+        q(t) = int_0^t p(v) k(shift + t - v) dv + int_t^1 p(v) k(shift + t - v) dv: the first integral sees the flight's
+        piece `shift`, the second the piece before it, so each integrand is smooth.
         """
         operator = np.zeros((NODES, NODES))
         t = self.nodes[:, None]

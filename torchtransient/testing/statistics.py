@@ -1,7 +1,7 @@
 """Tests for Monte Carlo results whose tolerances follow from the noise itself, never from taste.
 
-All of them work on independent runs along the first axis, shape (K, ...). The score of an entry is Student's t of its K runs,
-mapped to the normal deviate of the same probability: for normally distributed runs it is a standard normal
+All of them work on independent runs along the first axis, shape (K, ...). The score of an entry is Student's t of its K
+runs, mapped to the normal deviate of the same probability: for normally distributed runs it is a standard normal
 deviate whatever K is. Runs with few events per entry are not normal; give each run enough samples.
 """
 
@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 class ZTest:
     """Outcome of a test of many entries at once.
 
-    `z`: normal deviates, in the shape of one run, 0 where both sides are exactly equal without noise and inf where they differ
-    without noise. `limit`: the deviate that the largest |z| of this many entries exceeds with probability `alpha` if all is
-    well. `chi2_z`: deviate of the sum of z^2 against a chi-squared with `entries` degrees of freedom (Wilson-Hilferty);
-    independent entries are assumed, correlation makes it wider.
+    `z`: normal deviates, in the shape of one run, 0 where both sides are exactly equal without noise and inf where they
+    differ without noise. `limit`: the deviate that the largest |z| of this many entries exceeds with probability
+    `alpha` if all is well. `chi2_z`: deviate of the sum of z^2 against a chi-squared with `entries` degrees of freedom
+    (Wilson-Hilferty); independent entries are assumed, correlation makes it wider.
     """
 
     z: Array
@@ -63,7 +63,8 @@ def standard_error(runs: ArrayLike) -> Array:
 def z_test(runs: ArrayLike, expected: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
     """Test that independent runs (K, ...) have the mean `expected` (...), which is known exactly.
 
-    `rounding` is an absolute error that the comparison forgives, for float32 results with hardly any noise. The limit on
+    `rounding` is an absolute error that the comparison forgives, for float32 results with hardly any noise. The limit
+    on
     |z| is set so that a correct result fails with probability `alpha` over all entries together (Sidak). Raises
     ShapeError when the shapes differ or K < 2.
     """
@@ -89,8 +90,9 @@ def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3,
 def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
     """First indices of groups of neighbouring bins that each hold at least `minimum` of `expected` (T,).
 
-    Few events in a bin are not normally distributed; pool both sides of a test with `np.add.reduceat(values, starts, axis=-1)`.
-    What is left at the end joins the last group. Raises UnitError when all bins together hold less than `minimum`.
+    Few events in a bin are not normally distributed; pool both sides of a test with `np.add.reduceat(values, starts,
+    axis=-1)`. What is left at the end joins the last group. Raises UnitError when all bins together hold less than
+    `minimum`.
     """
     energy = np.asarray(expected, dtype=np.float64)
     if energy.ndim != 1:
@@ -118,7 +120,8 @@ class Slope:
 
 
 def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
-    """Least squares line through (log x, log y), both (N,), N >= 3, positive. The variance of Monte Carlo has slope -1 in spp."""
+    """Least squares line through (log x, log y), both (N,), N >= 3, positive. The variance of Monte Carlo has slope -1
+    in spp."""
     xs, ys = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if xs.ndim != 1 or xs.shape != ys.shape or xs.size < 3:
         raise ShapeError(f"log_log_slope: expected two rows of the same length >= 3, got {xs.shape} and {ys.shape}")
