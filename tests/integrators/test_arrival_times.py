@@ -105,7 +105,7 @@ def test_clock_of_distant_light_does_not_depend_on_merged_shapes():
 
 
 def test_clock_of_a_second_scene_is_its_own():
-    """One integrator for many scenes: a scene that is gone must not lend its sphere to a later one at the same address."""
+    """One integrator for many scenes: a scene that is gone must not lend its sphere to another at its address."""
     integrator = mi.load_dict({"type": "transient_path"})
     for size in (1.0, 2.0, 3.0, 1.5):
         scene = mi.load_dict({"type": "scene", "wall": wall(size=size), "sky": {"type": "constant"}})

@@ -1,4 +1,4 @@
-"""Every parameter of `transient_path`, and every kind of light and sensor, against closed forms and Mitsuba's `path`."""
+"""Every parameter of `transient_path`, against closed forms and Mitsuba's `path`."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def test_corner():
 
 @pytest.mark.parametrize("height", [1e-3, 1e-6, 0.0])
 def test_light_next_to_the_surface(height):
-    """Guards against 1 / d^2 of no distance: a point light next to the wall, and one on it, which lights nothing there."""
+    """Guards against 1 / d^2 of no distance: a point light next to the wall, and one on it."""
     scene = load(sensor([0, 0, 2], [0, 0, 0]), {"floor": floor(), "light": point([0.011, 0.007, height])})
     steady, transient = (np.array(v) for v in scene.integrator().render(scene, spp=256))
     assert np.isfinite(steady).all() and np.isfinite(transient).all()

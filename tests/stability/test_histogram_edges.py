@@ -38,7 +38,7 @@ def put(opl, width, filter="box"):
 @pytest.mark.parametrize("width", [1.0, 0.25, 0.003, 0.1, 1e-4])
 @pytest.mark.parametrize("eps", [1e-6, 1e-9, 1e-12])
 def test_half_open_bins(width, eps):
-    """Guards against bins computed in single precision, where an arrival flips to the neighbour within 1e-7 of an edge."""
+    """Guards against bins in single precision, where an arrival flips to the neighbour within 1e-7 of an edge."""
     k = np.arange(1, BINS)
     above, _, _ = put(k * width * (1 + eps), width)
     below, _, _ = put(k * width * (1 - eps), width)

@@ -49,7 +49,7 @@ def test_sixteen_million_terms_keep_their_mass(packets):
 
 @pytest.mark.parametrize("packets", [True, False])
 def test_bound_of_single_precision(packets):
-    """Up to the number of samples that is summed in single precision, rounding stays below 2e-4, far below the noise."""
+    """Up to the number of samples that is summed in single precision, rounding stays below 2e-4, under the noise."""
     count = 1 << 16
     assert abs(mass(count, count, packets)) < 2e-4
 
