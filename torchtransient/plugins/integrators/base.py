@@ -360,7 +360,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         expected = film.cube_shape()
         if tuple(g_transient.shape) != expected:
             raise GradientError(
-                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}; pass (H, W, T, C)."
+                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}; pass all of it."
             )
         _, w, t, c = expected
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
@@ -368,7 +368,7 @@ class TransientIntegrator(mi.CppADIntegrator):
     def _check_differentiable(self, film, facts):
         if facts.geometry and not film.filter.has_slope:
             raise GradientError(
-                "A parameter that changes optical path lengths (geometry, light or sensor position, index of refraction) "
+                "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
                 f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
                 "'tent' or 'gaussian'."
             )
