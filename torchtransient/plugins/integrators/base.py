@@ -360,7 +360,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         expected = film.cube_shape()
         if tuple(g_transient.shape) != expected:
             raise GradientError(
-                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}; pass all of it."
+                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}."
             )
         _, w, t, c = expected
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
