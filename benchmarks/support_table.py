@@ -1,4 +1,5 @@
-"""Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the markers.
+"""Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
+markers.
 
 The cases are those of ``tests/integrators/gradient_cases.py``: what the table says is what the tests check.
 """
@@ -15,8 +16,14 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
 NOT_SUPPORTED = (
-    ("eta of Mitsuba's own `dielectric`, `roughdielectric`", "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for"),
-    ("vertices of light-emitting meshes without texture coordinates", "rigid motion only: the area element is not differentiated"),
+    (
+        "eta of Mitsuba's own `dielectric`, `roughdielectric`",
+        "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",
+    ),
+    (
+        "vertices of light-emitting meshes without texture coordinates",
+        "rigid motion only: the area element is not differentiated",
+    ),
     ("any path length through an explicit box filter", "not supported: `GradientError`"),
     ("second derivatives; unlimited depth (`max_depth=-1`)", "not supported: `GradientError`"),
 )
@@ -30,7 +37,9 @@ def measure(case):
     reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
     forward = problem.forward(100)
     h = case.step
-    fd = np.array([(problem.loss(case.value + h, s) - problem.loss(case.value - h, s)) / (2 * h) for s in range(case.seeds)])
+    fd = np.array(
+        [(problem.loss(case.value + h, s) - problem.loss(case.value - h, s)) / (2 * h) for s in range(case.seeds)]
+    )
     root = np.sqrt(case.seeds)
     return reverse.mean(), reverse.std(ddof=1) / root, fd.mean(), fd.std(ddof=1) / root, forward / reverse[0]
 
@@ -59,12 +68,15 @@ def main() -> None:
     arguments = parser.parse_args()
 
     sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "integrators")]
-    import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
     from gradient_cases import CASES
     from tqdm import tqdm
 
+    import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
+
     rows = defaultdict(list)
-    for case in tqdm([c for c in CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"):
+    for case in tqdm(
+        [c for c in CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
+    ):
         rows[case.row].append((case, measure(case)))
     text = table(rows)
     print(text)

@@ -1,5 +1,7 @@
 """torchtransient: time-resolved light transport as differentiable PyTorch tensors."""
 
+import importlib
+
 from torchtransient import _llvm
 
 _llvm.bind()  # chooses the LLVM that Dr.Jit takes at its import, so nothing above may import mitsuba or drjit
@@ -7,6 +9,10 @@ _llvm.bind()  # chooses the LLVM that Dr.Jit takes at its import, so nothing abo
 from torchtransient import plugins as plugins  # noqa: E402  lets Mitsuba tell the plugins of a change of variant
 
 __version__ = "0.1.0.dev0"
+
+# The room `render` must not hide the function `render`: once the room is imported, later imports leave the name alone.
+importlib.import_module("torchtransient.render")
+del globals()["render"]
 
 _LAZY = {
     "RenderOutput": "torchtransient.render.output",
@@ -23,8 +29,6 @@ _LAZY = {
 
 def __getattr__(name: str) -> object:
     """Public names are imported when they are first used: `import torchtransient` stays cheap."""
-    import importlib
-
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])

@@ -72,6 +72,7 @@ class _Outcome:
     refused: tuple[LLVMLibrary, ...] = ()
     problem: str | None = None  # why nothing was chosen
     too_late: bool = False  # Dr.Jit had been imported before
+    own: str | None = None  # the user's setting of the variable
 
 
 _outcome = _Outcome()
@@ -79,10 +80,10 @@ _outcome = _Outcome()
 
 def bind() -> None:
     """Choose an LLVM and import Dr.Jit with it. Never raises; called once, by the package's `__init__`."""
+    own = _outcome.own = os.environ.get(VARIABLE)
     if "drjit" in sys.modules:
         _outcome.too_late = True
         return
-    own = os.environ.get(VARIABLE)
     if own:
         _check_own(own)
     else:
@@ -101,6 +102,11 @@ def bind() -> None:
             del os.environ[VARIABLE]
             if own:
                 os.environ[VARIABLE] = own
+
+
+def users_choice() -> str | None:
+    """What the user had set `DRJIT_LIBLLVM_PATH` to before the package was imported, None when nothing."""
+    return _outcome.own or None
 
 
 def ensure_llvm() -> LLVMLibrary:

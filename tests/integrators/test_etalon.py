@@ -1,4 +1,4 @@
-"""Optical path lengths through glass: slabs met at an angle, gaps, and connections through rough interfaces (closed form G)."""
+"""Optical path lengths through glass: slabs met at an angle, gaps, and connections through rough interfaces."""
 
 from __future__ import annotations
 
@@ -106,7 +106,8 @@ def test_slab(plugin, side, n_in, n_out, angle_deg):
     bins, start = 400, 2.5
     bsdf = {"type": plugin, "int_ior": n_in, "ext_ior": n_out}
     scene = mi.load_dict({
-        "type": "scene", "light": light, **interface_pair(bsdf, thickness), "sensor": camera(origin, [3, 0.1, 0], bins, start),
+        "type": "scene", "light": light, **interface_pair(bsdf, thickness),
+        "sensor": camera(origin, [3, 0.1, 0], bins, start),
         "integrator": {"type": "transient_path", "max_depth": 7, "rr_depth": 1000},
     })  # fmt: skip
     measured = transients(scene)
@@ -123,7 +124,9 @@ ROUGH = {
     },
     "half covered": {
         "type": "mask", "opacity": 0.5,
-        "nested": {"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.3, "distribution": "ggx"},
+        "nested": {
+            "type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.3, "distribution": "ggx",
+        },
     },
 }  # fmt: skip
 

@@ -1,7 +1,8 @@
 """Every parameter of the support table: reverse mode against finite differences, forward mode against reverse mode.
 
-The bounds are derived: reverse mode and finite differences are independent estimates over different seeds, their difference may be three standard
-errors of both; forward and reverse mode use the same paths, so they differ by float32 sums alone.
+The bounds are derived: reverse mode and finite differences are independent estimates over different seeds, their
+difference may be three standard errors of both; forward and reverse mode use the same paths, so they differ by float32
+sums alone.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import pytest
 from gradient_cases import CASES, Problem
 
 SIGMAS = 3.0
-# Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about sqrt(n) ulp.
+# Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
+# sqrt(n) ulp.
 ROUNDING = 2e-3
 
 

@@ -1,4 +1,5 @@
-"""``diff_dielectric`` and ``diff_rough_dielectric`` against Mitsuba's plugins, and their derivatives against the textbook."""
+"""``diff_dielectric`` and ``diff_rough_dielectric`` against Mitsuba's plugins, and their derivatives against the
+textbook."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fresnel's equations in single precision against the textbook in double precision (closed form H)."""
+"""Fresnel's equations in single precision against the textbook in double precision."""
 
 from __future__ import annotations
 

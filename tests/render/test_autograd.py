@@ -12,7 +12,7 @@ from torch import nn
 from torch.autograd import forward_ad
 
 import torchtransient as tt
-from conftest import COLOUR, GREY, WALL_POSE
+from torchtransient.testing.small_room import COLOUR, GREY, WALL_POSE
 
 START = torch.tensor([0.8, 0.5, 0.2])
 
@@ -329,9 +329,19 @@ def test_state_dict_round_trip(room_scene):
         renderer.values[GREY].fill_(0.25)
     other = make_renderer(room_scene, (COLOUR, GREY))
     other.load_state_dict(renderer.state_dict())
-    assert float(other.values[GREY]) == 0.25
+    assert other.values[GREY].item() == 0.25
     assert torch.equal(other(seed=1).transient, renderer(seed=1).transient)
     assert set(renderer.state_dict()) == {"box/bsdf/reflectance/value", "wall/bsdf/reflectance/value"}
+
+
+def test_functional_call(room_scene, weights):
+    renderer = make_renderer(room_scene)
+    name = next(iter(dict(renderer.named_parameters())))
+
+    def loss(x):
+        return (torch.func.functional_call(renderer, {name: x}, (), {"seed": 0}).transient * weights).sum()
+
+    torch.testing.assert_close(torch.func.grad(loss)(START * 0.5), gradient(renderer, START * 0.5, weights))
 
 
 def test_no_gradient_is_computed_for_frozen_values(room_scene, weights):

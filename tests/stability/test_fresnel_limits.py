@@ -1,4 +1,4 @@
-"""Limits in which the textbook form of Fresnel's equations loses its digits or its derivatives (PHYSICS: hard cases 7 and 8)."""
+"""Limits in which the textbook form of Fresnel's equations loses its digits or its derivatives."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def slope(cosine: float, eta: float) -> float:
 def test_index_near_one(offset):
     """Guards against cancellation as the index approaches one.
 
-    At n = 1 + 1e-6 the amplitudes are differences of numbers that agree to six digits: the textbook form in single precision
-    is wrong by several per cent, and its derivative too.
+    At n = 1 + 1e-6 the amplitudes are differences of numbers that agree to six digits: the textbook form in single
+    precision is wrong by several per cent, and its derivative too.
     """
     eta = np.float32(1 + offset)
     # Below this cosine the interface reflects totally from one of its sides.

@@ -1,4 +1,4 @@
-"""Rough interfaces that are almost smooth (PHYSICS: hard cases 8 and 9)."""
+"""Rough interfaces that are almost smooth."""
 
 from __future__ import annotations
 
@@ -51,8 +51,9 @@ def hard_directions(count: int) -> np.ndarray:
 @pytest.mark.parametrize("distribution", ["ggx", "beckmann"])
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_values_and_derivatives_are_finite(distribution, alpha):
-    """Guards against overflow: the density grows as 1 / alpha^2 and its derivative as 1 / alpha^3, exponentials underflow next
-    to infinite arguments, masking divides by cosines that vanish. One such lane turns a whole gradient into NaN."""
+    """Guards against overflow: the density grows as 1 / alpha^2 and its derivative as 1 / alpha^3, exponentials
+    underflow next to infinite arguments, masking divides by cosines that vanish. One such lane turns a whole
+    gradient into NaN."""
     wi = hard_directions(3000)
     n = len(wi)
     rng = np.random.default_rng(6)
@@ -113,7 +114,7 @@ def test_roughness_below_the_clamp_is_said():
     level = logger.error_level()
     logger.set_error_level(mi.LogLevel.Warn)
     try:
-        with pytest.raises(RuntimeError, match="'alpha_v' is clamped to 0.001"):
+        with pytest.raises(RuntimeError, match=r"'alpha_v' is clamped to 0\.001"):
             mi.load_dict({"type": "diff_rough_dielectric", "alpha_u": 0.1, "alpha_v": 5e-4})
         mi.load_dict({"type": "diff_rough_dielectric", "alpha": 2e-3})
     finally:
@@ -121,7 +122,8 @@ def test_roughness_below_the_clamp_is_said():
 
 
 def test_index_passing_through_one():
-    """Guards against 0 / 0 when an optimiser moves an index through exactly one, where the refracted lobe is a delta function."""
+    """Guards against 0 / 0 when an optimiser moves an index through exactly one, where the refracted lobe is a
+    delta function."""
     bsdf = plugin(0.1)
     wi = hard_directions(1000)
     n = len(wi)

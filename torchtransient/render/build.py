@@ -1,7 +1,7 @@
 """From a description to a Mitsuba scene: what is overridden on the way, and the errors told in the user's terms.
 
-The description is parsed into Mitsuba's list of nodes, the nodes are edited (film, integrator, plugins with more derivatives, stable
-names), and the list is instantiated. The same edits serve XML files and dictionaries.
+The description is parsed into Mitsuba's list of nodes, the nodes are edited (film, integrator, plugins with more
+derivatives, stable names), and the list is instantiated. The same edits serve XML files and dictionaries.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
-# Among the substitutions: every bitmap texture is stored as floats, whatever its file holds.
-FLOAT_TEXTURES = "*bitmap"
 
 
 @dataclass(frozen=True)
 class BuildOptions:
     """What is changed of a description when it is built.
 
-    ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for the integrator, or None.
-    ``substitute``: names of BSDFs that are built as their differentiable twins, or ``FLOAT_TEXTURES``. ``merge``: let Mitsuba merge meshes and
-    equal materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into transient ones.
-    ``sampler``: plugin name of the sampler of every sensor, or None to keep them.
+    ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for
+    the integrator, or None. ``substitute``: names of BSDFs that are built as their differentiable twins.
+    ``real_bitmaps``: store every bitmap as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no
+    derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
+    away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
+    that replaces those of the sensors, with the same number of samples; None to keep them.
     """
 
     time_axis: tuple[float, float, int] | None = None
     max_depth: int | None = None
     substitute: frozenset[str] = frozenset()
+    real_bitmaps: bool = False
     merge: bool = False
     transient: bool = False
     sampler: str | None = None
@@ -60,7 +61,9 @@ class BuiltScene:
 
 
 def build(description: Description, variant: str, options: BuildOptions) -> BuiltScene:
-    """Instantiate a description under the active variant. Raises ``SceneError`` with file and line where Mitsuba knows them."""
+    """Instantiate a description under the active variant. Raises ``SceneError`` with file and line where Mitsuba
+    knows them.
+    """
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(variant)
@@ -76,7 +79,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _override_films(state, options)
             _override_integrator(state, options)
             _override_samplers(state, options)
-            _substitute_plugins(state, options.substitute)
+            _substitute_plugins(state, options)
             transforms = _mesh_transforms(state)
             integrator = _find_child(state, state.root, _is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
@@ -157,7 +160,9 @@ def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, proper
 
 
 def name_nodes(state: Any) -> None:
-    """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``, ``shape_1``."""
+    """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``,
+    ``shape_1``.
+    """
     children = [state.nodes[index] for _, index in _children(state, state.root)]
     taken = {node.props.id() for node in children}
     nameless = [node for node in children if not node.props.id()]
@@ -231,8 +236,9 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     if options.transient and plugin in _STEADY_FILMS:
         if options.time_axis is None and "temporal_bins" not in node.props:
             raise SceneError(
-                f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., time_axis=tt.TimeAxis(start_opl=..., "
-                "bin_width_opl=..., num_bins=...)), or make the film a transient_hdr_film."
+                f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., "
+                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...)), or make the film a "
+                "transient_hdr_film."
             )
         _become(state, index, "transient_hdr_film", keep=_FILM_PROPERTIES)
     if options.time_axis is not None:
@@ -268,7 +274,9 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can stand in for: "
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
+                f"stand "
+                "in for: "
                 f"{', '.join(_PATH_INTEGRATORS)}."
             )
     if options.max_depth is not None and index is not None:
@@ -292,13 +300,13 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
             _become(state, sampler, options.sampler, keep=("sample_count", "seed"))
 
 
-def _substitute_plugins(state: Any, names: frozenset[str]) -> None:
-    """Build the BSDFs called ``names`` as their differentiable twins, which take the same parameters; store bitmaps as floats if asked for."""
+def _substitute_plugins(state: Any, options: BuildOptions) -> None:
+    """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
     for node in state.nodes:
         plugin = node.props.plugin_name()
-        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in names:
+        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
-        elif plugin == "bitmap" and FLOAT_TEXTURES in names:
+        elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"
 
 

@@ -1,7 +1,7 @@
 """What a scene is described by: an XML file or a dictionary, reduced to plain data that can be pickled.
 
-A description is parsed into Mitsuba's intermediate representation (``mitsuba.parser.ParserState``) whenever a scene is built. It never holds a
-Mitsuba object: those belong to one variant of one process.
+A description is parsed into Mitsuba's intermediate representation (``mitsuba.parser.ParserState``) whenever a scene
+is built. It never holds a Mitsuba object: those belong to one variant of one process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ class XmlDescription:
         return self.path
 
     def parse(self, config: Any) -> Any:
-        """Mitsuba's parser state. The text of the time of loading counts, even if the file has changed or gone since."""
+        """Mitsuba's parser state. The text of the time of loading counts, even if the file has changed or gone
+        since.
+        """
         import mitsuba as mi
 
         path = Path(self.path)
@@ -115,7 +117,9 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
     file = Path(path)
     if not file.is_file():
         kind = "a folder" if file.is_dir() else "no such file"
-        raise SceneError(f"tt.load: expected the path of an XML scene, got {str(path)!r} ({kind} seen from {os.getcwd()}).")
+        raise SceneError(
+            f"tt.load: expected the path of an XML scene, got {str(path)!r} ({kind} seen from {os.getcwd()})."
+        )
     try:
         text = file.read_text(encoding="utf-8")
         ElementTree.fromstring(text)
@@ -123,7 +127,9 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
         raise SceneError(f"tt.load: {file} cannot be read as text: {error}.") from error
     except ElementTree.ParseError as error:
         line, column = error.position
-        raise SceneError(f"tt.load: {file} is not well-formed XML at line {line}, column {column + 1}: {error}.") from error
+        raise SceneError(
+            f"tt.load: {file} is not well-formed XML at line {line}, column {column + 1}: {error}."
+        ) from error
     values = tuple((key, _xml_value(key, value)) for key, value in sorted(parameters.items()))
     return XmlDescription(str(file.resolve()), text, values)
 
@@ -131,6 +137,8 @@ def describe_xml(path: str | os.PathLike[str], parameters: Mapping[str, Any]) ->
 def _xml_value(key: str, value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, (str, int, float)):
         return str(value)
     raise SceneError(f"tt.load: XML parameter {key!r} must be a string or a number, got {type(value).__name__}.")
@@ -193,14 +201,17 @@ def _plain_mitsuba(value: Any, where: str) -> Any:
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise SceneError(f"tt.load: the {type(value).__name__} at {where} cannot be described as an array.") from error
+            raise SceneError(
+                f"tt.load: the {type(value).__name__} at {where} cannot be described as an array."
+            ) from error
         array = array.reshape(array.shape[:-1]) if array.ndim == 2 and array.shape[-1] == 1 else array
         if array.size == 1:
             return float(array.reshape(-1)[0])
         return array.tolist() if array.ndim == 1 else array
     raise SceneError(
-        f"tt.load: the {type(value).__name__} at {where} cannot be described, and a scene must be rebuilt in other variants and processes. "
-        "Give its dictionary, transforms as 4x4 arrays or Mitsuba transforms, pixels as arrays, meshes as files."
+        f"tt.load: the {type(value).__name__} at {where} cannot be described, and a scene must be rebuilt in "
+        "other variants and processes. Give its dictionary, transforms as 4x4 arrays or Mitsuba transforms, pixels "
+        "as arrays, meshes as files."
     )
 
 

@@ -1,9 +1,10 @@
 """Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
 
-Every run installs its values in the scene, renders, reads the result and puts the described values back, under one lock: between two runs a
-scene is always in the state of its description, and no Dr.Jit graph outlives a run.
+Every run installs its values in the scene, renders, reads the result and puts the described values back, under one
+lock: between two runs a scene is always in the state of its description, and no Dr.Jit graph outlives a run.
 
-Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items when there are several.
+Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items
+when there are several.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Item:
 class RenderJob:
     """Everything about a call that is not a tensor.
 
-    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects what the primal
-    run reports (seconds, energy outside the window) and belongs to one call.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects
+    what the primal run reports (seconds, energy outside the window) and belongs to one call.
     """
 
     scene: Scene
@@ -74,13 +75,11 @@ class _Session:
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
         """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
         import drjit as dr
-        import mitsuba as mi
 
         leaves = []
         for value, batched, need in zip(values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
-            # A copy: the scene must neither alias nor misalign memory that belongs to the caller.
-            leaf = mi.Float(entry.detach().reshape(-1).clone())
+            leaf = _own_array(entry)
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)
@@ -103,9 +102,26 @@ class _Session:
         return before
 
 
+def _own_array(tensor: torch.Tensor) -> Any:
+    """A flat Dr.Jit copy: the scene must not alias memory that belongs to the caller."""
+    import mitsuba as mi
+
+    flat = tensor.detach().reshape(-1).clone()
+    _wait_for_torch(flat)
+    return mi.Float(flat)
+
+
+def _wait_for_torch(tensor: torch.Tensor) -> None:
+    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
+    if tensor.is_cuda:
+        torch.cuda.current_stream(tensor.device).synchronize()
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is in our own table."""
+    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is
+    in our own table.
+    """
     import mitsuba as mi
 
     logger = mi.logger()
@@ -140,14 +156,15 @@ def _session(job: RenderJob) -> Iterator[_Session]:
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, transient); a single item is a view of the film's own memory."""
-    started = time.perf_counter()
     _check_finite(job, values)
     with _session(job) as session:
+        started = time.perf_counter()
         check_items(session.sensors, job.items)
         check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
         result = _render_items(session, values)
+        job.log["seconds"] = time.perf_counter() - started
         job.log["integrator"] = session.slots.built.integrator
-    job.log["seconds"] = time.perf_counter() - started
+        job.log["spp"] = _drawn_samples(session)
     return result
 
 
@@ -163,7 +180,12 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
         film = session.film(item)
         with dr.suspend_grad():
             session.integrator.render(
-                session.scene, sensor=item.sensor, seed=item.seed, spp=job.spp, develop=False, progress_callback=_fraction(job, n)
+                session.scene,
+                sensor=item.sensor,
+                seed=item.seed,
+                spp=job.spp,
+                develop=False,
+                progress_callback=_fraction(job, n),
             )
             before.append(film.energy_before)
             after.append(film.energy_after)
@@ -171,7 +193,10 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
         if count == 1:
             steady_all, transient_all = steady, transient
         elif steady_all is None or transient_all is None:
-            steady_all, transient_all = steady.new_empty((count, *steady.shape)), transient.new_empty((count, *transient.shape))
+            steady_all, transient_all = (
+                steady.new_empty((count, *steady.shape)),
+                transient.new_empty((count, *transient.shape)),
+            )
         if count > 1:
             steady_all[n].copy_(steady)
             transient_all[n].copy_(transient)
@@ -180,6 +205,13 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
     if steady_all is None or transient_all is None:
         raise ShapeError("a batch must have at least one entry, got 0.")
     return steady_all, transient_all
+
+
+def _drawn_samples(session: _Session) -> int:
+    """Samples per pixel that are really drawn: stratified samplers round the number that is asked for."""
+    sampler = session.sensors[session.job.items[0].sensor].sampler().clone()
+    sampler.set_sample_count(session.job.spp)
+    return int(sampler.sample_count())
 
 
 def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
@@ -215,11 +247,14 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
         if not 0 <= item.sensor < len(sensors):
             raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
         if not hasattr(sensors[item.sensor].film(), "cube_shape"):
-            raise SceneError("the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...).")
+            raise SceneError(
+                "the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...)."
+            )
     shapes = {item.sensor: tuple(sensors[item.sensor].film().cube_shape()) for item in items}
     if len(set(shapes.values())) > 1:
         raise SceneError(
-            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one TransientRenderer per sensor."
+            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one "
+            "TransientRenderer per sensor."
         )
 
 
@@ -227,7 +262,9 @@ def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
     for key, value in zip(job.keys, values, strict=True):
         if not bool(torch.isfinite(value).all()):
             bad = int((~torch.isfinite(value)).sum())
-            raise UnitError(f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite.")
+            raise UnitError(
+                f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
+            )
 
 
 # ----------------------------------------------------------------------------------------------------- derivatives
@@ -239,7 +276,9 @@ def vjp(
     """Gradients of ``<g_steady, steady> + <g_transient, transient>`` for the values that need one, in their shapes."""
     import drjit as dr
 
-    grads: list[torch.Tensor | None] = [torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)]
+    grads: list[torch.Tensor | None] = [
+        torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)
+    ]
     if g_steady is not None or g_transient is not None:
         with _session(job) as session:
             _check_slope(session)
@@ -273,10 +312,11 @@ def _finish_backward(session: _Session, leaves: Sequence[Any]) -> None:
     dr.sync_thread()
 
 
-def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+def jvp(
+    job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Derivatives of (steady, transient) along ``tangents``, given for the values that need one."""
     import drjit as dr
-    import mitsuba as mi
 
     steady_all, transient_all = [], []
     with _session(job) as session:
@@ -288,17 +328,16 @@ def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch
                 if need:
                     tangent = next(given)
                     tangent = tangent[item.entry] if batched else tangent
-                    dr.set_grad(leaf, mi.Float(tangent.detach().reshape(-1).clone()))
+                    dr.set_grad(leaf, _own_array(tangent))
                     dr.enqueue(dr.ADMode.Forward, leaf)
             # Interior nodes keep their tangents: the loops of the integrator read them at their boundary.
             dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-            d_steady, d_transient = session.integrator.render_forward(
-                session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
+            session.integrator.render_forward(
+                session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad, develop=False
             )
-            dr.eval(d_steady, d_transient)
-            dr.sync_thread()
-            steady_all.append(d_steady.torch())
-            transient_all.append(d_transient.torch())
+            d_steady, d_transient = _take(session.film(item), None)
+            steady_all.append(d_steady)
+            transient_all.append(d_transient)
             del leaves, d_steady, d_transient
     if len(job.items) == 1:
         return steady_all[0], transient_all[0]
@@ -308,7 +347,11 @@ def jvp(job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch
 def _check_slope(session: _Session) -> None:
     """A path length that changes needs a temporal filter with a slope."""
     table = session.job.scene.parameters()
-    moving = [key for key, need in zip(session.job.keys, session.job.needs, strict=True) if need and table[key].moves_path_length]
+    moving = [
+        key
+        for key, need in zip(session.job.keys, session.job.needs, strict=True)
+        if need and table[key].moves_path_length
+    ]
     film = session.film(session.job.items[0])
     if moving and not film.filter.has_slope:
         raise GradientError(no_slope(moving, film.temporal_filter))
@@ -317,15 +360,18 @@ def _check_slope(session: _Session) -> None:
 def no_slope(keys: Sequence[str], temporal_filter: str) -> str:
     """The message for a derivative through the time of flight that the temporal filter does not have."""
     return (
-        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has no slope: the derivative "
-        "through the time of flight would be lost. Use temporal_filter='auto', 'tent' or 'gaussian'."
+        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has "
+        "no slope: the derivative through the time of flight would be lost. Use temporal_filter='auto', 'tent' or "
+        "'gaussian'."
     )
 
 
 def _steady_adjoint(g: torch.Tensor) -> Any:
     import mitsuba as mi
 
-    return mi.TensorXf(g.detach().contiguous())
+    g = g.detach().contiguous()
+    _wait_for_torch(g)
+    return mi.TensorXf(g)
 
 
 def _cube_adjoint(g: torch.Tensor) -> Any:
@@ -333,6 +379,7 @@ def _cube_adjoint(g: torch.Tensor) -> Any:
     import mitsuba as mi
 
     g = g.detach()
+    _wait_for_torch(g)
     span = 1 + sum((size - 1) * stride for size, stride in zip(g.shape, g.stride(), strict=True))
     if span >= 2**32:
         # Beyond 32-bit indices only the film's own layout is understood.

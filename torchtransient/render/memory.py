@@ -59,8 +59,9 @@ def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
     parts = " x ".join(str(n) for n in cube_shape)
     batch = f", {films} of them for {items} renders" if items > 1 else ""
     raise StorageError(
-        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}), {_human(cube * films)} in all, and "
-        f"{_human(available)} are available on this {device_type(variant)}. Use fewer bins, a smaller film or crop, or a smaller batch."
+        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}), "
+        f"{_human(cube * films)} in all, and {_human(available)} are available on this {device_type(variant)}. Use "
+        f"fewer bins, a smaller film or crop, or a smaller batch."
     )
 
 

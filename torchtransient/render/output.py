@@ -13,8 +13,9 @@ from torchtransient.axes import TimeAxis
 class RenderStats:
     """How a result was made.
 
-    ``seconds`` is wall time with loading excluded and the wait for other threads included; ``samples_per_second`` counts camera paths. ``energy_before``
-    and ``energy_after`` hold, per rendered item, the light outside the time axis: sum over pixels of the mean over channels. ``seeds`` are the items' seeds.
+    ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
+    counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
+    axis: sum over pixels of the mean over channels. ``seeds`` are the items' seeds.
     """
 
     spp: int
@@ -32,10 +33,11 @@ class RenderStats:
 class RenderOutput:
     """A rendered scene.
 
-    ``transient``: float32 (C, T, H, W), radiance integrated over each bin, so that its sum over T is ``steady`` (C, H, W) as far as the axis reaches.
-    Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic variants and 3 (linear
-    sRGB) otherwise. ``phasor`` is None: phasor films are not supported yet. ``transient`` is a view of the film's own memory in
-    the order (H, W, T, C): ``.contiguous()`` makes a copy in torch's order.
+    ``transient``: float32 (C, T, H, W), radiance integrated over each bin, so that its sum over T is ``steady`` (C,
+    H, W) as far as the axis reaches. Leading dimensions come in the order (batch, sensor), each present only when
+    asked for. C is 1 in monochromatic variants and 3 (linear sRGB) otherwise. ``phasor`` is None: phasor films are
+    not supported yet. ``transient`` is a view of the film's own memory in the order (H, W, T, C): ``.contiguous()``
+    makes a copy in torch's order.
     """
 
     transient: torch.Tensor
@@ -45,7 +47,9 @@ class RenderOutput:
     stats: RenderStats
 
 
-def channels_first(steady: torch.Tensor, transient: torch.Tensor, leading: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+def channels_first(
+    steady: torch.Tensor, transient: torch.Tensor, leading: tuple[int, ...]
+) -> tuple[torch.Tensor, torch.Tensor]:
     """From the film's layout, with or without one dimension of items, to torch's with the ``leading`` dimensions."""
     steady = steady.reshape(*leading, *steady.shape[-3:])
     transient = transient.reshape(*leading, *transient.shape[-4:])

@@ -1,7 +1,8 @@
 """The parameters of a scene: what they are, which of them have derivatives, and how torch values enter the scene.
 
-Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key ``<mesh>.to_world`` is offered
-for them all the same: the matrix replaces the one of the description, and vertices and normals follow.
+Keys are those of ``mitsuba.traverse``. Meshes apply ``to_world`` while loading and forget it; a key
+``<mesh>.to_world`` is offered for them all the same: the matrix replaces the one of the description, and vertices
+and normals follow.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, FLOAT_TEXTURES, BuiltScene
+from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, BuiltScene
 
 CORRECT = "correct"
 SILHOUETTES = "correct except where silhouettes move (no boundary term)"
@@ -21,6 +22,11 @@ SILHOUETTES = "correct except where silhouettes move (no boundary term)"
 _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
 # Mitsuba's classes whose index of refraction is a plain float, and the plugin each was made from.
 _INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
+# In spectral variants these keep the coefficients of a smooth spectrum (Jakob and Hanika 2019).
+_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
+# Larger values are not copied into the table: textures of a real scene would fill the memory once more.
+_MAX_LISTED = 65536
+_BIASED = {("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated"}
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
 _SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
@@ -28,7 +34,8 @@ _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric."""
+    """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric.
+    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``."""
 
     key: str
     kind: str
@@ -66,7 +73,10 @@ class ParameterTable(Mapping[str, ParameterInfo]):
             mark = "" if entry.differentiable else "no: "
             rows.append((entry.key, shape, _short(entry.value), mark + entry.reason))
         widths = [max(len(row[i]) for row in rows) for i in range(3)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3] for row in rows]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row[:3], widths, strict=True)) + "  " + row[3]
+            for row in rows
+        ]
         lines.insert(1, "-" * max(len(line) for line in lines))
         return "\n".join(lines)
 
@@ -74,6 +84,8 @@ class ParameterTable(Mapping[str, ParameterInfo]):
 
 
 def _short(value: Any) -> str:
+    if value is None:
+        return "(large)"
     if isinstance(value, np.ndarray):
         if value.size > 4:
             return f"mean {float(np.mean(value)):.4g}"
@@ -85,7 +97,7 @@ def _short(value: Any) -> str:
 
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
-    """Read the table off a built scene (unmerged, without substitutions), inside its variant."""
+    """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
@@ -107,14 +119,15 @@ def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
     current = built.params[key]
     name = key.rsplit(".", 1)[-1]
     class_name = node.class_name()
-    kind, shape, value = classify(key, current)
+    kind, shape = classify(key, current)
+    few = shape is None or int(np.prod(shape, dtype=np.int64)) <= _MAX_LISTED
+    value = read_value(current, shape) if few else None
     if class_name in _INDEX_CLASSES and name == "eta":
         twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
-        reason = f"{CORRECT}; built as {twin} when asked for, since Mitsuba's own index is a plain float"
-        return ParameterInfo(key, "number", (), float(current), True, True, reason, substitute=node.id())
-    if name == "data" and class_name.startswith("BitmapTextureImpl") and not isinstance(current, mi.TensorXf):
-        reason = f"{CORRECT}; stored as floats when asked for, since {type(current).__name__} has no derivative"
-        return ParameterInfo(key, "tensor", tuple(current.shape), value, True, False, reason, FLOAT_TEXTURES)
+        reason = (
+            f"{CORRECT}; built as {twin} when asked for, which follows the index through direction, weight and length"
+        )
+        return ParameterInfo(key, "number", (), float(np.reshape(value, ())), True, True, reason, node.id())
     differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
     if not differentiable and isinstance(node, mi.Shape) and name == "faces":
         reason = "a list of vertex numbers"
@@ -132,50 +145,67 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
     if flags & mi.ParamFlags.ReadOnly:
         return False, False, "read-only in Mitsuba"
     if isinstance(node, mi.Shape) and name in _SHAPE_KEYS:
+        if node.is_emitter() and node.is_mesh() and not node.has_vertex_texcoords():
+            return True, True, f"{SILHOUETTES}; rigid motion only: the area of an emitting mesh is not differentiated"
         return True, True, SILHOUETTES
     if isinstance(node, mi.Sensor) and name in _SENSOR_KEYS:
         return True, True, SILHOUETTES
     if name in _LIGHT_KEYS.get(node.class_name(), ()):
         return True, True, CORRECT
-    if name == "eta" and isinstance(node, mi.BSDF):
+    if name == "eta" and type(node).__name__.startswith("Diff"):
         return True, True, CORRECT
+    if name == "eta" and isinstance(node, mi.BSDF):
+        return True, True, "biased where light is refracted: the path length does not follow this index"
+    if (node.class_name(), name) in _BIASED:
+        return True, False, _BIASED[node.class_name(), name]
     if flags & mi.ParamFlags.NonDifferentiable:
         return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
+    if mi.is_spectral and node.class_name().startswith(_COEFFICIENT_CLASSES) and name in ("value", "data"):
+        return True, False, f"{CORRECT}; the numbers are coefficients of Mitsuba's spectral model, not a colour"
     return True, False, CORRECT
 
 
 def is_transform(value: Any) -> bool:
-    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of component letters."""
+    """Whether a value is one of Mitsuba's transforms. By name: Dr.Jit arrays answer to any attribute made of
+    component letters.
+    """
     return "Transform" in type(value).__name__
 
 
-def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None, Any]:
-    """(kind, shape of the torch value, current value as numpy) of a Mitsuba value."""
+def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
+    """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
     import drjit as dr
 
     if is_transform(current):
-        matrix = np.array(current.matrix)
-        matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
-        return "transform" if dr.is_jit_v(current.matrix) else "plain", tuple(matrix.shape), matrix
+        size = len(current.matrix)
+        return "transform" if dr.is_jit_v(current.matrix) else "plain", (size, size)
     if not dr.is_jit_v(current):
-        if isinstance(current, (bool, int, float)):
-            return "plain", (), current
         if dr.is_array_v(current):
-            return "plain", (len(current),), np.array(current)
-        return "plain", None, type(current).__name__
-    if not dr.is_float_v(current):
-        return "integer", tuple(np.array(current).shape), np.array(current)
+            return "plain", (len(current),)
+        return "plain", () if isinstance(current, (bool, int, float)) else None
     if dr.is_tensor_v(current):
-        return "tensor", tuple(int(n) for n in current.shape), np.array(current)
-    value = np.array(current)
+        return "tensor" if dr.is_float_v(current) else "integer", tuple(int(n) for n in current.shape)
+    if not dr.is_float_v(current):
+        return "integer", (dr.width(current),)
     if dr.depth_v(current) == 2:
-        return "vector", (len(current),), value.reshape(len(current), -1)[:, 0]
+        return "vector", (len(current),)
+    size = dr.width(current)
     columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
     if columns is not None:
-        return "vertices", (value.size // columns, columns), value.reshape(-1, columns)
-    if value.size == 1:
-        return "number", (), value.reshape(())
-    return "list", (value.size,), value
+        return "vertices", (size // columns, columns)
+    return ("number", ()) if size == 1 else ("list", (size,))
+
+
+def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
+    """A Mitsuba value as numpy in the shape of its torch value; plain Python values as they are."""
+    import drjit as dr
+
+    if is_transform(current):
+        current = current.matrix
+    elif not dr.is_array_v(current):
+        return current if shape == () else type(current).__name__
+    # Arrays of width one come with a trailing dimension of one.
+    return np.array(current).reshape(shape)
 
 
 # ---------------------------------------------------------------------------------------------- values in a scene
@@ -189,7 +219,8 @@ class Slot:
         self._built = built
         params = built.params
         if key in params:
-            self.kind, shape, self.initial = classify(key, params[key])
+            self.kind, shape = classify(key, params[key])
+            self.initial = read_value(params[key], shape)
             self.targets = [key]
         else:
             self.kind, shape = "mesh_transform", (4, 4)
@@ -266,7 +297,9 @@ class SlotTable:
         for slot in self.slots:
             for target in slot.targets:
                 if target in owner:
-                    raise SceneError(f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them.")
+                    raise SceneError(
+                        f"parameters {owner[target]!r} and {slot.key!r} both set {target!r}; ask for one of them."
+                    )
                 owner[target] = slot.key
 
     def install(self, leaves: list[Any]) -> None:

@@ -11,8 +11,18 @@ import torch
 from torch import nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
 from torchtransient.render import engine
+from torchtransient.render.arguments import (
+    SEED_RANGE,
+    as_float,
+    checked_grad_seed,
+    fit_shape,
+    mangle,
+    mix_seed,
+    samples,
+    sensor_list,
+)
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.engine import Item, RenderJob
@@ -22,17 +32,6 @@ from torchtransient.render.scene_handle import Scene, load, unknown_key
 from torchtransient.render.variant import active_variant, device_type
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
-_SEED_RANGE = 2**32
-
-
-def mix_seed(seed: int, number: int) -> int:
-    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
-    if number == 0:
-        return seed % _SEED_RANGE
-    z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) % 2**64
-    return (z ^ (z >> 31)) % _SEED_RANGE
 
 
 class _Values(Mapping[str, nn.Parameter]):
@@ -50,30 +49,37 @@ class _Values(Mapping[str, nn.Parameter]):
     def __len__(self) -> int:
         return len(self._names)
 
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
 
 class TransientRenderer(nn.Module):
     """A scene as a differentiable layer.
 
-    ``scene``: what :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with ``time_axis`` the film becomes a
-    ``transient_hdr_film`` of the same size and filter, and the integrator a ``transient_path`` of the same depth.
+    ``scene``: what :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with
+    ``time_axis`` the film becomes a ``transient_hdr_film`` of the same size and filter, and the integrator a
+    ``transient_path`` of the same depth.
 
-    ``parameters``: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value, or a mapping from keys to start
-    values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes, since torch forbids dots; ``renderer.values`` maps keys to parameters.
+    ``parameters``: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value,
+    or a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes,
+    since torch forbids dots; ``renderer.values`` maps keys to parameters.
 
-    ``time_axis``: replaces the one of the scene's films. ``max_depth``: replaces the integrator's. ``spp``, ``spp_grad``: samples per pixel of the
-    render and of its derivatives; None takes the scene's and the render's.
+    ``time_axis``: replaces the one of the scene's films. ``max_depth``: replaces the integrator's. ``spp``,
+    ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
-    ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as soon as a parameter can change a
-    path length (shapes, light position, sensor pose, index of refraction), because a box has no slope in time. Asking for such a
-    derivative through an explicit box raises ``GradientError``.
+    ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
+    soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
+    a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``.
 
-    ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must have one shape.
-    ``grad_seed``: None draws the samples of the derivative independently of the render (which makes gradients of squared losses unbiased), "same" takes
-    the render's seed, an integer is taken as it is.
+    ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
+    have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
+    gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
+    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with
+    the same number of samples.
 
-    Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second derivatives raise ``GradientError``.
+    Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
+    derivatives raise ``GradientError``.
     """
 
     def __init__(
@@ -94,20 +100,24 @@ class TransientRenderer(nn.Module):
         if effects != "auto":
             raise SceneError(f"effects: only 'auto' is supported so far, got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
-            raise SceneError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}.")
+            raise SceneError(
+                f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
+            )
         if isinstance(parameters, str):
-            raise SceneError(f"parameters: expected a list of keys, got the string {parameters!r}; write parameters=[{parameters!r}].")
+            raise SceneError(
+                f"parameters: expected a list of keys, got the string {parameters!r}; write [{parameters!r}]."
+            )
         self.scene: Scene = load(scene)
-        self.spp, self.spp_grad = _samples("spp", spp), _samples("spp_grad", spp_grad)
+        self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = temporal_filter
-        self.grad_seed = _grad_seed(grad_seed)
+        self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
         self._options = self._build_options(time_axis, max_depth, sampler)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
             start = self._initial_values(parameters)
-        self._names = _mangle(self._keys)
+        self._names = mangle(self._keys)
         for key in self._keys:
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
 
@@ -131,7 +141,7 @@ class TransientRenderer(nn.Module):
         found = built.scene.sensors()
         if not found:
             raise SceneError(f"{self.scene!r} has no sensor; add one.")
-        self._sensors, self._stack_sensors = _sensor_list(sensors, len(found))
+        self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
         engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
         film = found[self._sensors[0]].film()
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
@@ -148,9 +158,11 @@ class TransientRenderer(nn.Module):
             value = torch.tensor(slot.initial, dtype=torch.float32, device=device).reshape(slot.shape)
             if isinstance(given, Mapping) and given[slot.key] is not None:
                 value = torch.as_tensor(given[slot.key], dtype=torch.float32).detach().clone().to(device)
-                value, batched = _fit_shape(slot.key, value, slot.shape)
+                value, batched = fit_shape(slot.key, value, slot.shape)
                 if batched:
-                    raise ShapeError(f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}.")
+                    raise ShapeError(
+                        f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}."
+                    )
             start[slot.key] = value
         return start
 
@@ -170,9 +182,13 @@ class TransientRenderer(nn.Module):
         return "tent" if moves and self._scene_filter == "box" else self._scene_filter
 
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
-        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one has."""
+        """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
+        has.
+        """
         if temporal_filter is not None and temporal_filter not in TEMPORAL_FILTERS:
-            raise SceneError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}.")
+            raise SceneError(
+                f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
+            )
         twin = copy.deepcopy(self)
         if sampler is not None:
             twin._options = replace(self._options, sampler=sampler)
@@ -185,7 +201,9 @@ class TransientRenderer(nn.Module):
         return self.effective_filter != "box" or not any(self._infos[key].moves_path_length for key in keys)
 
     def samples_drawn(self, spp: int) -> int:
-        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that they can lay out."""
+        """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
+        they can lay out.
+        """
         with active_variant(self.scene.variant):
             sampler = self.scene.built(self._options).scene.sensors()[self._sensors[0]].sampler().clone()
             sampler.set_sample_count(spp)
@@ -201,19 +219,21 @@ class TransientRenderer(nn.Module):
     ) -> RenderOutput:
         """Render. ``values`` replaces the module's own parameters, key by key; keys are those of ``parameters``.
 
-        A value has the shape listed by ``scene.parameters()``, or one leading batch dimension B more; values without it are used for every entry.
-        Any floating dtype is taken and computed in float32.
+        A value has the shape listed by ``scene.parameters()``, or one leading batch dimension B more; values without
+        it are used for every entry. Any floating dtype is taken and computed in float32.
 
-        ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch every entry has
-        its own seed, derived from this one, the first entry the seed itself; or give one seed per entry.
+        ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
+        every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
+        entry.
 
-        Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for unknown keys, ``ShapeError``, ``DeviceError``,
-        ``UnitError`` for values that are not finite, ``StorageError`` when the cube would not fit into memory, ``GradientError`` for a derivative through a box filter.
+        Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for
+        unknown keys, ``ShapeError``, ``DeviceError``, ``UnitError`` for values that are not finite, ``StorageError``
+        when the cube would not fit into memory, ``GradientError`` for a derivative through a box filter.
         """
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
-        used = _samples("spp", spp) or self.spp or self._scene_spp
+        used = samples("spp", spp) or self.spp or self._scene_spp
         items = self._items(seed, batch)
         bar = _Bar() if progress else None
         job = RenderJob(
@@ -247,16 +267,19 @@ class TransientRenderer(nn.Module):
         tensors, batched, batch = [], [], None
         for key in self._keys:
             value = given.get(key, self.values[key])
-            value = _as_float(key, value)
+            value = as_float(key, value)
             if value.device.type != expected:
                 raise DeviceError(
-                    f"value of {key!r}: expected a tensor on {expected!r}, where variant {self.scene.variant} computes, got {str(value.device)!r}. "
-                    f"Move it with .to({expected!r}), or load the scene with a variant of the other kind."
+                    f"value of {key!r}: expected a tensor on {expected!r}, where variant {self.scene.variant} "
+                    f"computes, got {str(value.device)!r}. Move it with .to({expected!r}), or load the scene with a "
+                    f"variant of the other kind."
                 )
-            value, has_batch = _fit_shape(key, value, self._shapes[key])
+            value, has_batch = fit_shape(key, value, self._shapes[key])
             if has_batch:
                 if batch is not None and value.shape[0] != batch:
-                    raise ShapeError(f"value of {key!r}: batch of {value.shape[0]}, but another value has a batch of {batch}.")
+                    raise ShapeError(
+                        f"value of {key!r}: batch of {value.shape[0]}, but another value has a batch of {batch}."
+                    )
                 batch = int(value.shape[0])
             tensors.append(value)
             batched.append(has_batch)
@@ -267,7 +290,9 @@ class TransientRenderer(nn.Module):
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
         if temporal_filter != "box" or not torch.is_grad_enabled():
             return
-        moving = [k for k, t in zip(self._keys, tensors, strict=True) if t.requires_grad and self._infos[k].moves_path_length]
+        moving = [
+            k for k, t in zip(self._keys, tensors, strict=True) if t.requires_grad and self._infos[k].moves_path_length
+        ]
         if moving:
             raise GradientError(engine.no_slope(moving, temporal_filter))
 
@@ -275,12 +300,14 @@ class TransientRenderer(nn.Module):
         entries = 1 if batch is None else batch
         per_entry = len(self._sensors)
         if seed is None:
-            seed = int(torch.randint(0, _SEED_RANGE, (), dtype=torch.int64))
+            seed = int(torch.randint(0, SEED_RANGE, (), dtype=torch.int64))
         if isinstance(seed, int):
             seeds = [mix_seed(seed, n) for n in range(entries * per_entry)]
         else:
             if len(seed) != entries:
-                raise ShapeError(f"seed: expected one integer, or one for each of {entries} batch entries, got {len(seed)}.")
+                raise ShapeError(
+                    f"seed: expected one integer, or one for each of {entries} batch entries, got {len(seed)}."
+                )
             seeds = [mix_seed(int(s), n) for s in seed for n in range(per_entry)]
         items = []
         for n, value in enumerate(seeds):
@@ -297,9 +324,9 @@ class TransientRenderer(nn.Module):
     def _stats(self, job: RenderJob) -> RenderStats:
         log = job.log
         pixels = self._cube_shape[0] * self._cube_shape[1]
-        paths = job.spp * pixels * len(job.items)
+        paths = log["spp"] * pixels * len(job.items)
         return RenderStats(
-            spp=job.spp,
+            spp=log["spp"],
             seconds=log["seconds"],
             samples_per_second=paths / log["seconds"],
             variant=self.scene.variant,
@@ -312,7 +339,8 @@ class TransientRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """Shown by ``print(renderer)``."""
-        return f"{self.scene!r}, parameters={list(self._keys)}, axis={self.axis}, temporal_filter={self.effective_filter!r}"
+        keys, used = list(self._keys), self.effective_filter
+        return f"{self.scene!r}, parameters={keys}, axis={self.axis}, temporal_filter={used!r}"
 
 
 def render(
@@ -324,79 +352,16 @@ def render(
     progress: bool = False,
     **settings: Any,
 ) -> RenderOutput:
-    """Functional twin of :class:`TransientRenderer`: the keys of ``values`` are its parameters, ``settings`` its other arguments.
+    """Functional twin of :class:`TransientRenderer`: the keys of ``values`` are its parameters, ``settings`` its
+    other arguments.
 
-    Same result as the module with the same keys and seed. For a loop, keep the scene of :func:`torchtransient.load`: it holds what was built.
+    Same result as the module with the same keys and seed. For a loop, keep the scene of :func:`torchtransient.load`:
+    it holds what was built.
     """
     renderer = TransientRenderer(scene, parameters=list(values or {}), spp=spp, **settings)
     for parameter in renderer.parameters():
         parameter.requires_grad_(False)
     return renderer(values, seed=seed, progress=progress)
-
-
-# ------------------------------------------------------------------------------------------------------- arguments
-
-
-def _samples(name: str, value: int | None) -> int | None:
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
-    return value
-
-
-def _grad_seed(value: int | str | None) -> int | str | None:
-    if value is None or value == "same" or (isinstance(value, int) and not isinstance(value, bool)):
-        return value
-    raise SceneError(f"grad_seed: expected None, 'same' or an integer, got {value!r}.")
-
-
-def _sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[int, ...], bool]:
-    if sensors == "all":
-        return tuple(range(count)), True
-    if isinstance(sensors, int) and not isinstance(sensors, bool):
-        return (sensors,), False
-    if isinstance(sensors, str) or not isinstance(sensors, Sequence) or not sensors:
-        raise SceneError(f"sensors: expected an index, a list of indices or 'all', got {sensors!r}.")
-    return tuple(int(sensor) for sensor in sensors), True
-
-
-def _mangle(keys: Sequence[str]) -> dict[str, str]:
-    """Names that torch allows: slashes for dots."""
-    names = {key: key.replace(".", "/") for key in keys}
-    if len(set(names.values())) != len(keys):
-        raise SceneError(f"parameters: every key once, and no two keys that differ only in '.' and '/', got {list(keys)}.")
-    return names
-
-
-def _as_float(key: str, value: Any) -> torch.Tensor:
-    """The value as float32, by an operation that gradients pass."""
-    if not isinstance(value, torch.Tensor):
-        raise ShapeError(f"value of {key!r}: expected a torch tensor, got {type(value).__name__}.")
-    if value.is_complex() or value.dtype == torch.bool:
-        raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
-    if value.layout != torch.strided:
-        raise ShapeError(f"value of {key!r}: expected a dense tensor, got layout {value.layout}.")
-    return value.to(torch.float32)
-
-
-def _fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
-    """The value in its own shape, and whether it has a leading batch dimension. Flat vertex lists are taken too."""
-    got = tuple(value.shape)
-    if got == shape:
-        return value, False
-    if len(got) == len(shape) + 1 and got[1:] == shape:
-        return value, True
-    flat = 1
-    for n in shape:
-        flat *= n
-    if len(shape) == 2 and got == (flat,):
-        return value.reshape(shape), False
-    if len(shape) == 2 and len(got) == 2 and got[1] == flat:
-        return value.reshape(got[0], *shape), True
-    batch = ("B", *shape)
-    with_batch = f"({', '.join(str(n) for n in batch)}{',' if len(batch) == 1 else ''})"
-    raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")
 
 
 class _Bar:
@@ -405,7 +370,9 @@ class _Bar:
     def __init__(self) -> None:
         from tqdm.auto import tqdm
 
-        self._bar: Any = tqdm(total=1.0, desc="render", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}")
+        self._bar: Any = tqdm(
+            total=1.0, desc="render", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+        )
 
     def __call__(self, fraction: float) -> None:
         self._bar.update(fraction - self._bar.n)

@@ -22,8 +22,9 @@ _MAX_BUILDS = 8
 class Scene:
     """A scene's description, and the Mitsuba scenes built from it when they are needed.
 
-    Made by :func:`load`. Pickling and copying take the description alone; the Mitsuba scene is built on first use, under the scene's variant.
-    Instances are immutable, so copies share everything. Not supported: Mitsuba objects inside a description (they belong to one variant of one process).
+    Made by :func:`load`. Pickling and copying take the description alone; the Mitsuba scene is built on first use,
+    under the scene's variant. Instances are immutable, so copies share everything. Not supported: Mitsuba objects
+    inside a description (they belong to one variant of one process).
     """
 
     def __init__(self, description: Description, variant: str | None):
@@ -41,11 +42,16 @@ class Scene:
         return self._variant
 
     def parameters(self) -> ParameterTable:
-        """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives a table."""
+        """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives
+        a table.
+        """
+        return self._parameters(BuildOptions(real_bitmaps=True))
+
+    def _parameters(self, options: BuildOptions) -> ParameterTable:
         with engine_lock:
             if self._table is None:
                 with active_variant(self.variant):
-                    self._table = parameter_table(self.built(BuildOptions()))
+                    self._table = parameter_table(self.built(options))
             return self._table
 
     def built(self, options: BuildOptions) -> BuiltScene:
@@ -71,7 +77,8 @@ class Scene:
         keys = tuple(keys)
         if not keys:
             return replace(options, merge=True)
-        table = self.parameters()
+        # The build that most keys need anyway, so that looking them up costs nothing.
+        table = self._parameters(replace(options, real_bitmaps=True, merge=False))
         substitute = set(options.substitute)
         for key in keys:
             info = table.get(key)
@@ -81,10 +88,12 @@ class Scene:
                 raise GradientError(f"parameter {key!r} has no derivative: {info.reason}.")
             if info.substitute is not None:
                 substitute.add(info.substitute)
-        return replace(options, substitute=frozenset(substitute), merge=False)
+        return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
-        """How torch values for ``keys`` enter the built scene. Must be called inside ``active_variant(scene.variant)``."""
+        """How torch values for ``keys`` enter the built scene. Must be called inside
+        ``active_variant(scene.variant)``.
+        """
         built, wanted = self.built(options), tuple(keys)
         if wanted not in built.slots:
             built.slots[wanted] = SlotTable(built, wanted)
@@ -114,27 +123,32 @@ def unknown_key(key: str, known: list[str]) -> str:
     return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
-def load(scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, variant: str | None = None, **xml_parameters: Any) -> Scene:
+def load(
+    scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, variant: str | None = None, **xml_parameters: Any
+) -> Scene:
     """Describe a scene: the path of a Mitsuba XML file, a scene dictionary, or another :class:`Scene`.
 
-    ``variant``: a differentiable variant such as ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_spectral``; None takes the active one if it is
-    differentiable and ``llvm_ad_rgb`` otherwise, settled at the first use. ``xml_parameters`` fill the ``$name`` parameters of an XML file.
+    ``variant``: a differentiable variant such as ``llvm_ad_rgb``, ``llvm_ad_mono``, ``cuda_ad_spectral``; None takes
+    the active one if it is differentiable and ``llvm_ad_rgb`` otherwise, settled at the first use.
+    ``xml_parameters`` fill the ``$name`` parameters of an XML file.
 
-    Nothing is built yet and no variant is switched: that happens at the first use, inside the call, and the variant that was
-    active before is put back (when none was active, the scene's variant stays active). Dictionaries hold transforms as (4, 4) arrays or nested
-    lists, or as Mitsuba transforms; colours, vectors, bitmaps and tensors of Mitsuba are taken too. Scenes written for mitransient 1.x load unchanged.
-    Children of an XML scene without an id are named after their kind: ``sensor``, ``shape_0``, ``shape_1``.
+    Nothing is built yet and no variant is switched: that happens at the first use, inside the call, and the variant
+    that was active before is put back (when none was active, the scene's variant stays active). Dictionaries hold
+    transforms as (4, 4) arrays or nested lists, or as Mitsuba transforms; colours, vectors, bitmaps and tensors of
+    Mitsuba are taken too. Scenes written for mitransient 1.x load unchanged. Children of an XML scene without an id
+    are named after their kind: ``sensor``, ``shape_0``, ``shape_1``.
 
-    Raises ``SceneError`` for a missing or malformed file and for entries that cannot be described; faults inside the scene (unknown plugins, unknown or
-    unused parameters) are reported when the scene is built, with file and line where Mitsuba knows them. Raises ``VariantError`` for a variant
-    that cannot be used.
+    Raises ``SceneError`` for a missing or malformed file and for entries that cannot be described; faults inside the
+    scene (unknown plugins, unknown or unused parameters) are reported when the scene is built, with file and line
+    where Mitsuba knows them. Raises ``VariantError`` for a variant that cannot be used.
     """
     if variant is not None:
         resolve_variant(variant)
     if isinstance(scene, (str, os.PathLike)):
         return Scene(describe_xml(scene, xml_parameters), variant)
     if xml_parameters:
-        raise SceneError(f"tt.load: {', '.join(sorted(xml_parameters))} only have a meaning for XML files, got {type(scene).__name__}.")
+        names = ", ".join(sorted(xml_parameters))
+        raise SceneError(f"tt.load: {names} only have a meaning for XML files, got {type(scene).__name__}.")
     if isinstance(scene, Scene):
         return scene if variant is None or variant == scene.variant else Scene(scene._description, variant)
     if isinstance(scene, Mapping):

@@ -1,8 +1,8 @@
 """Which Mitsuba variant a call runs under, and the lock that keeps calls apart.
 
-Mitsuba's variant is a property of the process. A scene of this library is bound to one variant; every call that touches it runs inside
-:func:`active_variant`, which switches to that variant when another one is active and switches back afterwards. When no variant was active at
-all, there is nothing to go back to, and the scene's variant stays.
+Mitsuba's variant is a property of the process. A scene of this library is bound to one variant; every call that
+touches it runs inside :func:`active_variant`, which switches to that variant when another one is active and switches
+back afterwards. When no variant was active at all, there is nothing to go back to, and the scene's variant stays.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torchtransient import plugins
+from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import VariantError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -27,7 +28,8 @@ _process = {"parent_was_rendering": False}
 def _mark_fork() -> None:
     """Runs in the child of a fork: Dr.Jit's threads did not come along, and waiting for them would never end."""
     mitsuba = sys.modules.get("mitsuba")
-    if mitsuba is not None and (mitsuba.variant() or "scalar").startswith("scalar") is False:
+    active = None if mitsuba is None else mitsuba.variant()
+    if active is not None and not active.startswith("scalar"):
         _process["parent_was_rendering"] = True
 
 
@@ -39,8 +41,9 @@ def check_process() -> None:
     """Raise ``VariantError`` in a forked child whose parent had a JIT variant active."""
     if _process["parent_was_rendering"]:
         raise VariantError(
-            "this process was forked from one in which Mitsuba was already rendering, and Dr.Jit does not survive a fork. Expected a fresh "
-            "process: use multiprocessing.get_context('spawn'), or DataLoader(..., multiprocessing_context='spawn')."
+            "this process was forked from one in which Mitsuba was already rendering, and Dr.Jit does not survive a "
+            "fork. Expected a fresh process: use multiprocessing.get_context('spawn'), or DataLoader(..., "
+            "multiprocessing_context='spawn')."
         )
 
 
@@ -66,8 +69,8 @@ def resolve_variant(requested: str | None) -> str:
         )
     if not is_differentiable(requested):
         raise VariantError(
-            f"variant {requested!r} cannot be used: transient rendering compiles kernels and differentiates them. Expected one of "
-            f"{', '.join(v for v in mi.variants() if is_differentiable(v))}."
+            f"variant {requested!r} cannot be used: transient rendering compiles kernels and differentiates them. "
+            f"Expected one of {', '.join(v for v in mi.variants() if is_differentiable(v))}."
         )
     return requested
 
@@ -81,7 +84,8 @@ def device_type(variant: str) -> str:
 def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.
 
-    Another active variant is put back at the end (a switch costs some 50 ms); when none was active, ``variant`` stays. Nested calls are free.
+    Another active variant is put back at the end (a switch costs some 50 ms); when none was active, ``variant``
+    stays. Nested calls are free.
     """
     import mitsuba as mi
 
@@ -101,6 +105,8 @@ def active_variant(variant: str) -> Iterator[None]:
 def _set_variant(variant: str) -> None:
     import mitsuba as mi
 
+    if variant.startswith("llvm"):
+        ensure_llvm()
     try:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:

@@ -1,10 +1,11 @@
 """Textbook dielectric interfaces in double precision with torch's autograd: what the plugins are compared with.
 
-Written from the equations without the rearrangements that single precision needs, and without Mitsuba. Directions are rows
-``(..., 3)`` in the shading frame, pointing away from the surface. ``eta`` is the inside index over the outside one.
+Written from the equations without the rearrangements that single precision needs, and without Mitsuba. Directions
+are rows ``(..., 3)`` in the shading frame, pointing away from the surface. ``eta`` is the inside index over the
+outside one.
 
-References: Born and Wolf, Principles of Optics, section 1.5; Walter et al. 2007, Microfacet Models for Refraction through Rough
-Surfaces (the Smith masking of Beckmann is their rational fit, equation 27).
+References: Born and Wolf, Principles of Optics, section 1.5; Walter et al. 2007, Microfacet Models for Refraction
+through Rough Surfaces (the Smith masking of Beckmann is their rational fit, equation 27).
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .._registry import register
+from torchtransient.plugins._registry import register
+
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 
@@ -18,12 +19,12 @@ class DiffDielectric(mi.BSDF):
     ``int_ior``, ``ext_ior`` (number or material name), ``specular_reflectance``, ``specular_transmittance`` (textures).
     Differentiable: ``eta`` (inside over outside index) and the textures.
 
-    Derivatives. ``sample`` chooses the lobe with detached numbers and attaches the rest to ``eta`` and ``si.wi``: the
-    direction ``bs.wo``, the index ``bs.eta`` and the weight, which is the lobe's value divided by its detached probability. ``bs.pdf`` is
-    detached, as in Mitsuba's own ``dielectric``.
+    Derivatives. ``sample`` chooses the lobe with detached numbers and attaches the rest to ``eta`` and ``si.wi``:
+    the direction ``bs.wo``, the index ``bs.eta`` and the weight, which is the lobe's value divided by its detached
+    probability. ``bs.pdf`` is detached, as in Mitsuba's own ``dielectric``.
 
-    ``eta`` is marked as discontinuous: moving it moves the refracted images of edges, which needs a boundary term that no
-    integrator of this library has.
+    ``eta`` is marked as discontinuous: moving it moves the refracted images of edges, which needs a boundary term
+    that no integrator of this library has.
     """
 
     def __init__(self, props: Any) -> None:

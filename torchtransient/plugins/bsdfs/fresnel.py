@@ -1,8 +1,8 @@
 """Fresnel equations of a smooth dielectric interface, written so that values and derivatives keep their digits.
 
-The textbook amplitudes are differences of nearly equal numbers when the index approaches one, and their derivative is the
-difference of two large ones. With ``c = |cos(theta_i)|``, ``m`` the relative index in the direction of travel,
-``d = m^2 - 1`` and ``g = m cos(theta_t) = sqrt(c^2 + d)`` the differences can be taken exactly by hand:
+The textbook amplitudes are differences of nearly equal numbers when the index approaches one, and their derivative
+is the difference of two large ones. With ``c = |cos(theta_i)|``, ``m`` the relative index in the direction of
+travel, ``d = m^2 - 1`` and ``g = m cos(theta_t) = sqrt(c^2 + d)`` the differences can be taken exactly by hand:
 
     r_s = (c - g) / (c + g)           = -d / (c + g)^2
     r_p = (m^2 c - g) / (m^2 c + g)   =  d (c^2 (m^2 + 1) - 1) / (m^2 c + g)^2

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...errors import SceneError
+from torchtransient.errors import SceneError
 
 
 def relative_index(props: Any, plugin: str) -> Any:

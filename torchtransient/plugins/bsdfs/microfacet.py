@@ -44,7 +44,8 @@ def normal_density(m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
 
 
 def smith_g1_over_cos(v: Any, m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
-    """Smith's masking of direction ``v`` divided by ``|v.z|``, which stays finite as ``v`` grows parallel to the surface.
+    """Smith's masking of direction ``v`` divided by ``|v.z|``, which stays finite as ``v`` grows parallel to the
+    surface.
 
     Zero where ``v`` sees the facet ``m`` and the surface from two sides.
     """
@@ -70,8 +71,8 @@ def smith_g1_over_cos(v: Any, m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> 
 def half_vector(wi: Any, wo: Any, weight: Any) -> tuple[Any, Any]:
     """Unit vector along ``wi + weight * wo``, turned to the side of ``+z``, and the mask where it is defined.
 
-    ``weight`` is 1 for reflection and the relative index in the direction of travel for refraction. It is undefined where
-    the sum vanishes, as it does for straight transmission through an interface of index one.
+    ``weight`` is 1 for reflection and the relative index in the direction of travel for refraction. It is undefined
+    where the sum vanishes, as it does for straight transmission through an interface of index one.
     """
     h = mi.Vector3f(wi + wo * weight)
     h2 = dr.squared_norm(h)

@@ -1,7 +1,8 @@
 """Which BSDFs of a scene refract without being a delta function, and by which relative index.
 
-Next-event estimation through a rough interface needs the index of the medium that the connection runs in, which is not the one
-that the path arrived in. Mitsuba's ``BSDF.eval`` does not tell it, so it is looked up here by the BSDF's number in Dr.Jit's registry.
+Next-event estimation through a rough interface needs the index of the medium that the connection runs in, which is
+not the one that the path arrived in. Mitsuba's ``BSDF.eval`` does not tell it, so it is looked up here by the
+BSDF's number in Dr.Jit's registry.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ _NOT_AN_INTERFACE = ("Hair",)
 class RefractionTable:
     """Relative indices of the BSDFs of one scene, read anew by ``refresh`` when parameters may have changed.
 
-    Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``, ``principled``
-    with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``, ``blendbsdf``, ``normalmap``, ``bumpmap`` and in
-    shape groups. Attached where the plugin's ``eta`` (``specular`` for ``principled``) is. Delta lobes are left out: nothing connects
-    through them, and ``sample`` returns their index.
+    Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``,
+    ``principled`` with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``,
+    ``blendbsdf``, ``normalmap``, ``bumpmap`` and in shape groups. Attached where the plugin's ``eta`` (``specular``
+    for ``principled``) is. Delta lobes are left out: nothing connects through them, and ``sample`` returns their
+    index.
 
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
@@ -136,6 +138,6 @@ def _index_of(leaf: Any) -> Any:
         # Burley 2015, Extending the Disney BRDF: reflectance 0.08 * specular at normal incidence.
         return 2 / (1 - dr.sqrt(0.08 * mi.Float(params["specular"]))) - 1
     raise SceneError(
-        f"BSDF '{leaf.id()}' ({leaf.class_name()}) has a refractive lobe but no parameter 'eta'. The optical length behind it "
-        "cannot be known: expose the relative index as 'eta' in the plugin's traverse()."
+        f"BSDF '{leaf.id()}' ({leaf.class_name()}) has a refractive lobe but no parameter 'eta'. The optical "
+        "length behind it cannot be known: expose the relative index as 'eta' in the plugin's traverse()."
     )

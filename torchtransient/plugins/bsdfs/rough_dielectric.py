@@ -7,8 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ...errors import SceneError
-from .._registry import register
+from torchtransient.errors import SceneError
+from torchtransient.plugins._registry import register
+
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 from .microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
@@ -19,20 +20,23 @@ _DISTRIBUTIONS = {"ggx": True, "beckmann": False}
 class DiffRoughDielectric(mi.BSDF):
     """Rough interface between two dielectrics, parameters and values as Mitsuba's ``roughdielectric``.
 
-    ``int_ior``, ``ext_ior`` (number or material name, not equal), ``distribution`` (``beckmann`` or ``ggx``), ``alpha`` or
-    ``alpha_u`` and ``alpha_v`` (textures, clamped to 1e-3 from below), ``sample_visible``, ``specular_reflectance``,
-    ``specular_transmittance`` (textures). Differentiable: ``eta`` (inside over outside index), the roughness, the textures.
+    ``int_ior``, ``ext_ior`` (number or material name, not equal), ``distribution`` (``beckmann`` or ``ggx``),
+    ``alpha`` or ``alpha_u`` and ``alpha_v`` (textures, clamped to 1e-3 from below), ``sample_visible``,
+    ``specular_reflectance``, ``specular_transmittance`` (textures). Differentiable: ``eta`` (inside over outside
+    index), the roughness, the textures.
 
-    Derivatives. ``eval``, ``pdf`` and ``eval_pdf`` are attached to ``si.wi``, ``wo``, ``eta`` and the roughness, the half
-    vector and the Jacobian of refraction included. ``sample`` draws a detached direction ``bs.wo``; ``bs.pdf`` is its
-    attached density, ``bs.eta`` the attached index, and the weight is value over density with both attached, so that
-    ``weight * dr.relative_grad(bs.pdf)`` is the detached estimator's. A roughness at the clamp has no derivative.
+    Derivatives. ``eval``, ``pdf`` and ``eval_pdf`` are attached to ``si.wi``, ``wo``, ``eta`` and the roughness,
+    the half vector and the Jacobian of refraction included. ``sample`` draws a detached direction ``bs.wo``;
+    ``bs.pdf`` is its attached density, ``bs.eta`` the attached index, and the weight is value over density with
+    both attached, so that ``weight * dr.relative_grad(bs.pdf)`` is the detached estimator's. A roughness at the
+    clamp has no derivative.
 
-    Single precision: the half vector of a refraction keeps about ``1e-7 / |eta - 1|`` of relative accuracy. At an index of
-    exactly one the transmitted lobe is a delta function, which this plugin cannot represent: it evaluates to zero.
+    Single precision: the half vector of a refraction keeps about ``1e-7 / |eta - 1|`` of relative accuracy. At an
+    index of exactly one the transmitted lobe is a delta function, which this plugin cannot represent: it evaluates
+    to zero.
 
-    With ``sample_visible`` off, weights of ``roughdielectric`` lack the ratio of the two normal densities; here they are
-    value over density.
+    With ``sample_visible`` off, weights of ``roughdielectric`` lack the ratio of the two normal densities; here
+    they are value over density.
     """
 
     def __init__(self, props: Any) -> None:

@@ -9,8 +9,8 @@ import mitsuba as mi
 class ChannelMatch:
     """Linear map from a sample's spectrum to the film's channels, weight of the primary ray included.
 
-    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves of the ray's own wavelengths, whose
-    weights are evaluated once per ray instead of once per event.
+    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves of the ray's
+    own wavelengths, whose weights are evaluated once per ray instead of once per event.
     """
 
     def __init__(self, wavelengths, weight):

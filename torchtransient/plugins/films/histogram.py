@@ -13,7 +13,8 @@ from torchtransient.plugins.films.temporal_filter import check_stddev, make_temp
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
 # Above this many samples per pixel single precision sums lose mass: 2^16 equal terms are good to 2e-4 (5e-5 on 16-wide
-# processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double precision.
+# processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double
+# precision.
 MAX_SINGLE_PRECISION_SAMPLES = 2**16
 
 
@@ -29,18 +30,19 @@ class TransientHDRFilm(mi.Film):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
-    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is
-    ``(H, W, T, C)`` of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in
-    spectral ones); there are no alpha or weight channels. Light outside the window is not stored but counted: ``energy_before``
-    and ``energy_after`` are sums over pixels of the mean over channels. With the sum over the stored bins they make up the
-    steady image, whatever the temporal filter: what it spreads over the rim of the window counts as outside.
+    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
+    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
+    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
+    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
+    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
 
-    The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter and
-    weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the same
-    image as splatting with ``sample_border`` (which is always on here); the noise of neighbouring pixels is independent.
+    The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
+    and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
+    same image as splatting with ``sample_border`` (which is always on here); the noise of neighbouring pixels is
+    independent.
 
-    Sums are kept in single precision up to 2^16 samples per pixel (rounding at most 2e-4 of a bin, far below the noise), above
-    in double precision, which doubles the memory while rendering.
+    Sums are kept in single precision up to 2^16 samples per pixel (rounding at most 2e-4 of a bin, far below the
+    noise), above in double precision, which doubles the memory while rendering.
 
     Not supported: alpha channel, half precision.
     """
@@ -145,8 +147,8 @@ class TransientHDRFilm(mi.Film):
         rows = MAX_ARRAY_ENTRIES // per_row
         if rows < 1:
             raise StorageError(
-                f"transient_hdr_film: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} values "
-                "each exceeds 2^32 values; use fewer bins, a narrower crop or a smaller laser grid."
+                f"transient_hdr_film: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} "
+                "values each exceeds 2^32 values; use fewer bins, a narrower crop or a smaller laser grid."
             )
         return min(rows, int(self.crop_size()[1]))
 
@@ -185,6 +187,14 @@ class TransientHDRFilm(mi.Film):
         """The storage as (first row, rows, flat array) for each band."""
         return self.bands
 
+    def check_one_band(self):
+        """Raise ``StorageError`` when the cube does not fit into one tensor."""
+        if self.band_rows() < int(self.crop_size()[1]):
+            raise StorageError(
+                f"transient_hdr_film: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
+                "develop=False and read the film's transient_bands(), or use a smaller crop."
+            )
+
     def develop(self, raw: bool = False):
         """The pair (steady ``(H, W, C)``, transient ``cube_shape()``), without a copy.
 
@@ -192,10 +202,7 @@ class TransientHDRFilm(mi.Film):
         """
         if self.steady is None:
             raise SceneError("transient_hdr_film: nothing was rendered yet; call render() first.")
-        if len(self.bands) > 1:
-            raise StorageError(
-                f"transient_hdr_film: the cube {self.cube_shape()} exceeds one array; read it by transient_bands()."
-            )
+        self.check_one_band()
         shape = self.cube_shape()
         steady = mi.TensorXf(self.steady, (shape[0], shape[1], shape[-1]))
         return steady, mi.TensorXf(self.bands[0][2], shape)
@@ -251,30 +258,33 @@ class TransientHDRFilm(mi.Film):
     def put(self, cube, base, opl_from_start, value, active, laser=None):
         """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the histogram that begins at ``base``.
 
-        ``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None otherwise. Returns the
-        fractions of ``value`` that belong to bins before the window and to bins after it; they are not stored.
+        ``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
+        otherwise. Returns the fractions of ``value`` that belong to bins before the window and to bins after it; they
+        are not stored.
         """
         x = self.bin_position(opl_from_start)
         bins, channels = self.temporal_bins, self.channel_count()
         base = self.pixel_base(base, laser)
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
-        # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a bin.
+        # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a
+        # bin.
         for offset, weight, _ in taps:
             k = first + offset
-            early, late = k < 0, k >= bins
-            before += dr.select(early, weight, 0)
-            after += dr.select(late, weight, 0)
+            before += dr.select(k < 0, weight, 0)
+            after += dr.select(k >= bins, weight, 0)
+            inside = active & (k >= 0) & (k < bins)
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, active & ~early & ~late)
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active):
         """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, bin stride, channel stride)`` and ``base`` the index of the histogram's first value in it.
+        ``adjoint`` is ``(flat array, bin stride, channel stride)`` and ``base`` the index of the histogram's first
+        value in it.
         """
         flat, bin_stride, channel_stride = adjoint
         x = self.bin_position(opl_from_start)

@@ -74,7 +74,7 @@ class GaussianFilter:
     def __init__(self, stddev: float):
         check_stddev(stddev)
         self.stddev = float(stddev)
-        self.radius = int(math.ceil(CUT_STDDEVS * stddev))
+        self.radius = math.ceil(CUT_STDDEVS * stddev)
 
     def weights(self, x):
         # The cumulative distribution, rescaled such that it is exactly 0 and 1 at the cut: the weights of an

@@ -15,7 +15,8 @@ from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_fac
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
 
-# Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32 bits.
+# Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
+# bits.
 MAX_LANES = 2**26
 
 
@@ -92,8 +93,9 @@ class AdjointLane:
 class TransientIntegrator(mi.CppADIntegrator):
     """Abstract base of the transient integrators.
 
-    Parameters: ``max_depth`` (6; -1 for no limit), ``rr_depth`` (5), ``hide_emitters`` (false), ``camera_unwarp`` (false: leave out the leg from the
-    first surface to the sensor), ``discard_direct_light`` (false: leave out emission that reaches the sensor without a bounce),
+    Parameters: ``max_depth`` (6; -1 for no limit), ``rr_depth`` (5), ``hide_emitters`` (false), ``camera_unwarp``
+    (false: leave out the leg from the first surface to the sensor), ``discard_direct_light`` (false: leave out emission
+    that reaches the sensor without a bounce),
     ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
 
     Subclasses provide ``trace`` (primal), ``sweep`` (reverse mode) and ``push`` (forward mode).
@@ -153,9 +155,9 @@ class TransientIntegrator(mi.CppADIntegrator):
     def facts(self, scene) -> SceneFacts:
         """What the loops may leave out for this scene.
 
-        The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the clock. The scene
-        itself is not kept, since it owns the integrator and would never be freed; one of its shapes is, so that no later scene can be
-        taken for this one because it got the same addresses.
+        The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the
+        clock. The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes
+        is, so that no later scene can be taken for this one because it got the same addresses.
         """
         shapes = scene.shapes()
         key = (scene.ptr, *(shape.ptr for shape in shapes))
@@ -166,7 +168,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel.
 
-        Some samplers round the number of samples of a launch, so that storage bands of different heights may get different totals.
+        Some samplers round the number of samples of a launch, so that storage bands of different heights may get
+        different totals.
         """
         sampler = sensor.sampler().clone()
         if spp:
@@ -234,6 +237,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
+            if develop:
+                film.check_one_band()
             jobs, samples = self.passes(sensor, film, int(seed), int(spp))
             film.prepare(self.aov_names(), samples)
             for i, job in enumerate(jobs):
@@ -266,8 +271,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Accumulate the gradient of ``<grad_in, render()>`` into the attached parameters of the scene.
 
         ``grad_in`` is the pair (steady ``(H, W, C)`` or None, transient or None). The transient adjoint is a TensorXf
-        ``(H, W, T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
-        a copy. ``params`` is not used: parameters are found through Dr.Jit's graph.
+        ``(H, W, T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any
+        layout without a copy. ``params`` is not used: parameters are found through Dr.Jit's graph.
 
         Raises GradientError when a path length can change and the temporal filter has no slope, or without a bound on
         the depth.
@@ -281,9 +286,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             jobs, _ = self.passes(sensor, film, int(seed), int(spp))
-            for job in jobs:
-                self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
-                dr.eval()
+            # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
+            # edges, and the first pass would be the only one to arrive.
+            with dr.isolate_grad():
+                for job in jobs:
+                    self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
+                    dr.eval()
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
@@ -308,10 +316,11 @@ class TransientIntegrator(mi.CppADIntegrator):
                     objective += a_first * length_to_sensor_origin(sensor, ray)
                 dr.backward_from(objective)
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
 
-        One pass over the samples for one tangent. ``params`` is not used. Errors as in :meth:`render_backward`.
+        One pass over the samples for one tangent. ``params`` is not used; with ``develop=False`` the
+        result stays in the film. Errors as in :meth:`render_backward`.
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
@@ -325,7 +334,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 self._forward_pass(scene, sensor, film, job, facts)
                 dr.eval(film.bands[job.band][2], film.steady)
             film.settle()
-            return film.develop()
+            return film.develop() if develop else None
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)

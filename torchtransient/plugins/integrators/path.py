@@ -17,15 +17,17 @@ from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 class TransientPath(TransientIntegrator):
     r"""Time-resolved path tracer (:monosp:`transient_path`).
 
-    Next-event estimation with multiple importance sampling over surfaces; monochromatic, RGB and spectral variants. Parameters
-    as in :class:`TransientIntegrator`. The optical path length is counted from the sensor's origin, segment by segment between hit points, each times
-    the index of refraction it runs through; light from environment and directional emitters arrives as plane waves that leave the sphere around
-    the scene at t = 0 (see ``plugins/sampling/distant.py``).
+    Next-event estimation with multiple importance sampling over surfaces; monochromatic, RGB and spectral variants.
+    Parameters as in :class:`TransientIntegrator`. The optical path length is counted from the sensor's origin, segment
+    by segment between hit points, each times the index of refraction it runs through; light from environment and
+    directional emitters arrives as plane waves that leave the sphere around the scene at t = 0 (see
+    ``plugins/sampling/distant.py``).
 
-    Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries tangents along; both
-    include the time of flight. Visibility changes are not differentiated (no boundary term).
+    Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
+    tangents along; both include the time of flight. Visibility changes are not differentiated (no boundary term).
 
-    Not supported: participating media (they are passed through as if empty: the layer refuses such scenes), polarization.
+    Not supported: participating media (they are passed through as if empty: the layer refuses such scenes),
+    polarization.
     """
 
     def __init__(self, props):
@@ -36,8 +38,8 @@ class TransientPath(TransientIntegrator):
     def trace(self, scene, sampler, ray, first_opl, lane, facts=None, record=False):
         """Trace the paths of one pass.
 
-        Primal: every event is put on ``lane``; returns the sums (steady radiance, energy before, energy after the window).
-        With ``record=True`` nothing is written to the film: the path goes to thread-local memory and
+        Primal: every event is put on ``lane``; returns the sums (steady radiance, energy before, energy after the
+        window). With ``record=True`` nothing is written to the film: the path goes to thread-local memory and
         ``(number of vertices, record)`` comes back.
         """
         primal = not record
@@ -138,7 +140,8 @@ class TransientPath(TransientIntegrator):
             if dr.hint(primal, mode="scalar"):
                 active_next &= β_max != 0
             else:
-                # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black surface.
+                # The derivative of a product with one factor of zero needs the light beyond it: go on past the first
+                # black surface.
                 weight_max = dr.max(mi.unpolarized_spectrum(bsdf_weight))
                 first_black = (weight_max == 0) & (dr.max(β_before) > 0) & (bs.pdf > 0)
                 active_next &= (weight_max > 0) | first_black

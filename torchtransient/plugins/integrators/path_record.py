@@ -1,6 +1,7 @@
 """The record of a path in thread-local memory: what the reverse sweep cannot recompute cheaply.
 
-Its size is per lane in flight, not per path, and it lives in the kernel's stack: global memory does not grow with the depth.
+Its size is per lane in flight, not per path, and it lives in the kernel's stack: global memory does not grow with the
+depth.
 """
 
 from __future__ import annotations

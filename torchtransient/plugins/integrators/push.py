@@ -1,7 +1,9 @@
 """Forward mode: walk the recorded path once more and carry its tangents along.
 
-``d_beta`` and ``d_tau`` are the derivatives of throughput and optical path length before the current vertex; every event splats
-``k df + f k' dtau``. The rules at a vertex are those of the reverse sweep, so both modes agree to rounding for one seed.
+``d_beta`` and ``d_tau`` are the derivatives of throughput and optical path length before the current vertex; every
+event splats
+``k df + f k' dtau``. The rules at a vertex are those of the reverse sweep, so both modes agree to rounding for one
+seed.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ def tangents(values):
 def vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, t_ray, t_w):
     """The terms of a vertex, detached, and their tangents in the order of ``values``.
 
-    Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind, which
-    the next traversal would run into.
+    Everything attached dies on return: a variable that outlived this call would leave an edge of Dr.Jit's graph behind,
+    which the next traversal would run into.
     """
     with dr.resume_grad():
         ray, _, _, w = attach_ray(v, facts, t_ray, t_w)

@@ -14,9 +14,10 @@ from torchtransient.plugins.sampling.distant import DistantReference
 class SceneFacts:
     """Static choices of the kernels.
 
-    ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups. ``distant``: reference sphere of infinitely distant
-    emitters, None when there are none. ``refraction``: table of the indices of transmissive rough BSDFs, None when there are none. The remaining ones
-    describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
+    ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups. ``distant``: reference sphere of
+    infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
+    BSDFs, None when there are none. The remaining ones describe which gradients are asked for: ``geometry`` (path
+    lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
     spherical ones), ``sensor_moves``,
     ``index_moves``.
 
@@ -82,13 +83,14 @@ class SceneFacts:
         return facts
 
 
-# Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself. Those of the others
-# (Mitsuba's dielectric and mask, ours) divide by the detached probability.
+# Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
+# Those of the others (Mitsuba's dielectric and mask, ours) divide by the detached probability.
 _CANCELLING = ("ThinDielectric", "SmoothPlastic")
 
 
 def lobe_probability_table(scene):
-    """Which BSDFs, by their number in Dr.Jit's registry, hide the derivative of their lobes' probability; None if none does.
+    """Which BSDFs, by their number in Dr.Jit's registry, hide the derivative of their lobes' probability; None if none
+    does.
 
     Inside ``mask`` the opacity hides in the same place and is attached already; such nested lobes are left as they are.
     """

@@ -1,11 +1,13 @@
 """Reverse mode: walk the recorded path backwards and hand every vertex the light beyond it.
 
-With the adjoint ``A(tau)`` of the film and its slope ``A'(tau)``, two suffixes are carried, per unit throughput at the vertex:
+With the adjoint ``A(tau)`` of the film and its slope ``A'(tau)``, two suffixes are carried, per unit throughput at the
+vertex:
 
     S_i = sum of A f  over the events at and beyond vertex i,      D_i = sum of A' f over the same events,
 
-so that ``dLoss = beta_i (A df + A' f dtau + dW S + W D dtau)`` at every vertex. Nothing is divided by a BSDF value: a zero albedo has its right
-gradient. Where a delta lobe determines the next ray, the adjoint of that ray (origin, direction) is handed back to the vertex that sent it.
+so that ``dLoss = beta_i (A df + A' f dtau + dW S + W D dtau)`` at every vertex. Nothing is divided by a BSDF value: a
+zero albedo has its right gradient. Where a delta lobe determines the next ray, the adjoint of that ray (origin,
+direction) is handed back to the vertex that sent it.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ def led_to(store, k, active, facts):
 
 @dr.syntax
 def sweep(integrator, scene, count, store, lane, facts, ray0):
-    """Accumulate gradients of the recorded paths; returns the adjoint (origin, direction, first length) of the primary ray.
+    """Accumulate gradients of the recorded paths; returns the adjoint (origin, direction, first length) of the primary
+    ray.
 
     ``count`` is the number of recorded vertices and ``store`` the record. Must run with gradients suspended.
     """

@@ -1,10 +1,10 @@
 """The attached physics of one vertex, shared by reverse and forward mode.
 
-:func:`vertex_terms` re-evaluates what happens at a recorded vertex with derivatives: emission, next-event estimation, scattering and the
-lengths of the segments around it. The sampled path is held fixed in this sense: a vertex slides along the ray that found it when its surface
-moves, and against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on
-light sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray, that
-ray itself is attached.
+:func:`vertex_terms` re-evaluates what happens at a recorded vertex with derivatives: emission, next-event estimation,
+scattering and the lengths of the segments around it. The sampled path is held fixed in this sense: a vertex slides
+along the ray that found it when its surface moves, and against the next vertex it moves as if that one were nailed
+down, with the change of solid angle counted. Points on light sources whose shape moves are material points: they follow
+the shape. Where a delta lobe determines the next ray, that ray itself is attached.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
         p = dr.replace_grad(p, dr.select(at_point, moving.p, dr.detach(moving.p)))
     cone = mi.Bool(False)
     if facts.sphere_lights:
-        # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A sphere is
-        # sampled over the cone that it fills, which moves with it, and by this strategy alone.
+        # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
+        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone.
         cone = surface & is_sphere(ds.emitter)
         surface &= ~cone
         ds_cone, weight_cone = scene.sample_emitter_direction(si, v.u_em, False, cone)
@@ -133,7 +133,8 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     ``led_here``: the vertex was found by the sensor or by a delta lobe, so that emission there has no other strategy.
 
     ``nxt`` is the next vertex: ``p, n, d, valid`` detached and, where emitter shapes move, its ``vertex``. Returns
-    :class:`Terms` with ``si, Le, f, length_em, index_em, W, seg, seg_out, out, step, onward, mirrored`` and, for delta lobes, ``p_out, d_out``.
+    :class:`Terms` with ``si, Le, f, length_em, index_em, W, seg, seg_out, out, step, onward, mirrored`` and, for delta
+    lobes, ``p_out, d_out``.
     """
     terms = Terms()
     terms.onward = onward = v.goes_on & ~v.is_delta
@@ -185,8 +186,8 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
 def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
     """Emission found by BSDF sampling on a shape that moves: ``terms.E`` (per unit throughput), ``terms.length_E``.
 
-    The light's point is a material point here, as it is for next-event estimation: both strategies must move their samples
-    alike, or the weights between them would no longer sum to one under the motion.
+    The light's point is a material point here, as it is for next-event estimation: both strategies must move their
+    samples alike, or the weights between them would no longer sum to one under the motion.
     """
     lit = terms.ahead & (nxt.vertex.mis > 0)
     if facts.sphere_lights:

@@ -1,8 +1,8 @@
 """Arrival time of light from infinitely distant emitters.
 
-Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches the sphere around
-the scene: the plane with normal ``d`` (towards the light) at ``center + radius d``. A point ``x`` is reached
-after ``radius - dot(x - center, d)``, which a plane wave demands and which no choice of path can change.
+Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches
+the sphere around the scene: the plane with normal ``d`` (towards the light) at ``center + radius d``. A point ``x`` is
+reached after ``radius - dot(x - center, d)``, which a plane wave demands and which no choice of path can change.
 """
 
 from __future__ import annotations
@@ -24,7 +24,14 @@ class DistantReference:
 
 def distant_reference(scene) -> DistantReference:
     """The sphere around all shapes of ``scene``."""
-    box = scene.bbox()
+    box = mi.ScalarBoundingBox3f()
+    for shape in scene.shapes():
+        bounds = shape.bbox()
+        if not bounds.valid() and isinstance(shape, mi.Mesh):
+            # Mitsuba leaves out the bounds of a mesh that it merged from rectangles, and the scene's bounds lack it.
+            shape.recompute_bbox()
+            bounds = shape.bbox()
+        box.expand(bounds)
     if not box.valid():
         return DistantReference((0.0, 0.0, 0.0), 0.0)
     sphere = box.bounding_sphere()

@@ -10,8 +10,8 @@ import mitsuba as mi
 def behind_area_lights(scene, ray, pi):
     """The first hit along ``ray`` at or behind ``pi`` that is not an area light.
 
-    Each search starts on the ray itself and distances stay those from ``ray.o``: an origin lifted off the light along its normal would
-    land the hit beside the ray, at a wrong distance.
+    Each search starts on the ray itself and distances stay those from ``ray.o``: an origin lifted off the light along
+    its normal would land the hit beside the ray, at a wrong distance.
     """
     pi = mi.PreliminaryIntersection3f(pi)
     lit = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (a Dr.Jit comparison)

@@ -9,8 +9,9 @@ import mitsuba as mi
 def length_to_sensor_origin(sensor, ray):
     """Distance in metres from the sensor's origin to ``ray.o``.
 
-    Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole (perspective), to the
-    sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Other sensors start rays where they are.
+    Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole
+    (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Other sensors
+    start rays where they are.
     """
     near = getattr(sensor, "near_clip", None)
     if near is None:

@@ -1,0 +1,207 @@
+"""The command line: results, messages, exit status."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+import torchtransient as tt
+from torchtransient.cli.main import COMMANDS, main
+from torchtransient.data.result_file import read_result
+
+SCENE = """<scene version="3.0.0">
+  <default name="res" value="8"/>
+  <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="transient_hdr_film">
+      <integer name="width" value="$res"/><integer name="height" value="$res"/>
+      <integer name="temporal_bins" value="40"/>
+      <float name="start_opl" value="3"/><float name="bin_width_opl" value="0.2"/>
+    </film>
+    <sampler type="independent"><integer name="sample_count" value="16"/></sampler>
+  </sensor>
+  <bsdf type="diffuse" id="grey"><rgb name="reflectance" value="0.5"/></bsdf>
+  <shape type="rectangle"><ref id="grey"/></shape>
+  <emitter type="point" id="lamp"><point name="position" x="0" y="1" z="3"/><rgb name="intensity" value="5"/></emitter>
+</scene>"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box.xml").write_text(SCENE, encoding="utf-8")
+    return tmp_path
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+def test_render_writes_what_the_library_renders(folder, ending):
+    result = run("render", "box.xml", "-o", f"out.{ending}", "--overview", "out.png", "--seed", 3, "--quiet")
+    assert result.exit_code == 0, result.output
+    stored = read_result(folder / f"out.{ending}")
+    expected = tt.render("box.xml", seed=3)
+    assert torch.equal(stored.transient, expected.transient)
+    assert torch.equal(stored.steady, expected.steady)
+    assert stored.axis == tt.TimeAxis(3.0, 0.2, 40)
+    assert stored.metadata["stats"]["spp"] == 16
+    assert (folder / "out.png").read_bytes()[:4] == b"\x89PNG"
+    assert f"out.{ending}: 3 x 40 x 8 x 8" in result.stdout
+
+
+def test_options_of_render(folder):
+    options = (
+        "--param",
+        "res=6",
+        "--spp",
+        4,
+        "--set",
+        "grey.reflectance.value=0.1,0.2,0.4",
+        "--variant",
+        "llvm_ad_rgb",
+    )
+    axis = ("--start-opl", 4, "--bin-width-opl", 0.5, "--num-bins", 8, "--temporal-filter", "tent", "--max-depth", 2)
+    result = run("render", "box.xml", *options, *axis, "--quiet")
+    assert result.exit_code == 0, result.output
+    stored = read_result(folder / "box.h5")
+    expected = tt.render(
+        tt.load("box.xml", res=6),
+        {"grey.reflectance.value": torch.tensor([0.1, 0.2, 0.4])},
+        spp=4,
+        seed=0,
+        time_axis=tt.TimeAxis(4.0, 0.5, 8),
+        temporal_filter="tent",
+        max_depth=2,
+    )
+    assert stored.transient.shape == (3, 8, 6, 6)
+    assert torch.equal(stored.transient, expected.transient)
+    assert stored.metadata["set"] == ["grey.reflectance.value=0.1,0.2,0.4"]
+
+
+def test_light_outside_of_the_axis_is_reported(folder):
+    axis = ("--start-opl", 0, "--bin-width-opl", 0.5, "--num-bins", 2)
+    result = run("render", "box.xml", *axis, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "misses light: 0.0% arrives before it and 100.0% after it" in result.stdout
+    assert "misses" not in run("render", "box.xml", "--quiet").stdout
+
+
+def test_list_of_parameters(folder):
+    result = run("render", "box.xml", "--list-parameters")
+    assert result.exit_code == 0, result.output
+    assert "grey.reflectance.value" in result.stdout
+    assert not (folder / "box.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("missing.xml",), "missing.xml"),
+        (("broken.xml",), "line 2"),
+        (("unknown.xml",), "no_such_film"),
+        (("box.xml", "--param", "resx=3"), "resx"),
+        (("box.xml", "--set", "gray.reflectance.value=0.1"), "Did you mean 'grey.reflectance.value'"),
+        (("box.xml", "--set", "grey.reflectance.value=0.1"), "expected shape (3,)"),
+        (("box.xml", "--variant", "scalar_rgb"), "llvm_ad_rgb"),
+        (("box.xml", "--sensor", "2"), "sensors"),
+        (("box.xml", "--param", "res=60000", "--quiet"), "TiB"),
+        (("box.xml", "-o", "out.exr"), ".npz"),
+        (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),
+        (("box.xml", "--overview", "nowhere/out.png"), "'nowhere' does not exist"),
+        (("box.xml", "--overview", "out.docx"), ".png"),
+        (("box.xml", "--start-opl", "0", "--bin-width-opl", "-1", "--num-bins", "3"), "bin_width_opl > 0"),
+    ],
+)
+def test_errors_are_one_message_and_status_2(folder, arguments, message):
+    (folder / "broken.xml").write_text("<scene version='3.0.0'>\n<film", encoding="utf-8")
+    unknown = SCENE.replace("transient_hdr_film", "no_such_film")
+    (folder / "unknown.xml").write_text(unknown, encoding="utf-8")
+    result = run("render", *arguments)
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr
+    assert "error: " in result.stderr
+    assert "Traceback" not in result.stderr
+    assert isinstance(result.exception, SystemExit)
+    assert not list(folder.glob("*.h5"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("render", "box.xml", "--num-bins", "3"), "give all"),
+        (("render", "box.xml", "--param", "res"), "NAME=VALUE"),
+        (("render", "box.xml", "--param", "res=1", "--param", "res=2"), "given twice"),
+        (("render", "box.xml", "--set", "a=b"), "expected a number"),
+        (("cost", "box.xml", "--spp", "4,x"), "expected whole numbers"),
+        (("polish",), "No such command"),
+    ],
+)
+def test_usage_errors(folder, arguments, message):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_debug_shows_where_an_error_comes_from(folder):
+    result = run("--debug", "render", "missing.xml")
+    assert isinstance(result.exception, tt.errors.SceneError)
+
+
+def test_cost(folder):
+    result = run(
+        "cost", "box.xml", "--spp", "4,8", "--repeats", 2, "--gradient", "grey.reflectance.value", "--sampler",
+        "independent", "--plot", "cost.png", "--json", "cost.json", "--quiet",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    points = json.loads((folder / "cost.json").read_text(encoding="utf-8"))["points"]
+    assert {p["spp"] for p in points} == {4, 8}
+    assert len({p["quantity"] for p in points}) == 2
+    assert all(p["seconds"] > 0 and p["squared_error"] > 0 for p in points)
+    assert "grey.reflectance.value" in result.stdout
+    assert (folder / "cost.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_demo_finds_the_colour(folder):
+    result = run("demo", "--resolution", 32, "--spp", 16, "--steps", 25)
+    assert result.exit_code == 0, result.output
+    rows = [line.split() for line in result.stdout.splitlines() if line.split()[:1] in (["red"], ["green"], ["blue"])]
+    assert len(rows) == 3
+    for _name, start, found, truth in rows:
+        assert abs(float(found) - float(truth)) < 0.03
+        assert abs(float(start) - float(truth)) > 0.15
+    for name in ("cornell_box.png", "fit.png"):
+        assert (folder / "demo_output" / name).read_bytes()[:4] == b"\x89PNG"
+    assert read_result(folder / "demo_output" / "cornell_box.npz").transient.shape == (3, 100, 32, 32)
+    assert str(folder / "demo_output") in result.stdout
+
+
+def test_demo_where_nothing_can_be_written(folder):
+    (folder / "file").write_text("", encoding="utf-8")
+    result = run("demo", "-o", "file/inside")
+    assert result.exit_code == 2
+    assert "cannot be made" in result.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command(name):
+    result = run(name, "--help")
+    assert result.exit_code == 0
+    assert "Usage" in result.stdout
+
+
+def test_help_needs_no_torch():
+    code = "import sys\nfrom torchtransient.cli.main import main\n"
+    code += "try:\n    main(['--help'])\nexcept SystemExit as stop:\n    assert not stop.code\n"
+    code += "assert not {'torch', 'matplotlib', 'h5py'} & set(sys.modules), 'heavy'"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ)
+    assert result.returncode == 0, result.stderr
+    assert "doctor" in result.stdout

@@ -1,0 +1,68 @@
+"""The doctor: fine here; with a bad LLVM or a process that dies, it says so and its status is not 0."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from torchtransient import _llvm
+from torchtransient.cli import doctor
+from torchtransient.cli.main import main
+
+
+def test_everything_is_fine_here():
+    result = CliRunner().invoke(main, ["doctor"])
+    assert result.exit_code == 0, result.output
+    assert f"LLVM {_llvm.ensure_llvm().version[0]}" in result.stdout
+    assert "renders and differentiates" in result.stdout
+    assert "problem" not in result.stdout
+
+
+def test_a_users_bad_choice_of_llvm(tmp_path):
+    environment = {**os.environ, _llvm.VARIABLE: str(tmp_path / "libLLVM.so")}
+    code = "from torchtransient.cli.main import main; main(['doctor'])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=environment)
+    assert result.returncode == 1
+    assert f"'{tmp_path / 'libLLVM.so'}', which does not exist" in result.stdout
+    assert "pip install" in result.stdout
+    assert "not tried" in result.stdout
+    assert "1 problem found" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("import os; os.abort()", "the process was ended by SIGABRT"),
+        ("raise SystemExit('the image sums to nan')", "failed: the image sums to nan"),
+    ],
+)
+def test_a_probe_that_fails(monkeypatch, code, message):
+    monkeypatch.setattr(doctor, "_RENDER", code)
+    finding = doctor.probe("llvm_ad_rgb")
+    assert finding.state == "problem"
+    assert message in finding.text
+
+
+def test_a_probe_that_hangs(monkeypatch):
+    monkeypatch.setattr(doctor, "_RENDER", "import time; time.sleep(60)")
+    monkeypatch.setattr(doctor, "_TIMEOUT_S", 0.5)
+    assert "no answer" in doctor.probe("llvm_ad_rgb").text
+
+
+def test_what_programs_get_that_import_mitsuba_alone(monkeypatch):
+    monkeypatch.setattr(doctor, "_PLAIN", "print('15.0.6')")
+    state = [(f.state, f.text) for f in doctor.llvm()]
+    assert state[0][0] == "ok"
+    assert state[1][0] == "note"
+    assert "gets LLVM 15.0.6. Import torchtransient first" in state[1][1]
+
+
+def test_a_missing_package(monkeypatch):
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name in ("kornia", "h5py") else "1.0")
+    found = {f.subject: f for f in doctor.versions()}
+    assert (found["kornia"].state, found["h5py"].state, found["torch"].state) == ("problem", "note", "ok")
+    assert "torchtransient[data]" in found["h5py"].text

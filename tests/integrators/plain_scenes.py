@@ -1,0 +1,52 @@
+"""Cameras, loading and comparisons for the tests of `transient_path`."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from torchtransient import plugins
+from torchtransient.testing.statistics import two_sample_z_test
+
+
+def T():
+    return mi.ScalarTransform4f()
+
+
+def camera(
+    width=8, height=6, start=0.0, bins=200, bin_width=0.05, fov=30.0, origin=(0, 0, 4), transient=True, **arguments
+):
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    if transient:
+        film |= {"type": "transient_hdr_film", "temporal_bins": bins, "bin_width_opl": bin_width, "start_opl": start}
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "near_clip": 0.1,
+        "film": film,
+        "to_world": T().look_at(origin=list(origin), target=[origin[0], origin[1], 0], up=[0, 1, 0]),
+        **arguments,
+    }
+
+
+def load(sensor, objects, integrator="transient_path", **arguments):
+    with plugins.plugin_errors():
+        node = {"type": integrator, **({"max_depth": 4} | arguments)}
+        return mi.load_dict({"type": "scene", "integrator": node, "sensor": sensor, **objects})
+
+
+def runs(scene, count=6, spp=64, seed=0):
+    results = [scene.integrator().render(scene, seed=seed + k, spp=spp) for k in range(count)]
+    return [np.array([np.array(r[i]) for r in results], dtype=float) for i in (0, 1)]
+
+
+def mitsuba_runs(sensor, objects, count=6, spp=64, **arguments):
+    scene = load(sensor, objects, "path", **arguments)
+    images = np.array([np.array(mi.render(scene, seed=700 + k, spp=spp)) for k in range(count)], dtype=float)
+    return images[..., :1] if mi.is_monochromatic else images
+
+
+def check(a, b):
+    result = two_sample_z_test(a, b, rounding=1e-5)
+    assert result.passed, str(result)
+    assert result.chi2_z < 4.5, str(result)  # equal channels make it small

@@ -1,0 +1,245 @@
+"""`transient_hdr_film` by itself: how arrivals spread over bins, how the adjoint reads them back, parameters and
+layout.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from torchtransient import plugins
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.plugins.films.temporal_filter import make_temporal_filter
+
+FILTERS = [("box", 0.5), ("tent", 0.5), ("gaussian", 0.2), ("gaussian", 0.5), ("gaussian", 1.3), ("gaussian", 3.0)]
+BINS, WIDTH, START = 40, 0.25, 2.0
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+
+
+def make_film(**arguments):
+    description = {
+        "type": "transient_hdr_film",
+        "width": 1,
+        "height": 1,
+        "rfilter": {"type": "box"},
+        "temporal_bins": BINS,
+        "bin_width_opl": WIDTH,
+        "start_opl": START,
+        **arguments,
+    }
+    with plugins.plugin_errors():
+        return mi.load_dict(description)
+
+
+def exact_weights(name, stddev, x):
+    """Weight of every bin (rows) for arrivals ``x`` in bins, in double precision."""
+    edges = np.arange(BINS + 1)[:, None]
+    u = edges - x[None]
+    if name == "box":
+        return ((u[:-1] <= 0) & (u[1:] > 0)).astype(float)
+    if name == "tent":
+        return np.maximum(0, 1 - np.abs(u[:-1] + 0.5))
+    limit = 4 * stddev
+    cdf = 0.5 + 0.5 * erf(np.clip(u, -limit, limit) / (stddev * np.sqrt(2))) / erf(4 / np.sqrt(2))
+    return np.diff(cdf, axis=0)
+
+
+def put_each(film, x, value=1.0):
+    """Every arrival ``x`` (in bins) in a pixel of its own: histograms (n, T, C) and the fractions before and after."""
+    n, channels = len(x), film.channel_count()
+    cube = dr.zeros(mi.Float, n * film.entries_per_pixel())
+    base = dr.arange(mi.UInt32, n) * film.entries_per_pixel()
+    before, after = film.put(cube, base, mi.Float64(x * WIDTH), [mi.Float(value)] * channels, mi.Bool(True))
+    return np.array(cube, dtype=float).reshape(n, BINS, channels), np.array(before), np.array(after)
+
+
+def arrivals(n=400, margin=16.0):
+    return np.random.default_rng(5).uniform(-margin, BINS + margin, n)
+
+
+@pytest.mark.parametrize("name, stddev", FILTERS)
+def test_weights_are_those_of_the_filter(name, stddev):
+    x = arrivals()
+    cube, _, _ = put_each(make_film(temporal_filter=name, gaussian_stddev=stddev), x)
+    # erf in single precision
+    np.testing.assert_allclose(cube, np.repeat(exact_weights(name, stddev, x).T[..., None], 3, -1), atol=5e-7)
+
+
+@pytest.mark.parametrize("name, stddev", FILTERS)
+def test_stored_and_lost_make_one(name, stddev):
+    cube, before, after = put_each(make_film(temporal_filter=name, gaussian_stddev=stddev), arrivals())
+    np.testing.assert_allclose(cube.sum(1) + (before + after)[:, None], 1, atol=1e-6)
+    deep = (arrivals() > 12) & (arrivals() < BINS - 12)
+    assert deep.sum() > 50 and np.all(before[deep] == 0) and np.all(after[deep] == 0)
+    early, late = arrivals() < -13, arrivals() > BINS + 13
+    assert early.any() and late.any()
+    np.testing.assert_allclose(before[early], 1, atol=1e-6)
+    np.testing.assert_allclose(after[late], 1, atol=1e-6)
+    assert np.all(cube[early | late] == 0)
+
+
+@pytest.mark.parametrize("layout", ["film", "channels first"])
+@pytest.mark.parametrize("name, stddev", FILTERS)
+def test_read_is_the_transpose_of_put(name, stddev, layout):
+    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
+    rng = np.random.default_rng(1)
+    n, pixels = 700, 5
+    x, pixel = rng.uniform(-8, BINS + 8, n), rng.integers(0, pixels, n)
+    value, g = rng.normal(size=(3, n)), rng.normal(size=(pixels, BINS, 3))
+    active = mi.Bool(rng.random(n) > 0.1)
+    opl = mi.Float64(x * WIDTH)
+    cube = dr.zeros(mi.Float, pixels * BINS * 3)
+    film.put(cube, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
+    if layout == "film":
+        adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (BINS * 3)
+    else:  # (C, T, pixels), as a torch gradient comes
+        adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, BINS * pixels), mi.UInt32(pixel)
+    A, _ = film.read(adjoint, base, opl, active)
+    stored = np.array(cube, dtype=float).reshape(g.shape)
+    read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
+    scale = np.abs(stored * g).sum()
+    assert abs((stored * g).sum() - read) < 1e-6 * scale
+
+
+@pytest.mark.parametrize("name, stddev", [f for f in FILTERS if f[0] != "box"])
+def test_slope_is_the_derivative_of_what_is_read(name, stddev):
+    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
+    rng = np.random.default_rng(2)
+    x, h = rng.uniform(-4, BINS + 4, 600), 0.02
+    # away from the kinks of the tent
+    x = x[np.abs((x - 0.5) % 1.0 - 0.5) < 0.5 - 1.5 * h]
+    adjoint = (mi.Float(rng.normal(size=BINS * 3)), 3, 1)
+
+    def read(shift):
+        A, slope = film.read(adjoint, mi.UInt32(0), mi.Float64((x + shift) * WIDTH), mi.Bool(True))
+        return [np.array(v, dtype=float) for v in A], [np.array(v, dtype=float) for v in slope]
+
+    _, slope = read(0)
+    near, far = [
+        [(a - b) / (2 * s * h * WIDTH) for a, b in zip(read(s * h)[0], read(-s * h)[0], strict=True)] for s in (0.5, 1)
+    ]
+    for c in range(3):
+        # the cut of the gaussian at four standard deviations is a kink of exp(-8) of its height
+        np.testing.assert_allclose(slope[c], (4 * near[c] - far[c]) / 3, atol=2e-3 * np.abs(slope[c]).max())
+
+
+def test_box_reads_no_slope():
+    film = make_film()
+    _, slope = film.read((mi.Float(np.arange(BINS * 3)), 3, 1), mi.UInt32(0), mi.Float64(1.1), mi.Bool(True))
+    assert all(np.all(np.array(s) == 0) for s in slope)
+
+
+@pytest.mark.parametrize("name, stddev", [f for f in FILTERS if f[0] != "box"])
+def test_forward_splat_is_the_transpose_of_value_and_slope(name, stddev):
+    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
+    rng = np.random.default_rng(3)
+    n = 300
+    opl, active = mi.Float64(rng.uniform(-4, BINS + 4, n) * WIDTH), mi.Bool(True)
+    df, f_dtau, g = rng.normal(size=(3, n)), rng.normal(size=(3, n)), rng.normal(size=BINS * 3)
+    cube = dr.zeros(mi.Float, BINS * 3)
+    film.put_slope(cube, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in f_dtau], active)
+    A, slope = film.read((mi.Float(g), 3, 1), mi.UInt32(0), opl, active)
+    read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * f_dtau[c]).sum(dtype=float) for c in range(3))
+    stored = np.array(cube, dtype=float)
+    assert abs(stored @ g - read) < 1e-5 * np.abs(stored * g).sum()
+
+
+def test_exhaustive_layout():
+    film = make_film(width=3, height=2, exhaustive_scan=True, laser_scan_width=4, laser_scan_height=5)
+    assert film.cube_shape() == (2, 3, 5, 4, BINS, 3)
+    film.prepare()
+    row, column, laser_row, laser_column, k = 1, 2, 3, 1, 17
+    base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
+    value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
+    flat = film.bands[0][2]
+    film.put(
+        flat, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
+    )
+    steady, transient = film.develop()
+    assert steady.shape == (2, 3, 3)
+    cube = np.array(transient)
+    np.testing.assert_array_equal(cube[row, column, laser_row, laser_column, k], [1, 2, 3])
+    assert cube.sum() == 6
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ({"temporal_bins": 0}, "temporal_bins"),
+        ({"bin_width_opl": 0.0}, "bin_width_opl"),
+        ({"bin_width_opl": -1.0}, "bin_width_opl"),
+        ({"bin_width_opl": float("inf")}, "bin_width_opl"),
+        ({"start_opl": float("nan")}, "start_opl"),
+        ({"temporal_filter": "triangle"}, "box, tent, gaussian"),
+        ({"temporal_filter": "gaussian", "gaussian_stddev": 0.0}, "gaussian_stddev"),
+        ({"gaussian_stddev": -2.0}, "gaussian_stddev"),
+        ({"exhaustive_scan": True}, "laser_scan_width"),
+        ({"laser_scan_width": 4}, "exhaustive_scan"),
+    ],
+)
+def test_bad_parameters(arguments, words):
+    with pytest.raises(SceneError, match=words):
+        make_film(**arguments)
+
+
+def test_unknown_parameter_is_reported():
+    with pytest.raises(RuntimeError, match="temporal_binz"):
+        mi.load_dict({"type": "transient_hdr_film", "temporal_binz": 3})
+
+
+def test_nothing_rendered_yet():
+    with pytest.raises(SceneError, match="render"):
+        make_film().develop()
+
+
+def test_no_arbitrary_outputs_and_no_polarization():
+    with pytest.raises(SceneError, match="albedo"):
+        make_film().prepare(["albedo"])
+    with mi.variant_context("llvm_ad_mono_polarized"):
+        plugins.sync()
+        with pytest.raises(SceneError, match="polarized"):
+            make_film().prepare()
+
+
+def test_row_too_large(monkeypatch):
+    monkeypatch.setattr("torchtransient.plugins.films.histogram.MAX_ARRAY_ENTRIES", 100)
+    with pytest.raises(StorageError, match="fewer bins"):
+        make_film().prepare()
+
+
+def test_filter_follows_its_settings():
+    film = make_film(temporal_filter="gaussian", gaussian_stddev=0.5)
+    x = np.array([20.3])
+    film.gaussian_stddev = 2.0
+    np.testing.assert_allclose(put_each(film, x)[0][0, :, 0], exact_weights("gaussian", 2.0, x)[:, 0], atol=5e-7)
+    film.temporal_filter = "tent"
+    np.testing.assert_allclose(put_each(film, x)[0][0, :, 0], exact_weights("tent", 2.0, x)[:, 0], atol=5e-7)
+    with pytest.raises(SceneError, match="expected one of"):
+        film.temporal_filter = "none"
+    with pytest.raises(SceneError, match="positive"):
+        film.gaussian_stddev = 0.0
+    assert film.temporal_filter == "tent"
+
+
+@pytest.mark.parametrize("variant, channels", [("llvm_ad_mono", 1), ("llvm_ad_rgb", 3), ("llvm_ad_spectral", 3)])
+def test_channels_of_the_variant(variant, channels):
+    mi.set_variant(variant)
+    plugins.sync()
+    film = make_film(width=5, height=4, crop_width=3, crop_height=2, crop_offset_x=1)
+    assert film.prepare() == channels
+    steady, transient = film.develop()
+    assert steady.shape == (2, 3, channels) and transient.shape == (2, 3, BINS, channels)
+    assert "temporal_filter = box" in str(film)
+
+
+def test_factory_names():
+    with pytest.raises(SceneError, match="lanczos"):
+        make_temporal_filter("lanczos")

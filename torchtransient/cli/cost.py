@@ -1,0 +1,76 @@
+"""`torchtransient cost scene.xml`: error against seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from torchtransient.cli.options import load_scene, scene_options, time_axis
+
+
+class Counts(click.ParamType):
+    """Whole numbers with commas between them."""
+
+    name = "N,N,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        """The numbers of a text; a usage error for anything else."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(int(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"expected whole numbers such as 16,64,256, got '{value}'", param, ctx)
+
+
+@click.command()
+@scene_options
+@click.option("--spp", type=Counts(), default="16,64,256", show_default=True, help="Samples per pixel to compare.")
+@click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="Also the derivative by this parameter.")
+@click.option("--sampler", "samplers", multiple=True, default=("independent", "multijitter"), show_default=True)
+@click.option("--temporal-filter", "filters", multiple=True, type=click.Choice(["box", "tent", "gaussian"]))
+@click.option("--reference-spp", type=click.IntRange(min=1), help="Compare with a long render, not pairs of runs.")
+@click.option("--repeats", type=click.IntRange(min=2), default=4, show_default=True, help="Runs of each kind.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Write the log-log picture (.png).")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the numbers (.json).")
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def command(scene: Path, **options: Any) -> None:
+    """Measure the error of SCENE's transient, and of derivatives, against seconds and samples; print a table."""
+    from torchtransient.data.result_file import check_folder
+    from torchtransient.vis.overview import check_picture
+
+    axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
+    if options["plot"]:
+        check_picture(options["plot"])
+    if options["json_path"]:
+        check_folder(options["json_path"])
+    described = load_scene(scene, options["variant"], options["params"])
+    report = _measure(described, axis, options)
+    click.echo(report.table())
+    if options["plot"]:
+        report.plot(options["plot"])
+        click.echo(f"{options['plot']}: the curves")
+    if options["json_path"]:
+        report.to_json(options["json_path"])
+        click.echo(f"{options['json_path']}: the numbers")
+
+
+def _measure(described: Any, axis: Any, options: dict[str, Any]) -> Any:
+    import torchtransient as tt
+
+    renderer = tt.TransientRenderer(
+        described, parameters=list(options["gradients"]), time_axis=axis, max_depth=options["max_depth"]
+    )
+    return tt.cost_of_accuracy(
+        renderer,
+        spp=options["spp"],
+        gradients=list(options["gradients"]),
+        reference_spp=options["reference_spp"],
+        repeats=options["repeats"],
+        samplers=list(options["samplers"]),
+        temporal_filters=list(options["filters"]) or None,
+        seed=options["seed"],
+        progress=not options["quiet"],
+    )

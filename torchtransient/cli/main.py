@@ -1,0 +1,62 @@
+"""The command `torchtransient`: its subcommands, and how errors leave it.
+
+An error that the library raises on purpose is one line on stderr and exit status 2; with `--debug` it is a traceback.
+Commands are imported when they are called, so that `torchtransient --help` needs no torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any
+
+import click
+
+from torchtransient import __version__
+from torchtransient.errors import TorchTransientError
+
+# In the order of the help text: name of the command (and of its module), what the help says about it.
+COMMANDS = {
+    "doctor": "Check that this machine can render, and say what to install.",
+    "render": "Render a scene file to HDF5 or npz, with an overview picture.",
+    "cost": "Measure what accuracy costs in time on a scene.",
+    "demo": "Render the Cornell box, fit a colour to it, write pictures.",
+}
+
+
+class Commands(click.Group):
+    """Imports a command when it is asked for, and turns the library's errors into messages."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of COMMANDS."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name, from the module of that name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"torchtransient.cli.{cmd_name}")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands, without importing any."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; an error of the library ends the process with status 2."""
+        try:
+            return super().invoke(ctx)
+        except TorchTransientError as error:
+            if ctx.params.get("debug"):
+                raise
+            click.echo(f"error: {error}", err=True)
+            sys.exit(2)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.version_option(__version__, prog_name="torchtransient")
+def main(debug: bool) -> None:
+    """Time-resolved light transport as differentiable PyTorch tensors."""

@@ -1,0 +1,96 @@
+"""`torchtransient render scene.xml -o result.h5`"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values, time_axis
+
+
+@click.command()
+@scene_options
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Result, .h5 or .npz.  [default: SCENE.h5]")
+@click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png).")
+@click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
+@click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
+@click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
+@click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
+@click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
+@click.option("--list-parameters", is_flag=True, help="Print the keys that --set takes, and stop.")
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def command(scene: Path, **options: Any) -> None:
+    """Render SCENE, a Mitsuba XML file, and write the transient.
+
+    The file holds transient (C, T, H, W), steady (C, H, W), the time axis in metres of optical path, and how it was
+    made; torchtransient.data.result_file.read_result reads it.
+    """
+    from torchtransient.data.result_file import check_target, write_result
+    from torchtransient.vis.overview import check_picture, plot_overview
+
+    assignments(options["params"], "--param")
+    axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
+    values = scene_values(options["values"], "--set")
+    # What is wrong with the places to write to is said before the render, not after it.
+    target = check_target(options["output"] or scene.with_suffix(".h5"))
+    if options["overview"]:
+        check_picture(options["overview"])
+    described = load_scene(scene, options["variant"], options["params"])
+    if options["list_parameters"]:
+        click.echo(described.parameters())
+        return
+    output = _render(described, values, axis, options)
+    write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
+    stats = output.stats
+    click.echo(
+        f"{target}: {' x '.join(map(str, output.transient.shape))} (C x T x H x W), {stats.spp} samples per pixel, "
+        f"{stats.seconds:.1f} s, {stats.variant}, {stats.temporal_filter} filter"
+    )
+    _report_energy(output)
+    if options["overview"]:
+        plot_overview(
+            output.transient, output.steady, output.axis, options["overview"], pixel=options["pixel"], title=scene.name
+        )
+        click.echo(f"{options['overview']}: overview")
+
+
+def _render(described: Any, values: dict[str, Any], axis: Any, options: dict[str, Any]) -> Any:
+    import torch
+
+    import torchtransient as tt
+
+    with torch.no_grad():
+        return tt.render(
+            described,
+            values,
+            spp=options["spp"],
+            seed=options["seed"],
+            progress=not options["quiet"],
+            time_axis=axis,
+            max_depth=options["max_depth"],
+            temporal_filter=options["temporal_filter"],
+            sensors=options["sensor"],
+        )
+
+
+def _report_energy(output: Any) -> None:
+    """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
+    before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
+    inside = _mean_over_channels(output.transient)
+    total = before + after + inside
+    if total > 0 and before + after > 0.001 * total:
+        axis = output.axis
+        click.echo(
+            f"note: the axis from {axis.start_opl:g} m to {axis.end_opl:g} m misses light: "
+            f"{before / total:.1%} arrives before it and {after / total:.1%} after it."
+        )
+
+
+def _mean_over_channels(transient: Any) -> float:
+    import torch
+
+    sums: Sequence[float] = [float(channel.sum(dtype=torch.float64)) for channel in transient]
+    return sum(sums) / len(sums)

@@ -1,0 +1,187 @@
+"""A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Both hold the same names. Arrays have torch's order: `transient` float32 (..., C, T, H, W), radiance integrated over
+each bin; `steady` float32 (..., C, H, W); `edges_opl` float64 (T + 1,), metres. The numbers of the axis (`start_opl`,
+`bin_width_opl` in metres, `num_bins`), `format` and `metadata` (JSON) are attributes of the HDF5 file and
+zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.render.output import RenderOutput
+
+FORMAT = "torchtransient result 1"
+_HDF5 = (".h5", ".hdf5")
+_ENDINGS = (*_HDF5, ".npz")
+_PART_BYTES = 2**26
+
+
+@dataclass(frozen=True)
+class Result:
+    """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making."""
+
+    transient: torch.Tensor
+    steady: torch.Tensor
+    axis: TimeAxis
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def check_target(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when a result could not be written there. For before a long render."""
+    target = Path(path)
+    if target.suffix.lower() not in _ENDINGS:
+        raise StorageError(f"result file: expected a name that ends in {', '.join(_ENDINGS)}, got '{target}'.")
+    check_folder(target)
+    if target.suffix.lower() in _HDF5:
+        _h5py()
+    return target
+
+
+def check_folder(path: str | Path) -> None:
+    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
+    target = Path(path)
+    folder = target.parent
+    if not folder.is_dir():
+        raise StorageError(f"result file: the folder '{folder}' does not exist. Create it first.")
+    if target.is_dir() or not os.access(folder, os.W_OK):
+        what = "is a folder" if target.is_dir() else f"cannot be written: no permission in '{folder}'"
+        raise StorageError(f"result file: '{target}' {what}. Choose another place.")
+
+
+def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, Any] | None = None) -> Path:
+    """Write a render. An existing file is replaced once the new one is complete.
+
+    `metadata`: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render. Raises
+    StorageError for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
+    """
+    target = check_target(path)
+    stats = asdict(output.stats)
+    try:
+        note = json.dumps({**(metadata or {}), "stats": stats})
+    except TypeError as error:
+        raise StorageError(f"result file: metadata must be plain data ({error}).") from error
+    axis = output.axis
+    entries: dict[str, Any] = {
+        "format": FORMAT,
+        "start_opl": axis.start_opl,
+        "bin_width_opl": axis.bin_width_opl,
+        "num_bins": axis.num_bins,
+        "metadata": note,
+    }
+    arrays = {
+        "transient": output.transient.detach().cpu().numpy(),
+        "steady": output.steady.detach().cpu().numpy(),
+        "edges_opl": axis.edges_opl.numpy(),
+    }
+    with _replacing(target) as unfinished:
+        if target.suffix.lower() in _HDF5:
+            _write_hdf5(unfinished, arrays, entries)
+        else:
+            with unfinished.open("wb") as file:
+                # numpy writes arrays that are not contiguous through a small buffer
+                everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in entries.items()}}
+                np.savez(file, **everything)
+    return target
+
+
+def read_result(path: str | Path) -> Result:
+    """Read what `write_result` wrote, as tensors on the CPU.
+
+    Raises StorageError when the file is missing, damaged or not a result.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in _ENDINGS:
+        raise StorageError(f"result file: expected a name that ends in {', '.join(_ENDINGS)}, got '{source}'.")
+    if not source.is_file():
+        raise StorageError(f"result file: '{source}' does not exist.")
+    try:
+        values = _read_hdf5(source) if source.suffix.lower() in _HDF5 else _read_npz(source)
+        form = str(values["format"])
+        if form != FORMAT:
+            raise StorageError(f"result file: '{source}' is of format '{form}'; this version reads '{FORMAT}'.")
+        axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+        metadata = json.loads(str(values["metadata"]))
+        transient, steady = torch.from_numpy(values["transient"]), torch.from_numpy(values["steady"])
+    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, TorchTransientError):
+            raise
+        raise StorageError(
+            f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
+        ) from error
+    if transient.ndim < 4 or transient.shape[-3] != axis.num_bins:
+        raise StorageError(
+            f"result file: '{source}' holds a transient of shape {tuple(transient.shape)}; expected "
+            f"(..., C, T, H, W) with T = {axis.num_bins}."
+        )
+    return Result(transient, steady, axis, metadata)
+
+
+@contextmanager
+def _replacing(target: Path) -> Iterator[Path]:
+    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails."""
+    unfinished = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    try:
+        yield unfinished
+        unfinished.replace(target)
+    except OSError as error:
+        raise StorageError(f"result file: '{target}' could not be written: {error}.") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any]) -> None:
+    with _h5py().File(path, "w") as file:
+        for name, value in entries.items():
+            file.attrs[name] = value
+        for name, array in arrays.items():
+            dataset = file.create_dataset(name, shape=array.shape, dtype=array.dtype)
+            for part in _parts(array):
+                dataset[part] = array[part]
+
+
+def _parts(array: NDArray[Any]) -> Iterator[Any]:
+    """Indices of rows of an image: the film keeps H first, so they are read in order, and only they are copied."""
+    if array.ndim < 2:
+        yield ...
+        return
+    rows = array.shape[-2]
+    step = max(1, _PART_BYTES * rows // max(1, array.nbytes))
+    for row in range(0, rows, step):
+        yield ..., slice(row, row + step), slice(None)
+
+
+def _read_hdf5(path: Path) -> dict[str, Any]:
+    with _h5py().File(path, "r") as file:
+        return {**{name: file[name][()] for name in ("transient", "steady")}, **dict(file.attrs)}
+
+
+def _read_npz(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise StorageError(
+            "result file: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
+            "or choose a name that ends in .npz."
+        ) from error
+    return h5py

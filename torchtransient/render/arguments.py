@@ -1,0 +1,89 @@
+"""Checks of what is passed to the renderer, and seeds derived from one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+SEED_RANGE = 2**32
+
+
+def mix_seed(seed: int, number: int) -> int:
+    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
+    if number == 0:
+        return seed % SEED_RANGE
+    z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) % 2**64
+    return (z ^ (z >> 31)) % SEED_RANGE
+
+
+def samples(name: str, value: int | None) -> int | None:
+    """A number of samples per pixel, or None. Raises ``UnitError``."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
+    return value
+
+
+def checked_grad_seed(value: int | str | None) -> int | str | None:
+    """None, "same" or an integer. Raises ``SceneError``."""
+    if value is None or value == "same" or (isinstance(value, int) and not isinstance(value, bool)):
+        return value
+    raise SceneError(f"grad_seed: expected None, 'same' or an integer, got {value!r}.")
+
+
+def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[int, ...], bool]:
+    """The sensors to render out of ``count``, and whether they get a dimension of their own. Raises ``SceneError``."""
+    if sensors == "all":
+        return tuple(range(count)), True
+    if isinstance(sensors, int) and not isinstance(sensors, bool):
+        return (sensors,), False
+    if isinstance(sensors, str) or not isinstance(sensors, Sequence) or not sensors:
+        raise SceneError(f"sensors: expected an index, a list of indices or 'all', got {sensors!r}.")
+    return tuple(int(sensor) for sensor in sensors), True
+
+
+def mangle(keys: Sequence[str]) -> dict[str, str]:
+    """Names that torch allows: slashes for dots."""
+    names = {key: key.replace(".", "/") for key in keys}
+    if len(set(names.values())) != len(keys):
+        raise SceneError(
+            f"parameters: every key once, and no two keys that differ only in '.' and '/', got {list(keys)}."
+        )
+    return names
+
+
+def as_float(key: str, value: Any) -> torch.Tensor:
+    """The value as float32, by an operation that gradients pass. Raises ``ShapeError`` for what is not real numbers."""
+    if not isinstance(value, torch.Tensor):
+        raise ShapeError(f"value of {key!r}: expected a torch tensor, got {type(value).__name__}.")
+    if value.is_complex() or value.dtype == torch.bool:
+        raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
+    if value.layout != torch.strided:
+        raise ShapeError(f"value of {key!r}: expected a dense tensor, got layout {value.layout}.")
+    return value.to(torch.float32)
+
+
+def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
+    """The value in its own shape, and whether it has a leading batch dimension. Flat vertex lists are taken too."""
+    got = tuple(value.shape)
+    if got == shape:
+        return value, False
+    if len(got) == len(shape) + 1 and got[1:] == shape:
+        return value, True
+    flat = 1
+    for n in shape:
+        flat *= n
+    if len(shape) == 2 and got == (flat,):
+        return value.reshape(shape), False
+    if len(shape) == 2 and len(got) == 2 and got[1] == flat:
+        return value.reshape(got[0], *shape), True
+    batch = ("B", *shape)
+    with_batch = f"({', '.join(str(n) for n in batch)}{',' if len(batch) == 1 else ''})"
+    raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")

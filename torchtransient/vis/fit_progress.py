@@ -1,0 +1,60 @@
+"""A fit on one page: images before and after, the loss, and the parameters on their way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, StorageError
+from torchtransient.vis.overview import figure_type
+from torchtransient.vis.tone_mapping import exposure_of, tone_map
+
+
+def plot_fit(
+    images: Mapping[str, Tensor],
+    loss: Sequence[float],
+    values: Mapping[str, Sequence[float]],
+    truth: Mapping[str, float],
+    path: str | Path,
+) -> None:
+    """Write a picture: `images` (title -> steady (C, H, W)) under one exposure, the loss, the values over the steps.
+
+    The exposure is that of the last image. `values`: name -> one number per step; `truth`: name -> the number aimed at,
+    a dashed line. Raises ShapeError without images or steps, or when the lists differ in length; StorageError when the
+    file cannot be written. Needs matplotlib (extra `vis`).
+    """
+    steps = len(loss)
+    if not images or steps == 0:
+        raise ShapeError(f"plot_fit: expected at least one image and one step, got {len(images)} and {steps}.")
+    for name, curve in values.items():
+        if len(curve) != steps:
+            raise ShapeError(f"plot_fit: expected {steps} values of '{name}', as many as losses, got {len(curve)}.")
+    figure = figure_type()(figsize=(11.0, 6.6), layout="constrained")
+    upper, lower = figure.subfigures(2, 1)
+    exposure = exposure_of(list(images.values())[-1].cpu())
+    panels = upper.subplots(1, len(images), squeeze=False)[0]
+    for panel, (title, image) in zip(panels, images.items(), strict=True):
+        panel.imshow(tone_map(image.cpu(), exposure).numpy(), interpolation="nearest")
+        panel.set_title(title, fontsize=10)
+        panel.set_axis_off()
+    left, right = lower.subplots(1, 2)
+    left.plot(loss, color="black", linewidth=1.2)
+    if bool((torch.tensor(loss) > 0).all()):
+        left.set_yscale("log")
+    left.set_ylabel("loss")
+    for n, (name, curve) in enumerate(values.items()):
+        right.plot(curve, color=f"C{n}", linewidth=1.2, label=name)
+        if name in truth:
+            right.axhline(truth[name], color=f"C{n}", linewidth=0.8, linestyle="--")
+    right.set_ylabel("value (dashed: truth)")
+    right.legend(fontsize=8, frameon=False)
+    for panel in (left, right):
+        panel.set_xlabel("step")
+        panel.grid(True, color="0.9", linewidth=0.6)
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # matplotlib raises ValueError for an unknown ending
+        raise StorageError(f"plot_fit: cannot write '{path}': {error}. Choose a writable .png.") from error
