@@ -1,0 +1,42 @@
+"""What accuracy costs in time: error of the Cornell box's transient and gradients, for the README's curve.
+
+Writes the picture and the numbers next to it. The choices compared are the sampler and the temporal filter.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torchtransient as tt
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--picture", type=Path, default=Path("docs/images/accuracy_cornell.png"))
+    parser.add_argument("--json", type=Path, default=Path("benchmarks/results/accuracy_cornell.json"))
+    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--repeats", type=int, default=24)
+    parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
+    options = parser.parse_args()
+    resolution, spp = (8, (4, 16)) if options.quick else (options.resolution, (16, 64, 256))
+
+    keys = ["red.reflectance.value", "light.emitter.radiance.value"]
+    box = tt.scenes.cornell_box(resolution=resolution, num_bins=300, spp=64)
+    renderer = tt.TransientRenderer(tt.load(box, variant="llvm_ad_rgb"), parameters=keys, spp=64)
+    report = tt.cost_of_accuracy(
+        renderer,
+        spp=spp,
+        gradients=keys,
+        repeats=options.repeats,
+        samplers=("independent", "multijitter", "ldsampler"),
+        temporal_filters=("box", "tent"),
+    )
+    print(report.table())
+    report.to_json(options.json)
+    report.plot(options.picture)
+    print(f"picture: {options.picture}, numbers: {options.json}")
+
+
+if __name__ == "__main__":
+    main()
