@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+VARIANT = "llvm_ad_rgb"
 README = Path(__file__).parents[1] / "README.md"
 
 

@@ -9,11 +9,12 @@ from torchtransient.accuracy.cost import cosine_over_the_window
 from torchtransient.accuracy.report import Choice
 from torchtransient.errors import SceneError
 
+VARIANT = "llvm_ad_mono"
 ALBEDO, WALL, LIGHT = "wall.bsdf.reflectance.value", "wall.to_world", "light.position"
 
 
 def wall_renderer(**settings):
-    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant="llvm_ad_mono")
+    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant=VARIANT)
     return tt.TransientRenderer(scene, parameters=[ALBEDO, WALL], **settings)
 
 

@@ -15,6 +15,7 @@ import torchtransient as tt
 from torchtransient.cli.main import COMMANDS, main
 from torchtransient.data.result_file import read_result
 
+VARIANT = "llvm_ad_rgb"  # what the commands take when none is active, as in a process of their own
 SCENE = """<scene version="3.0.0">
   <default name="res" value="8"/>
   <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
