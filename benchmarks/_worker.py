@@ -22,9 +22,9 @@ os.dup2(2, 1)
 if sys.argv[1] == "torchtransient":
     import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported)
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import numpy as np  # noqa: E402
 
 
 def start(library, variant):

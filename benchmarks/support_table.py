@@ -30,7 +30,7 @@ NOT_SUPPORTED = (
 
 
 def measure(case):
-    """Reverse mode and finite differences of one case: (reverse, its error, difference, its error, forward / reverse)."""
+    """One case: (reverse mode, its error, finite difference, its error, forward over reverse mode)."""
     from gradient_cases import Problem
 
     problem = Problem(case)
@@ -46,7 +46,8 @@ def measure(case):
 
 def table(rows) -> str:
     lines = [
-        "| parameter | status | case: reverse mode, finite differences, difference in standard errors | forward / reverse |",
+        "| parameter | status | case: reverse mode, finite differences, difference in standard errors "
+        "| forward / reverse |",
         "|---|---|---|---|",
     ]
     for row, entries in rows.items():

@@ -61,9 +61,8 @@ def main() -> None:
         "within": growth < 0.02 and not late,
         "environment": environment(options.variant),
     }
-    report(
-        "training_memory", {"resolution": resolution, "bins": bins, "spp": spp, "steps": steps}, results, options.json
-    )
+    settings = {"resolution": resolution, "bins": bins, "spp": spp, "steps": steps, "quick": options.quick}
+    report("training_memory", settings, results, options.json)
 
 
 if __name__ == "__main__":

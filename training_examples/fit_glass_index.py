@@ -58,7 +58,7 @@ def measure(resolution: int, spp: int, repetitions: int) -> dict[str, Measuremen
 def fit(kind: str, target: Measurement, args: argparse.Namespace) -> list[float]:
     """Adam from START on the weighted squared difference of one kind of image; the index after every step."""
     renderer = make_renderer(START, args.resolution, args.spp)
-    # Derivatives far from the truth are a hundred times those near it: Adam's usual memory of a thousand steps would crawl.
+    # Derivatives far from the truth dwarf those near it: with Adam's usual memory of a thousand steps it would crawl.
     optimizer = torch.optim.Adam(renderer.parameters(), lr=args.learning_rate, betas=(0.8, 0.95))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps, eta_min=args.learning_rate / 100)
     history = [START]

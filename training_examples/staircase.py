@@ -88,8 +88,8 @@ def window_slice(window: tuple[float, float]) -> slice:
     return slice(first, last)
 
 
-def window_gradients(scene: tt.Scene, key: str, sizes: Sizes) -> list[torch.Tensor]:
-    """d(light of the whole picture in a window)/d(texel), summed over channels: one (H, W) per window.
+def window_gradients(scene: tt.Scene, key: str, sizes: Sizes) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """The texture (H, W, 3), and d(light of the whole picture in a window)/d(texel), summed over channels: (H, W) each.
 
     The loss is linear in the light, so its derivative does not depend on the render: one sample per pixel is enough
     there, and the samples go into the adjoint pass.
@@ -100,7 +100,7 @@ def window_gradients(scene: tt.Scene, key: str, sizes: Sizes) -> list[torch.Tens
         renderer.zero_grad()
         renderer(seed=number).transient[:, window_slice(window)].sum().backward()
         gradients.append(renderer.values[key].grad.sum(dim=-1))
-    return gradients
+    return renderer.values[key].detach(), gradients
 
 
 def in_blocks(texture: torch.Tensor) -> torch.Tensor:
@@ -251,8 +251,7 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
         key = floor_key(scene)
         renderer = tt.TransientRenderer(scene, time_axis=AXIS, spp=sizes.spp)
         draw_light(renderer(seed=0, progress=True), options.output / "staircase_light.png")
-        gradients = window_gradients(scene, key, sizes)
-        texture = torch.as_tensor(scene.parameters()[key].value)
+        texture, gradients = window_gradients(scene, key, sizes)
         draw_gradients(texture, gradients, options.output / "staircase_gradient.png")
         result = recover(scene, key, sizes)
     draw_recovery(result, options.output / "staircase_recovery.png")

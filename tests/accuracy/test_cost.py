@@ -1,5 +1,6 @@
 """`tt.cost_of_accuracy` on the real renderer, with tiny scenes."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,11 @@ from torchtransient.errors import SceneError
 
 VARIANT = "llvm_ad_mono"
 ALBEDO, WALL, LIGHT = "wall.bsdf.reflectance.value", "wall.to_world", "light.position"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_mono")
 
 
 def wall_renderer(**settings):
@@ -115,6 +121,14 @@ def test_default_loss_is_linear():
     out = wall_renderer()(seed=0, spp=4)
     doubled = type(out)(2 * out.transient, out.steady, None, out.axis, out.stats)
     assert torch.allclose(cosine_over_the_window(doubled), 2 * cosine_over_the_window(out))
+
+
+def test_the_users_variant_stays_active():
+    renderer = wall_renderer()
+    mi.set_variant("llvm_ad_rgb")
+    tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, samplers=("independent",), progress=False)
+    assert mi.variant() == "llvm_ad_rgb"
+    mi.set_variant("llvm_ad_mono")
 
 
 def test_errors():

@@ -17,7 +17,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Case:
-    """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown ``x`` into it."""
+    """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown into it."""
 
     name: str
     row: str
@@ -578,7 +578,7 @@ class Problem:
         self.scene = mi.load_dict(case.scene(), optimize=False)
         self.film = self.scene.sensors()[0].film()
         self.params = mi.traverse(self.scene)
-        changes = Changes({key: self.params[key] for key in self.params.keys()})
+        changes = Changes({key: self.params[key] for key in list(self.params.keys())})
         case.apply(changes, mi.Float(case.value))
         self.base = {key: dr.copy(self.params[key]) for key in changes}
         # The first look fixes the reference sphere of distant lights.

@@ -1,8 +1,8 @@
 """The gradient that a radiometric renderer does not have: the mean arrival time of a wall that moves.
 
-Camera and light stand at one point, a distance h before the wall. A ray at angle t from the normal returns after 2 h / cos t with a
-radiance proportional to cos^3 t / h^2, so the mean arrival M of the whole picture is proportional to h, and moving the wall
-towards the camera changes it by exactly -M / h.
+Camera and light stand at one point, a distance h before the wall. A ray at angle t from the normal returns after
+2 h / cos t with a radiance proportional to cos^3 t / h^2, so the mean arrival M of the whole picture is proportional to
+h, and moving the wall towards the camera changes it by exactly -M / h.
 """
 
 import pytest
@@ -45,8 +45,9 @@ def look_at_wall(fov):
 @pytest.mark.parametrize("fov", [8.0, 40.0])
 @pytest.mark.parametrize("temporal_filter", ["auto", "gaussian"])
 def test_mean_arrival_of_a_moving_wall(fov, temporal_filter):
+    scene = tt.load(look_at_wall(fov))
     renderer = tt.TransientRenderer(
-        tt.load(look_at_wall(fov)), parameters=["wall.to_world"], spp=64, temporal_filter=temporal_filter, grad_seed="same"
+        scene, parameters=["wall.to_world"], spp=64, temporal_filter=temporal_filter, grad_seed="same"
     )
     z = torch.zeros((), requires_grad=True)
     pose = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0])) + torch.nn.functional.one_hot(

@@ -20,8 +20,8 @@ def peer_python():
         return named
     if importlib.util.find_spec("mitransient") is None:
         pytest.fail(
-            "the tests marked 'peer' need mitransient 1.3.1: install the extra 'peer' here, or set TORCHTRANSIENT_PEER_PYTHON to the "
-            "python of an environment that has it",
+            "the tests marked 'peer' need mitransient 1.3.1: install the extra 'peer' here, or set "
+            "TORCHTRANSIENT_PEER_PYTHON to the python of an environment that has it",
             pytrace=False,
         )
     return sys.executable

@@ -40,7 +40,8 @@ def with_film(description, **changes):
 
 
 def enough_events(a, b, relative):
-    """Entries where both sides hold at least `relative` of the brightest: few events in a bin are not normally distributed."""
+    """Entries where both sides hold at least `relative` of the brightest: few events in a bin are not normally
+    distributed."""
     mean = (a.mean(axis=0) + b.mean(axis=0)) / 2
     return mean > relative * mean.max()
 

@@ -42,7 +42,7 @@ def test_asking_for_the_derivative_does_not_change_the_picture(textured_wall: tt
 
 
 def test_gradient_of_the_image_adds_up_to_the_light_it_reflects(textured_wall: tt.Scene) -> None:
-    """After one bounce the light is linear in the albedo: sum of albedo times derivative is the light itself (Euler)."""
+    """After one bounce the light is linear in the albedo: albedo times derivative adds up to the light (Euler)."""
     renderer = tt.TransientRenderer(textured_wall, parameters=[KEY], grad_seed="same")
     total = renderer(seed=1).transient.sum()
     total.backward()

@@ -72,7 +72,9 @@ def test_mitsuba_loads_every_entry(name):
 
 
 def test_scenes_need_no_variant():
-    code = "import torchtransient.scenes as s, mitsuba as mi; s.cornell_box(); raise SystemExit(mi.variant() is not None)"
+    code = (
+        "import torchtransient.scenes as s, mitsuba as mi; s.cornell_box(); raise SystemExit(mi.variant() is not None)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
@@ -97,7 +99,8 @@ def test_cornell_box_materials(option, plugin):
 
 
 def check_mean(description, expected, spp, slack=0.0):
-    """The mean over pixels lies within 5 standard errors (12 seeds) of the closed form, plus a stated geometric slack."""
+    """The mean over pixels lies within 5 standard errors (12 seeds) of the closed form, plus a stated geometric
+    slack."""
     means = [steady_image(description, spp=spp, seed=seed).mean(dtype=np.float64) for seed in range(12)]
     error = np.std(means, ddof=1) / np.sqrt(len(means))
     assert error < 0.01 * expected, "the test is too noisy to mean anything"

@@ -14,6 +14,7 @@ from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.errors import SceneError
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
+from torchtransient.render.variant import active_variant
 
 Loss = Callable[[RenderOutput], torch.Tensor]
 
@@ -91,9 +92,17 @@ def cost_of_accuracy(
         "time_axis": [renderer.axis.start_opl, renderer.axis.bin_width_opl, renderer.axis.num_bins],
         "without_gradients": without,
     }
-    return measure(
-        candidates, spp, reference_spp=reference_spp, repeats=repeats, seed=seed, progress=progress, settings=settings
-    )
+    # One switch of variant for all runs: a switch within each would be timed with it.
+    with active_variant(renderer.scene.variant):
+        return measure(
+            candidates,
+            spp,
+            reference_spp=reference_spp,
+            repeats=repeats,
+            seed=seed,
+            progress=progress,
+            settings=settings,
+        )
 
 
 def _values_task(renderer: TransientRenderer) -> Task:

@@ -3,8 +3,7 @@
 Two ways to the same number, the expected squared error per entry:
 
 * against a *reference* of two independent halves A and B: mean of (x - (A + B) / 2)^2 less the reference's own
-variance,
-  (A - B)^2 / 4. It contains the bias of the estimate, if the reference has none.
+  variance, (A - B)^2 / 4. It contains the bias of the estimate, if the reference has none.
 * from *pairs* of independent runs: mean of (x1 - x2)^2 / 2, the variance. It sees no bias.
 
 The power that a relative error divides by is the product of two independent runs, A B or x1 x2, whose expectation is
@@ -34,7 +33,8 @@ class Reference:
 
 @dataclass
 class ErrorTally:
-    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is none."""
+    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is
+    none."""
 
     time_dim: int | None = None
     reference: Reference | None = None

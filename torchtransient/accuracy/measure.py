@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import ArrayLike
-from tqdm import tqdm  # type: ignore[import-untyped]
+from tqdm import tqdm
 
 from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
@@ -139,7 +139,8 @@ def _checked(spp: Sequence[int], repeats: int, reference_spp: int | None) -> lis
         raise UnitError(f"spp: expected different sample counts of at least 1, got {list(spp)}")
     if repeats < 2 or (reference_spp is None and repeats % 2):
         raise UnitError(
-            f"repeats: expected at least 2, and an even number without a reference (runs are compared in pairs), got {repeats}"
+            "repeats: expected at least 2, and an even number without a reference (runs are compared in pairs), "
+            f"got {repeats}"
         )
     if reference_spp is not None and reference_spp < 4 * max(counts):
         raise UnitError(

@@ -65,7 +65,8 @@ class AccuracyReport:
             yield quantity, choice, sorted(curve, key=lambda p: p.spp)
 
     def slope(self, quantity: str, choice: Choice) -> Slope | None:
-        """Line through log squared error against log spp; -1 for independent samples. None with fewer than three points."""
+        """Line through log squared error against log spp; -1 for independent samples. None with fewer than three
+        points."""
         for name, candidate, curve in self.curves():
             if (name, candidate) == (quantity, choice):
                 good = [p for p in curve if p.squared_error > 0]
@@ -137,7 +138,8 @@ class AccuracyReport:
             raise StorageError(f"accuracy report: cannot write {path}: {error}; choose a writable place") from error
 
     def plot(self, path: str | Path) -> None:
-        """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope -1."""
+        """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope
+        -1."""
         from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
 
         curves = [

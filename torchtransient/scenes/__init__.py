@@ -1,4 +1,5 @@
-"""Scene dictionaries in metres. They need no Mitsuba variant: transforms are (4, 4) arrays, plugins are named by string."""
+"""Scene dictionaries in metres. They need no Mitsuba variant: transforms are (4, 4) arrays, plugins are named by
+string."""
 
 from torchtransient.scenes.cavities import furnace as furnace
 from torchtransient.scenes.cavities import integrating_sphere as integrating_sphere

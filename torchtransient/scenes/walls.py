@@ -55,8 +55,8 @@ def light_over_plane(
 ) -> SceneDict:
     """A point light and an irradiance meter at the same place, `height` above a diffuse plane. Lengths in metres.
 
-    The plane is z = 0 and reaches `half_extent` to each side. The meter is a square of side 2e-4 `height` facing
-    the plane; the light hangs 1e-4 `height` below it, so that the meter casts no shadow on the plane. Film: one pixel,
+    The plane is z = 0 and reaches `half_extent` to each side. The meter is a square of side 2e-4 `height` facing the
+    plane; the light hangs 1e-4 `height` below it, so that the meter casts no shadow on the plane. Film: one pixel,
     direct light only. Closed form: `closed_forms.light_over_plane`.
     """
     h = positive("height", height)

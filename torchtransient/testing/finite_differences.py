@@ -22,7 +22,8 @@ Render = Callable[[float, int], ArrayLike]
 
 @dataclass(frozen=True)
 class Derivative:
-    """A derivative by finite differences: `per_seed` (K, ...) in the shape of what was rendered, and the `step` that was used."""
+    """A derivative by finite differences: `per_seed` (K, ...) in the shape of what was rendered, and the `step` that
+    was used."""
 
     per_seed: Array
     step: float

@@ -120,7 +120,8 @@ class Slope:
 
 
 def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
-    """Least squares line through (log x, log y), both (N,), N >= 3, positive. The variance of Monte Carlo has slope -1 in spp."""
+    """Least squares line through (log x, log y), both (N,), N >= 3, positive. The variance of Monte Carlo has slope -1
+    in spp."""
     xs, ys = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if xs.ndim != 1 or xs.shape != ys.shape or xs.size < 3:
         raise ShapeError(f"log_log_slope: expected two rows of the same length >= 3, got {xs.shape} and {ys.shape}")

@@ -14,7 +14,8 @@ from torchtransient.errors import ShapeError, StorageError
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of the picture. The three lists have equal length; `seconds` and errors that are not positive are left out."""
+    """One line of the picture. The three lists have equal length; `seconds` and errors that are not positive are left
+    out."""
 
     quantity: str
     label: str
@@ -24,7 +25,8 @@ class Curve:
 
 
 def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
-    """Write a log-log PNG: squared relative error against seconds (left) and samples per pixel (right), a row per quantity.
+    """Write a log-log PNG: squared relative error against seconds (left) and samples per pixel (right), a row per
+    quantity.
 
     A dashed guide of slope -1 starts at the first point of the first curve: independent samples fall along it.
     Raises ShapeError without curves and StorageError when `path` cannot be written. Needs matplotlib (extra `vis`).

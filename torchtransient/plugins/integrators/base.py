@@ -143,8 +143,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         if film.exhaustive_scan:
             raise SceneError(
-                "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing has "
-                "no laser positions. Remove exhaustive_scan."
+                "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
+                "has no laser positions. Remove exhaustive_scan."
             )
         if self.gaussian_stddev is not None:
             film.gaussian_stddev = self.gaussian_stddev
@@ -359,20 +359,23 @@ class TransientIntegrator(mi.CppADIntegrator):
             return g_transient
         expected = film.cube_shape()
         if tuple(g_transient.shape) != expected:
-            raise GradientError(f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}.")
+            raise GradientError(
+                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}."
+            )
         _, w, t, c = expected
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
 
     def _check_differentiable(self, film, facts):
         if facts.geometry and not film.filter.has_slope:
             raise GradientError(
-                "A parameter that changes optical path lengths (geometry, light or sensor position, index of refraction) needs a "
-                f"temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to 'tent' or 'gaussian'."
+                "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
+                f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
+                "'tent' or 'gaussian'."
             )
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(
-                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a finite number, "
-                "for instance to where the remaining throughput no longer matters."
+                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
+                "finite number, for instance to where the remaining throughput no longer matters."
             )
 
     def to_string(self):

@@ -163,11 +163,7 @@ class TransientPath(TransientIntegrator):
             depth += 1
             active = active_next
 
-        if record:
-            result = (depth, store)
-        else:
-            result = (L, before, after)
-        return result
+        return (depth, store) if record else (L, before, after)
 
     def sweep(self, scene, sampler, ray, first_opl, lane, facts):
         """Record the paths of one pass and walk them backwards, see :mod:`.sweep`."""

@@ -43,7 +43,7 @@ class SceneFacts:
         return self.refraction is not None
 
     def unweighted(self, bsdf, bs):
-        """Factor of one whose derivative puts back the probability of a delta lobe, see :func:`lobe_probability_table`."""
+        """One, with the derivative of a delta lobe's probability where :func:`lobe_probability_table` says so."""
         if self.lobe_probability is None:
             return mi.Float(1)
         number = dr.reinterpret_array(mi.UInt32, bsdf)
@@ -76,7 +76,8 @@ class SceneFacts:
         facts.geometry = shapes or light or sensor_moves or index
         facts.light_moves = light
         facts.emitter_shape_moves = emitter_shape
-        facts.sphere_lights = facts.geometry and any(s.is_emitter() and s.class_name() == "Sphere" for s in scene.shapes())
+        spheres = any(s.is_emitter() and s.class_name() == "Sphere" for s in scene.shapes())
+        facts.sphere_lights = facts.geometry and spheres
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
         facts.lobe_probability = lobe_probability_table(scene) if facts.delta else None
@@ -96,7 +97,7 @@ def lobe_probability_table(scene):
     """
     numbers = []
     for bsdf in unique_bsdfs(scene):
-        if bsdf.class_name() in _CANCELLING or (bsdf.class_name() == "TwoSided" and _nests(bsdf)):
+        if bsdf.class_name() in _CANCELLING or (bsdf.class_name() == "TwoSidedBRDF" and _nests(bsdf)):
             numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]))
     if not numbers:
         return None
@@ -111,10 +112,7 @@ def _nests(bsdf) -> bool:
 
 def _attached(plugin, names) -> bool:
     """Whether one of the parameters called ``names`` of a plugin or its children carries gradients."""
-    for key, value in mi.traverse(plugin):
-        if key.split(".")[-1] in names and dr.grad_enabled(value):
-            return True
-    return False
+    return any(key.split(".")[-1] in names and dr.grad_enabled(value) for key, value in mi.traverse(plugin))
 
 
 def unique_bsdfs(scene) -> list:
