@@ -50,7 +50,8 @@ def plot_fit(
         if name in truth:
             right.axhline(truth[name], color=f"C{n}", linewidth=0.8, linestyle="--")
     right.set_ylabel("value (dashed: truth)")
-    right.legend(fontsize=8, frameon=False)
+    if values:
+        right.legend(fontsize=8, frameon=False)
     for panel in (left, right):
         panel.set_xlabel("step")
         panel.grid(True, color="0.9", linewidth=0.6)
