@@ -16,7 +16,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=Path("docs/images/accuracy_cornell.png"))
     parser.add_argument("--json", type=Path, default=Path("benchmarks/results/accuracy_cornell.json"))
     parser.add_argument("--resolution", type=int, default=64)
-    parser.add_argument("--repeats", type=int, default=24)
+    parser.add_argument("--repeats", type=int, default=12)
     parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
     options = parser.parse_args()
     resolution, spp = (8, (4, 16)) if options.quick else (options.resolution, (16, 64, 256))

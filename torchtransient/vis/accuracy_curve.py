@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,13 +49,15 @@ def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
     for axis, label in zip(axes[-1], ("seconds per render", "samples per pixel"), strict=True):
         axis.set_xlabel(label)
     try:
-        figure.savefig(path, dpi=150)
+        figure.savefig(path, dpi=100)
     except OSError as error:
         raise StorageError(f"plot_accuracy: cannot write {path}: {error}; choose a writable place") from error
 
 
 def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
     """One panel: the curves over `unit` ("seconds" or "spp") and the guide."""
+    from matplotlib.ticker import NullFormatter
+
     starts, ends = [], []
     for i, curve in enumerate(lines):
         x = np.asarray(getattr(curve, unit), dtype=np.float64)
@@ -71,3 +74,16 @@ def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.grid(True, which="major", color="0.9", linewidth=0.6)
+    # Less than a decade would be labelled at every minor tick, one over the other.
+    counts = np.unique(np.concatenate([np.asarray(getattr(curve, unit), dtype=np.float64) for curve in lines]))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    counts = counts[counts > 0]
+    if not counts.size:
+        return
+    if unit == "spp":
+        axis.set_xticks(counts, [f"{count:g}" for count in counts])
+    else:
+        low, high = math.log10(counts.min()), math.log10(counts.max())
+        steps = [m * 10.0**e for e in range(math.floor(low), math.ceil(high) + 1) for m in (1, 2, 5)]
+        ticks = [t for t in steps if counts.min() / 1.3 <= t <= counts.max() * 1.3]
+        axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
