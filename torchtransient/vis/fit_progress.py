@@ -12,6 +12,9 @@ from torchtransient.errors import ShapeError, StorageError
 from torchtransient.vis.overview import figure_type
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
+# A curve called by the name of a channel is drawn in its colour.
+CHANNEL_COLORS = {"red": "tab:red", "green": "tab:green", "blue": "tab:blue"}
+
 
 def plot_fit(
     images: Mapping[str, Tensor],
@@ -46,9 +49,10 @@ def plot_fit(
         left.set_yscale("log")
     left.set_ylabel("loss")
     for n, (name, curve) in enumerate(values.items()):
-        right.plot(curve, color=f"C{n}", linewidth=1.2, label=name)
+        color = CHANNEL_COLORS.get(name, f"C{n}")
+        right.plot(curve, color=color, linewidth=1.2, label=name)
         if name in truth:
-            right.axhline(truth[name], color=f"C{n}", linewidth=0.8, linestyle="--")
+            right.axhline(truth[name], color=color, linewidth=0.8, linestyle="--")
     right.set_ylabel("value (dashed: truth)")
     if values:
         right.legend(fontsize=8, frameon=False)
