@@ -133,3 +133,19 @@ def test_fork_before_rendering_is_fine():
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     """)
     assert printed == "0"
+
+
+def test_many_switches_are_mentioned_once(monkeypatch):
+    import mitsuba as mi
+
+    from torchtransient.render import variant
+
+    monkeypatch.setattr(variant, "MANY_SWITCHES", 2)
+    monkeypatch.setitem(variant._switches, "count", 0)
+    mi.set_variant("llvm_ad_mono")
+    with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
+        for _ in range(4):
+            with active_variant(VARIANT):
+                pass
+    assert len(caught) == 1
+    assert mi.variant() == "llvm_ad_mono"

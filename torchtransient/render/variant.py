@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -23,6 +24,10 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 engine_lock = threading.RLock()
 
 _process = {"parent_was_rendering": False}
+
+# A switch takes some 0.1 s and makes Dr.Jit translate every loop anew; once or twice is fine, at every step it is not.
+MANY_SWITCHES = 20
+_switches = {"count": 0}
 
 
 def _mark_fork() -> None:
@@ -94,12 +99,27 @@ def active_variant(variant: str) -> Iterator[None]:
         before = mi.variant()
         if before != variant:
             _set_variant(variant)
+            _count_switch(before, variant)
         try:
             plugins.sync()
             yield
         finally:
             if before is not None and mi.variant() != before:
                 mi.set_variant(before)
+
+
+def _count_switch(before: str | None, variant: str) -> None:
+    """Say once that the calls of a scene keep switching to and fro."""
+    if before is None:
+        return
+    _switches["count"] += 1
+    if _switches["count"] == MANY_SWITCHES:
+        warnings.warn(
+            f"a scene for {variant} is rendered again and again while {before} is active: every call switches to and "
+            f"fro, which costs some 0.1 s each way. Call mitsuba.set_variant({variant!r}) once before the loop.",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _set_variant(variant: str) -> None:
