@@ -172,6 +172,24 @@ def glass_slab(bsdf, shape="cube"):
     return wide
 
 
+def blend():
+    """Diffuse and rough metal, mixed."""
+    parts = {"a": {"type": "diffuse", "reflectance": 0.5}, "b": {"type": "roughconductor", "alpha": 0.3}}
+    return {"type": "blendbsdf", "weight": 0.4, **parts}
+
+
+def picture_sky():
+    """An environment map with a gradient in it."""
+    data = np.linspace(0.5, 1.5, 8 * 16, dtype=np.float32).reshape(8, 16, 1)
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.repeat(data, 3, axis=2))}
+
+
+def projector():
+    """A projector beside the camera, aimed at the wall."""
+    pose = transform().look_at([0.5, 0, 4], [0, 0, 0], [0, 1, 0])
+    return {"type": "projector", "irradiance": 2.0, "fov": 40.0, "to_world": pose, "scale": 1.0}
+
+
 def mirror_room(bsdf=None):
     """A large diffuse wall seen in a mirror; light and camera stand before both."""
     scene = room(
@@ -514,6 +532,86 @@ CASES = [
         2e-3,
         spp=2048,
         fd_spp=2048,
+    ),
+    Case(
+        "blend_weight",
+        "blend weight",
+        lambda: room(bsdf=blend()),
+        set_color("wall.bsdf.weight.value"),
+        0.4,
+        0.02,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "conductor_eta",
+        "complex index of a conductor",
+        lambda: mirror_room({"type": "conductor", "eta": 0.5, "k": 2.0}),
+        set_color("wall.bsdf.eta.value"),
+        0.5,
+        0.02,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "sky_texture",
+        "environment radiance",
+        lambda: room(light=picture_sky(), sensor=camera(start=2.0)),
+        scale_texture("light.data"),
+        0.0,
+        0.05,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "projector_scale",
+        "emitter radiance or intensity",
+        lambda: room(light=projector()),
+        set_color("light.scale"),
+        1.0,
+        0.05,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "cube_light_moves",
+        "area light shape",
+        lambda: room(light=area_light("cube", 0.12), side_reflectance=0.2),
+        move_vertices("light.vertex_positions", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+        fd_spp=8192,
+    ),
+    Case(
+        "disk_light_moves",
+        "area light shape",
+        lambda: room(light=area_light("disk", 0.3), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "cylinder_moves",
+        "shape to_world",
+        lambda: room(pipe={"type": "cylinder", "p0": [0, -2, -1.8], "p1": [0, 2, -1.8], "radius": 2.0}),
+        move("pipe.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
+        fd_spp=4096,
+    ),
+    Case(
+        "thin_lens_moves",
+        "sensor pose",
+        lambda: room(sensor={**camera(near=0.5), "type": "thinlens", "aperture_radius": 0.02, "focus_distance": 4.0}),
+        move("sensor.to_world", (0.5, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
+        fd_spp=4096,
     ),
     Case(
         "wall_rgb",
