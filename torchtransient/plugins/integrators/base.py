@@ -146,6 +146,11 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
             )
+        if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
+            raise SceneError(
+                f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
+                "if they were empty. Remove the interior and exterior media of its shapes."
+            )
         if self.gaussian_stddev is not None:
             film.gaussian_stddev = self.gaussian_stddev
         if self.temporal_filter:

@@ -26,8 +26,7 @@ class TransientPath(TransientIntegrator):
     Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
     tangents along; both include the time of flight. Visibility changes are not differentiated (no boundary term).
 
-    Not supported: participating media (they are passed through as if empty: the layer refuses such scenes),
-    polarization.
+    Not supported: participating media (``SceneError``), polarization.
     """
 
     def __init__(self, props):
