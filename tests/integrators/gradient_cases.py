@@ -190,6 +190,13 @@ def projector():
     return {"type": "projector", "irradiance": 2.0, "fov": 40.0, "to_world": pose, "scale": 1.0}
 
 
+def angular_light():
+    """An area light that emits into a cone with a soft rim."""
+    lamp = area_light()
+    lamp["emitter"] = {"type": "angulararea", "radiance": 9.0, "cutoff_angle": 60.0, "beam_width": 5.0}
+    return lamp
+
+
 def mirror_room(bsdf=None):
     """A large diffuse wall seen in a mirror; light and camera stand before both."""
     scene = room(
@@ -582,6 +589,26 @@ CASES = [
         5e-3,
         spp=4096,
         fd_spp=8192,
+    ),
+    Case(
+        "angular_light_radiance",
+        "emitter radiance or intensity",
+        lambda: room(light=angular_light()),
+        set_color("light.emitter.radiance.value"),
+        9.0,
+        0.5,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "angular_light_moves",
+        "area light shape",
+        lambda: room(light=angular_light(), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+        fd_spp=4096,
     ),
     Case(
         "disk_light_moves",

@@ -246,6 +246,7 @@ def test_scalar_variant_is_refused():
 def test_participating_media_are_refused():
     fog = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
     cloud = {"type": "cube", "bsdf": {"type": "null"}, "interior": fog}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "transient_path"}, "sensor": camera(), "cloud": cloud})
+    integrator = {"type": "transient_path"}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(), "cloud": cloud})
     with pytest.raises(SceneError, match="participating media"):
         scene.integrator().render(scene, spp=1)

@@ -143,9 +143,13 @@ def test_many_switches_are_mentioned_once(monkeypatch):
     monkeypatch.setattr(variant, "MANY_SWITCHES", 2)
     monkeypatch.setitem(variant._switches, "count", 0)
     mi.set_variant("llvm_ad_mono")
-    with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
-        for _ in range(4):
+
+    def switch(times):
+        for _ in range(times):
             with active_variant(VARIANT):
                 pass
+
+    with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
+        switch(4)
     assert len(caught) == 1
     assert mi.variant() == "llvm_ad_mono"
