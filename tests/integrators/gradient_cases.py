@@ -741,7 +741,5 @@ class Problem:
         dr.enable_grad(x)
         self.install(x)
         dr.set_grad(x, 1.0)
-        dr.enqueue(dr.ADMode.Forward, x)
-        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
         _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
         return float((np.array(transient).sum((0, 1, 3)) * weights(self.film)).sum())

@@ -55,8 +55,13 @@ def settle_tangents(scene, facts):
     attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
     if facts.refracts and dr.grad_enabled(facts.refraction.table):
         attached.append(facts.refraction.table)
-    if attached:
-        dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
+    if not attached:
+        return
+    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
+    # On to what plugins derive from them, such as the vertices of a rectangle. Nothing is left to do where the caller did.
+    for value in attached:
+        dr.enqueue(dr.ADMode.Forward, value)
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
 
 
 @dr.syntax
