@@ -58,7 +58,7 @@ def settle_tangents(scene, facts):
     if not attached:
         return
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
-    # On to what plugins derive from them, such as the vertices of a rectangle. Nothing is left to do where the caller did.
+    # On to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so already.
     for value in attached:
         dr.enqueue(dr.ADMode.Forward, value)
     dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
