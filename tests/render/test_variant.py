@@ -151,5 +151,5 @@ def test_many_switches_are_mentioned_once(monkeypatch):
 
     with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
         switch(4)
-    assert len(caught) == 1
+    assert sum("mitsuba.set_variant" in str(warning.message) for warning in caught) == 1
     assert mi.variant() == "llvm_ad_mono"
