@@ -17,6 +17,10 @@ ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
 NOT_SUPPORTED = (
     (
+        "`eta`, `specular` of `principled` with `spec_trans`",
+        "biased, see docs/gradients.md; use `diff_rough_dielectric`",
+    ),
+    (
         "eta of Mitsuba's own `dielectric`, `roughdielectric`",
         "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",
     ),

@@ -197,6 +197,23 @@ def angular_light():
     return lamp
 
 
+def instances(bsdf):
+    """A plate that is an instance of a group, in front of the wall and tilted against the camera."""
+    tilted = transform().translate([0, 0, 1.4]).rotate([0, 1, 0], 25).scale([0.8, 0.8, 0.2])
+    plate = {"type": "cube", "to_world": tilted, "bsdf": bsdf}
+    scene = room(
+        light={"type": "point", "position": [1.9, 0.0, 2.0], "intensity": 10.0}, sensor=camera(fov=6.0, start=3.0)
+    )
+    del scene["side"]
+    scene["wall"]["to_world"] = transform().scale(3)
+    group = {"type": "shapegroup", "plate": plate}
+    return {
+        **scene,
+        "group": group,
+        "copy": {"type": "instance", "to_world": transform(), "group": {"type": "ref", "id": "group"}},
+    }
+
+
 def mirror_room(bsdf=None):
     """A large diffuse wall seen in a mirror; light and camera stand before both."""
     scene = room(
@@ -609,6 +626,26 @@ CASES = [
         5e-3,
         spp=4096,
         fd_spp=4096,
+    ),
+    Case(
+        "instance_moves",
+        "shape to_world",
+        lambda: instances({"type": "diffuse", "reflectance": 0.5}),
+        move("copy.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
+        fd_spp=4096,
+    ),
+    Case(
+        "glass_in_a_group",
+        "dielectric index, smooth",
+        lambda: instances({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
+        set_color("group.plate.bsdf.eta"),
+        1.5,
+        4e-3,
+        spp=8192,
+        fd_spp=8192,
     ),
     Case(
         "disk_light_moves",

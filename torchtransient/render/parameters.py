@@ -26,7 +26,12 @@ _INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdie
 _COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
 # Larger values are not copied into the table: textures of a real scene would fill the memory once more.
 _MAX_LISTED = 65536
-_BIASED = {("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated"}
+_PRINCIPLED = "biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md"
+_BIASED = {
+    ("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated",
+    ("Principled", "eta"): _PRINCIPLED,
+    ("Principled", "specular"): _PRINCIPLED,
+}
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
 _SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
@@ -152,12 +157,12 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
         return True, True, SILHOUETTES
     if name in _LIGHT_KEYS.get(node.class_name(), ()):
         return True, True, CORRECT
+    if (node.class_name(), name) in _BIASED:
+        return True, name in ("eta", "specular"), _BIASED[node.class_name(), name]
     if name == "eta" and type(node).__name__.startswith("Diff"):
         return True, True, CORRECT
     if name == "eta" and isinstance(node, mi.BSDF):
         return True, True, "biased where light is refracted: the path length does not follow this index"
-    if (node.class_name(), name) in _BIASED:
-        return True, False, _BIASED[node.class_name(), name]
     if flags & mi.ParamFlags.NonDifferentiable:
         return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
     if mi.is_spectral and node.class_name().startswith(_COEFFICIENT_CLASSES) and name in ("value", "data"):

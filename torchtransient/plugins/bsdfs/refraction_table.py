@@ -36,14 +36,15 @@ class RefractionTable:
         self.refresh()
 
     @staticmethod
-    def of(scene: Any) -> RefractionTable | None:
+    def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractionTable | None:
         """The table of ``scene``, or None when nothing in it refracts through a lobe that can be connected to.
 
+        ``bsdfs``: those of the scene where they are known already.
         Raises SceneError for a blend of two refractive BSDFs with different indices, where a connection has no single
         optical length, and for a refractive plugin that does not expose ``eta``.
         """
         size, entries = 1, []
-        for bsdf in _bsdfs_of_scene(scene):
+        for bsdf in bsdfs if bsdfs is not None else bsdfs_of_scene(scene):
             number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
             size = max(size, number + 1)
             leaf = _refractive_leaf(bsdf)
@@ -70,7 +71,8 @@ class RefractionTable:
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))
 
 
-def _bsdfs_of_scene(scene: Any) -> list[Any]:
+def bsdfs_of_scene(scene: Any) -> list[Any]:
+    """The outermost BSDFs of a scene, those of shape groups included, each once."""
     shapes = scene.shapes()
     if any(shape.class_name() == "Instance" for shape in shapes):
         # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.

@@ -7,14 +7,15 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.bsdfs.refraction_table import RefractionTable
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
 from torchtransient.plugins.sampling.distant import DistantReference
 
 
 class SceneFacts:
     """Static choices of the kernels.
 
-    ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups. ``distant``: reference sphere of
+    ``bsdfs``: the outermost BSDFs. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups.
+    ``distant``: reference sphere of
     infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
     BSDFs, None when there are none. The remaining ones describe which gradients are asked for: ``geometry`` (path
     lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
@@ -24,7 +25,8 @@ class SceneFacts:
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, delta: bool, instances: bool, distant: DistantReference | None, refraction=None):
+    def __init__(self, bsdfs: list, delta: bool, instances: bool, distant: DistantReference | None, refraction=None):
+        self.bsdfs = bsdfs
         self.delta = delta
         self.instances = instances
         self.distant = distant
@@ -65,13 +67,17 @@ class SceneFacts:
         """The same facts with the gradients that the scene's attached parameters ask for."""
         light, sensor_moves, index = False, False, False
         shapes = any(shape.parameters_grad_enabled() for shape in scene.shapes())
+        # An instance does not speak of its own transformation.
+        shapes |= any(_attached(s, ("to_world",)) for s in scene.shapes() if s.class_name() == "Instance")
         emitter_shape = any(s.is_emitter() and s.parameters_grad_enabled() for s in scene.shapes())
         for emitter in scene.emitters():
             if emitter.get_shape() is None:
                 light |= _attached(emitter, ("position", "to_world"))
         sensor_moves = _attached(sensor, ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"))
-        for bsdf in unique_bsdfs(scene):
+        for bsdf in self.bsdfs:
             index |= _attached(bsdf, ("eta",))
+        if self.refraction is not None:
+            index |= dr.grad_enabled(self.refraction.table)
         facts = copy.copy(self)
         facts.geometry = shapes or light or sensor_moves or index
         facts.light_moves = light
@@ -80,7 +86,7 @@ class SceneFacts:
         facts.sphere_lights = facts.geometry and spheres
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
-        facts.lobe_probability = lobe_probability_table(scene) if facts.delta else None
+        facts.lobe_probability = lobe_probability_table(self.bsdfs) if facts.delta else None
         return facts
 
 
@@ -89,14 +95,14 @@ class SceneFacts:
 _CANCELLING = ("ThinDielectric", "SmoothPlastic")
 
 
-def lobe_probability_table(scene):
+def lobe_probability_table(bsdfs):
     """Which BSDFs, by their number in Dr.Jit's registry, hide the derivative of their lobes' probability; None if none
     does.
 
     Inside ``mask`` the opacity hides in the same place and is attached already; such nested lobes are left as they are.
     """
     numbers = []
-    for bsdf in unique_bsdfs(scene):
+    for bsdf in bsdfs:
         if bsdf.class_name() in _CANCELLING or (bsdf.class_name() == "TwoSidedBRDF" and _nests(bsdf)):
             numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]))
     if not numbers:
@@ -115,25 +121,16 @@ def _attached(plugin, names) -> bool:
     return any(key.split(".")[-1] in names and dr.grad_enabled(value) for key, value in mi.traverse(plugin))
 
 
-def unique_bsdfs(scene) -> list:
-    """The BSDFs of all shapes, each once."""
-    seen, result = set(), []
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is not None and bsdf.ptr not in seen:
-            seen.add(bsdf.ptr)
-            result.append(bsdf)
-    return result
-
-
 def scene_facts(scene, reference: DistantReference) -> SceneFacts:
     """Read the facts of a scene that do not depend on which gradients are asked for."""
-    delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in unique_bsdfs(scene))
+    bsdfs = bsdfs_of_scene(scene)
+    delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in bsdfs)
     infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
     instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
     return SceneFacts(
-        delta=delta or instances,
+        bsdfs=bsdfs,
+        delta=delta,
         instances=instances,
         distant=reference if infinite else None,
-        refraction=RefractionTable.of(scene),
+        refraction=RefractionTable.of(scene, bsdfs),
     )
