@@ -1,6 +1,7 @@
 """Scene dictionaries in metres. They need no Mitsuba variant: transforms are (4, 4) arrays, plugins are named by
 string."""
 
+from torchtransient.scenes.bottle import milk_bottle as milk_bottle
 from torchtransient.scenes.cavities import furnace as furnace
 from torchtransient.scenes.cavities import integrating_sphere as integrating_sphere
 from torchtransient.scenes.cavities import parallel_plates as parallel_plates
