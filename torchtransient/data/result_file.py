@@ -2,8 +2,9 @@
 
 Both hold the same names. Arrays have torch's order: `transient` float32 (..., C, T, H, W), radiance integrated over
 each bin; `steady` float32 (..., C, H, W); `edges_opl` float64 (T + 1,), metres. The numbers of the axis (`start_opl`,
-`bin_width_opl` in metres, `num_bins`), `format` and `metadata` (JSON) are attributes of the HDF5 file and
-zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
+`bin_width_opl` in metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON)
+are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second
+copy of it is needed.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class Result:
     steady: torch.Tensor
     axis: TimeAxis
     metadata: dict[str, Any] = field(default_factory=dict)
+    channels: tuple[str, ...] = ()
 
 
 def check_target(path: str | Path) -> Path:
@@ -82,6 +84,7 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
         "start_opl": axis.start_opl,
         "bin_width_opl": axis.bin_width_opl,
         "num_bins": axis.num_bins,
+        "channels": json.dumps(output.channels),
         "metadata": note,
     }
     arrays = {
@@ -117,6 +120,8 @@ def read_result(path: str | Path) -> Result:
             raise StorageError(f"result file: '{source}' is of format '{form}'; this version reads '{FORMAT}'.")
         axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         metadata = json.loads(str(values["metadata"]))
+        # Files of earlier versions have no names of channels.
+        channels = tuple(json.loads(str(values.get("channels", "[]"))))
         transient, steady = torch.from_numpy(values["transient"]), torch.from_numpy(values["steady"])
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TorchTransientError):
@@ -129,7 +134,7 @@ def read_result(path: str | Path) -> Result:
             f"result file: '{source}' holds a transient of shape {tuple(transient.shape)}; expected "
             f"(..., C, T, H, W) with T = {axis.num_bins}."
         )
-    return Result(transient, steady, axis, metadata)
+    return Result(transient, steady, axis, metadata, channels)
 
 
 @contextmanager

@@ -35,7 +35,8 @@ class RenderOutput:
 
     ``transient``: float32 (C, T, H, W), radiance integrated over each bin, so that its sum over T is ``steady`` (C,
     H, W) as far as the axis reaches. Leading dimensions come in the order (batch, sensor), each present only when
-    asked for. C is 1 in monochromatic variants and 3 (linear sRGB) otherwise. ``phasor`` is None: phasor films are
+    asked for. C is 1 in monochromatic variants, the number of response curves of a film that has some, and 3 (linear
+    sRGB) otherwise; ``channels`` holds the names. ``phasor`` is None: phasor films are
     not supported yet. ``transient`` is a view of the film's own memory in the order (H, W, T, C): ``.contiguous()``
     makes a copy in torch's order.
     """
@@ -45,6 +46,7 @@ class RenderOutput:
     phasor: torch.Tensor | None
     axis: TimeAxis
     stats: RenderStats
+    channels: tuple[str, ...] = ()
 
 
 def channels_first(

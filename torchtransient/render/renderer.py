@@ -146,6 +146,7 @@ class TransientRenderer(nn.Module):
         film = found[self._sensors[0]].film()
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
         self._cube_shape = tuple(film.cube_shape())
+        self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
 
@@ -254,7 +255,7 @@ class TransientRenderer(nn.Module):
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
         steady, transient = channels_first(steady, transient, leading)
-        return RenderOutput(transient, steady, None, self.axis, self._stats(job))
+        return RenderOutput(transient, steady, None, self.axis, self._stats(job), self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""

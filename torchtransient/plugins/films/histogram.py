@@ -8,6 +8,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.plugins.films.temporal_filter import check_stddev, make_temporal_filter
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
@@ -30,11 +31,16 @@ class TransientHDRFilm(mi.Film):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
+        which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
+
     A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
-    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
-    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
-    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
-    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
+    of the crop window with C = 1 in monochromatic variants, the number of response curves where there are some, and 3
+    otherwise (linear sRGB in spectral variants); there are no alpha or weight channels. Light outside the window is
+    not stored but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean over channels.
+    With the sum over the stored bins they make up the steady image, whatever the temporal filter: what it spreads
+    over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
@@ -57,6 +63,7 @@ class TransientHDRFilm(mi.Film):
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
         self.laser_scan_width = int(props.get("laser_scan_width", 0))
         self.laser_scan_height = int(props.get("laser_scan_height", 0))
+        self.response = SensorResponse.of(props)
         self._check()
         self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
         self.bands = []
@@ -117,6 +124,9 @@ class TransientHDRFilm(mi.Film):
         super().traverse(cb)
         for name in ("temporal_bins", "bin_width_opl", "start_opl"):
             cb.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
+        if self.response is not None:
+            for name, curve in zip(self.response.names, self.response.curves, strict=True):
+                cb.put(name, curve, mi.ParamFlags.NonDifferentiable)
 
     def base_channels_count(self):
         return self.channel_count()
@@ -124,8 +134,16 @@ class TransientHDRFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """1 in monochromatic variants, 3 otherwise."""
-        return 1 if mi.is_monochromatic else 3
+        """The number of :meth:`channel_names`."""
+        return len(self.channel_names())
+
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
+        "B").
+        """
+        if self.response is not None:
+            return self.response.names
+        return ("L",) if mi.is_monochromatic else ("R", "G", "B")
 
     def laser_count(self) -> int:
         """Number of laser positions of an exhaustive scan, otherwise 1."""
