@@ -15,6 +15,7 @@ importlib.import_module("torchtransient.render")
 del globals()["render"]
 
 _LAZY = {
+    "FrequencyAxis": "torchtransient.axes",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",
@@ -24,6 +25,7 @@ _LAZY = {
     "load": "torchtransient.render.scene_handle",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
+    "stokes": "torchtransient.stokes",
 }
 
 
@@ -32,7 +34,7 @@ def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])
-    value = module if name == "scenes" else getattr(module, name)
+    value = module if name in ("scenes", "stokes") else getattr(module, name)
     globals()[name] = value
     return value
 

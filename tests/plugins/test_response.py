@@ -108,7 +108,7 @@ def test_channels_are_integrals_over_wavelength():
 
 
 def test_wavelengths_are_drawn_where_the_curves_are():
-    response = mi.load_dict(film()).response
+    response = mi.load_dict(film()).curves
     assert isinstance(response, SensorResponse) and response.names == ("red", "blue", "ragged")
     u = mi.Float((np.arange(4096) + 0.5) / 4096)
     wavelengths, weight = response.sample(u)
@@ -126,7 +126,7 @@ def test_less_noise_than_wavelengths_drawn_for_the_eye():
     far_red = {"far": {"type": "regular", "wavelength_min": 760, "wavelength_max": 800, "values": "0, 1, 0"}}
     ours, _ = runs(mi.load_dict(description(film(bands=far_red))))
     relative = ours.std(0) / ours.mean(0)
-    response = mi.load_dict(film(bands=far_red)).response
+    response = mi.load_dict(film(bands=far_red)).curves
     # drawn for the eye, one wavelength in 40 would meet this curve: 4 x 1024 of them leave 10 percent of noise
     lengths, inverse = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(np.random.default_rng(0).random(1 << 14))))
     rows = np.array([np.array(row[0]) for row in response.matrix(lengths)]) * 4

@@ -42,10 +42,10 @@ class SensorResponse:
 
     def __init__(self, curves: dict):
         self.names = tuple(curves)
-        self.curves = list(curves.values())
+        self.textures = list(curves.values())
         low, high = math.inf, -math.inf
         resolution = math.inf
-        for curve in self.curves:
+        for curve in self.textures:
             a, b = curve.wavelength_range()
             low, high = min(low, float(a)), max(high, float(b))
             step = float(curve.spectral_resolution())
@@ -76,7 +76,7 @@ class SensorResponse:
     def _evaluate(self, wavelengths) -> list:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = wavelengths
-        return [mi.unpolarized_spectrum(curve.eval(si)) for curve in self.curves]
+        return [mi.unpolarized_spectrum(curve.eval(si)) for curve in self.textures]
 
     @staticmethod
     def of(props) -> SensorResponse | None:

@@ -1,0 +1,71 @@
+"""Degrees and angle of polarization where they have no derivative: no light, no polarization."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchtransient import stokes as st
+
+FUNCTIONS = {
+    "dop": st.degree_of_polarization,
+    "dolp": st.degree_of_linear_polarization,
+    "docp": st.degree_of_circular_polarization,
+    "aolp": st.angle_of_linear_polarization,
+    "normalized": st.normalized_components,
+}
+TINY = torch.finfo(torch.float32).tiny
+STATES = {
+    "dark": (0.0, 0.0, 0.0, 0.0),
+    "negative": (-1.0, 0.5, 0.1, 0.0),
+    "unpolarised": (1.0, 0.0, 0.0, 0.0),
+    "circular": (1.0, 0.0, 0.0, 1.0),
+    "hardly polarised": (1.0, 1e-30, -1e-30, 1e-30),
+    "denormal": (TINY / 4, TINY / 8, 0.0, 0.0),
+    "faint": (4 * TINY, 4 * TINY, 0.0, 0.0),
+    "bright": (1e30, 1e30, 1e25, 0.0),
+}
+
+
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_value_and_gradient_are_finite(name, state):
+    """Guards against sqrt'(0), 0 / 0 and atan2'(0, 0), and against a torch.where that hides them in the value but not
+    in the gradient. Squares of 1e-30 and 1e30 leave the range of float32: they must not be formed.
+    """
+    s = torch.tensor(STATES[state]).requires_grad_()
+    value = FUNCTIONS[name](s, 0)
+    assert bool(torch.isfinite(value).all())
+    value.sum().backward()
+    assert bool(torch.isfinite(s.grad).all()), s.grad
+    if state in ("dark", "negative", "denormal") and name != "aolp":
+        assert not s.grad.any()
+        assert not value.any()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_one_dark_pixel_does_not_spoil_the_picture(name):
+    """The gradient of a mean over a picture: NaN in one pixel would be NaN in every parameter."""
+    lit = torch.tensor([1.0, 0.3, -0.2, 0.1])
+    picture = torch.stack([lit, torch.zeros(4), torch.tensor([1.0, 0.0, 0.0, 0.0])], dim=1).requires_grad_()
+    FUNCTIONS[name](picture, 0).sum().backward()
+    alone = lit.clone().requires_grad_()
+    FUNCTIONS[name](alone, 0).sum().backward()
+    torch.testing.assert_close(picture.grad[:, 0], alone.grad)
+    assert not picture.grad[:, 1].any()
+
+
+def test_small_numbers_keep_their_digits():
+    """Values do not depend on the scale of the light, down to the smallest normal numbers."""
+    s = torch.tensor([5.0, 1.0, 2.0, 3.0])
+    for scale in (1e-37, 1e-20, 1.0, 1e30):
+        for function in FUNCTIONS.values():
+            torch.testing.assert_close(function(s * scale, 0), function(s, 0), rtol=1e-5, atol=0)
+
+
+def test_hardly_polarised_light_has_the_right_slope():
+    """Just beside the kink the slope is one, not zero and not infinite."""
+    for s1 in (1e-30, -1e-30):
+        s = torch.tensor([1.0, s1, 0.0, 0.0], requires_grad=True)
+        st.degree_of_polarization(s, 0).backward()
+        assert s.grad[1].item() == pytest.approx(1.0 if s1 > 0 else -1.0, rel=1e-6)

@@ -1,0 +1,232 @@
+"""Stokes vectors and Mueller matrices as torch tensors: degrees and angle of polarization, frames, ideal elements.
+
+A Stokes vector ``(S0, S1, S2, S3)`` describes light in a frame across its direction of travel, seen by the receiver
+who looks towards the source: the horizontal axis x, and y a quarter turn counter-clockwise from it. ``S1 > 0`` is
+horizontal light, ``S2 > 0`` light at +45 degrees, ``S3 > 0`` right circular light (Mitsuba's convention). For a camera
+of this library x points to the right of the image and y up.
+
+Tensors hold the four components along ``dim``: -5 in a transient ``(..., 4, C, T, H, W)`` (``TRANSIENT_DIM``), -4 in a
+steady image ``(..., 4, C, H, W)`` (``STEADY_DIM``). Angles are radians. Any real floating dtype and device.
+
+Nothing here divides zero by zero, forwards or backwards: dark entries and unpolarised ones have the value and the
+derivative zero, where the functions themselves have no derivative. Second derivatives exist away from these entries.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, UnitError
+
+TRANSIENT_DIM = -5
+STEADY_DIM = -4
+
+
+# ------------------------------------------------------------------------------------------------------ measures
+
+
+def degree_of_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
+    """``|(S1, S2, S3)| / S0``, the shape of ``stokes`` without ``dim``.
+
+    Zero where ``S0 <= floor``. Exceeds one where noise makes the components inconsistent: clamp it for display only. To
+    fit polarization, prefer a loss on :func:`normalized_components`, which has no kink at zero.
+
+    Raises ``ShapeError`` unless ``stokes`` has four real components along ``dim``, ``UnitError`` for a negative
+    ``floor``.
+    """
+    return _degree(stokes, dim, (1, 2, 3), floor)
+
+
+def degree_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
+    """``|(S1, S2)| / S0``; shapes, dark entries and errors as for :func:`degree_of_polarization`."""
+    return _degree(stokes, dim, (1, 2), floor)
+
+
+def degree_of_circular_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
+    """``S3 / S0`` in [-1, 1], positive for right circular light; otherwise as :func:`degree_of_polarization`."""
+    return normalized_components(stokes, dim, floor).select(dim, 2)
+
+
+def angle_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
+    """Angle of the plane of oscillation against the horizontal axis, in (-pi/2, pi/2], without ``dim``.
+
+    Counter-clockwise for the receiver. Zero, with derivative zero, where the linear part ``|(S1, S2)|`` does not exceed
+    ``floor``: there is no angle. The angle jumps by pi at its ends and its derivative grows as one over the linear
+    part; a loss on :func:`normalized_components` has neither problem. Errors as for :func:`degree_of_polarization`.
+    """
+    part = _components(stokes, dim)
+    _check_floor(floor)
+    s1, s2 = part[1], part[2]
+    largest = torch.maximum(s1.abs(), s2.abs()).detach()
+    # The angle does not depend on the scale; at scale one the squares in its derivative cannot underflow.
+    there = largest > max(floor, torch.finfo(stokes.dtype).tiny)
+    there = there & (torch.hypot(s1, s2).detach() > floor)
+    scale = torch.where(there, largest, 1.0)
+    s1, s2 = torch.where(there, s1, 1.0) / scale, torch.where(there, s2, 0.0) / scale
+    return 0.5 * torch.atan2(s2, s1)
+
+
+def normalized_components(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
+    """``(S1, S2, S3) / S0`` with three entries along ``dim``; zero, with derivative zero, where ``S0 <= floor``.
+
+    Its first two entries are ``DoLP (cos 2 AoLP, sin 2 AoLP)``: smooth through zero polarization and around the angle's
+    jump. Errors as for :func:`degree_of_polarization`.
+    """
+    part = _components(stokes, dim)
+    lit, s0 = _intensity(part[0], floor)
+    return torch.stack([torch.where(lit, p, 0.0) / s0 for p in part[1:]], dim=_axis(stokes, dim))
+
+
+def _degree(stokes: Tensor, dim: int, which: tuple[int, ...], floor: float) -> Tensor:
+    part = _components(stokes, dim)
+    lit, s0 = _intensity(part[0], floor)
+    used = torch.stack([part[i] for i in which])
+    largest = used.abs().amax(0).detach()
+    polarized = lit & (largest > torch.finfo(stokes.dtype).tiny)
+    # At scale one no square underflows, and the root is taken of a number between one and three.
+    scale = torch.where(polarized, largest, 1.0)
+    unit = torch.where(polarized, used, 0.0) / scale
+    length = torch.where(polarized, unit.square().sum(0), 1.0).sqrt() * scale
+    return torch.where(polarized, length, 0.0) / s0
+
+
+def _intensity(s0: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+    """Where there is light, and a divisor that is one elsewhere."""
+    _check_floor(floor)
+    lit = s0 > max(floor, torch.finfo(s0.dtype).tiny)
+    return lit, torch.where(lit, s0, 1.0)
+
+
+# -------------------------------------------------------------------------------------------------------- frames
+
+
+def rotate_frame(stokes: Tensor, angle: Tensor | float, dim: int) -> Tensor:
+    """The same light in a frame turned counter-clockwise (for the receiver) by ``angle``; the shape of ``stokes``.
+
+    Light at the angle ``a`` reads ``a - angle`` in the new frame. ``angle``: a number, or a tensor that broadcasts
+    against ``stokes`` without ``dim``. Raises ``ShapeError``.
+    """
+    s0, s1, s2, s3 = _components(stokes, dim)
+    double = 2 * torch.as_tensor(angle, dtype=stokes.dtype, device=stokes.device)
+    c, s = torch.cos(double), torch.sin(double)
+    turned = c * s1 + s * s2, c * s2 - s * s1
+    if turned[0].shape != s0.shape:
+        raise ShapeError(
+            f"angle: expected a shape that broadcasts to {tuple(s0.shape)}, that of the Stokes tensor without its "
+            f"components, got {tuple(double.shape)}."
+        )
+    return torch.stack([s0, *turned, s3], dim=_axis(stokes, dim))
+
+
+def apply_mueller(matrix: Tensor, stokes: Tensor, dim: int) -> Tensor:
+    """``M S``: what an element makes of light. ``matrix``: (4, 4); result in the shape of ``stokes``.
+
+    Several elements: multiply their matrices, the one that the light meets first on the right. Raises ``ShapeError``.
+    """
+    _components(stokes, dim)
+    if matrix.shape != (4, 4):
+        raise ShapeError(f"matrix: expected a Mueller matrix of shape (4, 4), got {tuple(matrix.shape)}.")
+    return (matrix.to(stokes) @ stokes.movedim(dim, -1).unsqueeze(-1)).squeeze(-1).movedim(-1, _axis(stokes, dim))
+
+
+# ------------------------------------------------------------------------------------------------ ideal elements
+
+
+def rotator(angle: Tensor | float) -> Tensor:
+    """Change to a frame turned counter-clockwise by ``angle`` (a number or a tensor ``(...)``), shape (..., 4, 4)."""
+    double = 2 * _floating(angle)
+    c, s = torch.cos(double), torch.sin(double)
+    o, i = torch.zeros_like(c), torch.ones_like(c)
+    return _matrix(((i, o, o, o), (o, c, s, o), (o, -s, c, o), (o, o, o, i)))
+
+
+def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0.0) -> Tensor:
+    """Polarizer that passes light oscillating at ``angle``; shape (..., 4, 4).
+
+    ``extinction``: power transmitted of the light across it, relative to that along it, in [0, 1]: 0 is ideal, real
+    sensors have 1/100 to 1/400. Raises ``UnitError`` outside of that range.
+    """
+    double, e = _together(2 * _floating(angle), _floating(extinction))
+    if bool(((e < 0) | (e > 1)).any()):
+        raise UnitError(f"extinction: expected numbers in [0, 1], got {extinction!r}.")
+    c, s = torch.cos(double), torch.sin(double)
+    plus, minus = 0.5 * (1 + e), 0.5 * (1 - e)
+    # The root has no slope at zero; an ideal polarizer's derivative by its extinction leaves the cross terms out.
+    root = torch.where(e > 0, torch.where(e > 0, e, 1.0).sqrt(), 0.0)
+    o = torch.zeros_like(c)
+    a, b = plus * c * c + root * s * s, plus * s * s + root * c * c
+    m = (plus - root) * s * c
+    return _matrix(((plus, minus * c, minus * s, o), (minus * c, a, m, o), (minus * s, m, b, o), (o, o, o, root)))
+
+
+def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
+    """Wave plate with its fast axis at ``angle`` that delays the other axis by ``delay`` radians; shape (..., 4, 4).
+
+    A quarter-wave plate has pi/2, a half-wave plate pi.
+    """
+    double, phase = _together(2 * _floating(angle), _floating(delay))
+    c, s, cd, sd = torch.cos(double), torch.sin(double), torch.cos(phase), torch.sin(phase)
+    o, i = torch.zeros_like(c), torch.ones_like(c)
+    m = (1 - cd) * s * c
+    return _matrix(
+        (
+            (i, o, o, o),
+            (o, c * c + cd * s * s, m, -sd * s),
+            (o, m, s * s + cd * c * c, sd * c),
+            (o, sd * s, -sd * c, cd),
+        )
+    )
+
+
+def circular_polarizer(left_handed: bool = False) -> Tensor:
+    """Ideal polarizer for right (or left) circular light; shape (4, 4)."""
+    sign = -0.5 if left_handed else 0.5
+    matrix = torch.zeros(4, 4)
+    matrix[0, 0] = matrix[3, 3] = 0.5
+    matrix[0, 3] = matrix[3, 0] = sign
+    return matrix
+
+
+def depolarizer() -> Tensor:
+    """Keeps the power and forgets the polarization; shape (4, 4)."""
+    matrix = torch.zeros(4, 4)
+    matrix[0, 0] = 1
+    return matrix
+
+
+# ------------------------------------------------------------------------------------------------------- checks
+
+
+def _components(stokes: Tensor, dim: int) -> tuple[Tensor, ...]:
+    if not stokes.dtype.is_floating_point:
+        raise ShapeError(f"stokes: expected real floating point numbers, got {stokes.dtype}.")
+    if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
+        raise ShapeError(
+            f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}. They are along -5 in "
+            "a transient (..., 4, C, T, H, W) and along -4 in a steady image (..., 4, C, H, W); only polarized "
+            "variants render them."
+        )
+    return torch.unbind(stokes, dim)
+
+
+def _axis(stokes: Tensor, dim: int) -> int:
+    return dim % stokes.ndim
+
+
+def _check_floor(floor: float) -> None:
+    if not floor >= 0:
+        raise UnitError(f"floor: expected a number of at least 0, got {floor!r}.")
+
+
+def _floating(value: Tensor | float) -> Tensor:
+    tensor = torch.as_tensor(value)
+    return tensor if tensor.dtype.is_floating_point else tensor.to(torch.get_default_dtype())
+
+
+def _together(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    return a + torch.zeros_like(b), b + torch.zeros_like(a)
+
+
+def _matrix(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
