@@ -18,8 +18,11 @@ from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.render.description import Description
 
-# Steady integrators whose parameters mean the same for `transient_path`.
-_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
 _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 # What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
 _STEADY_FILMS = ("hdrfilm", "specfilm")
@@ -292,14 +295,12 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
-        if plugin in _PATH_INTEGRATORS:
-            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        if plugin in _COUNTERPARTS:
+            _become(state, index, _COUNTERPARTS[plugin], keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
-                f"stand "
-                "in for: "
-                f"{', '.join(_PATH_INTEGRATORS)}."
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
