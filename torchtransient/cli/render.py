@@ -25,8 +25,9 @@ from torchtransient.cli.options import assignments, load_scene, scene_options, s
 def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
-    The file holds transient (C, T, H, W), steady (C, H, W), the time axis in metres of optical path, and how it was
-    made; torchtransient.data.result_file.read_result reads it.
+    The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
+    polarized variant, the time axis in metres of optical path, and how it was made;
+    torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
     from torchtransient.vis.overview import check_picture, plot_overview
@@ -45,15 +46,14 @@ def command(scene: Path, **options: Any) -> None:
     output = _render(described, values, axis, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats = output.stats
+    dims = "Stokes x C x T x H x W" if output.polarized else "C x T x H x W"
     click.echo(
-        f"{target}: {' x '.join(map(str, output.transient.shape))} (C x T x H x W), {stats.spp} samples per pixel, "
+        f"{target}: {' x '.join(map(str, output.transient.shape))} ({dims}), {stats.spp} samples per pixel, "
         f"{stats.seconds:.1f} s, {stats.variant}, {stats.temporal_filter} filter"
     )
     _report_energy(output)
     if options["overview"]:
-        plot_overview(
-            output.transient, output.steady, output.axis, options["overview"], pixel=options["pixel"], title=scene.name
-        )
+        plot_overview(*_power(output), output.axis, options["overview"], pixel=options["pixel"], title=scene.name)
         click.echo(f"{options['overview']}: overview")
 
 
@@ -76,10 +76,15 @@ def _render(described: Any, values: dict[str, Any], axis: Any, options: dict[str
         )
 
 
+def _power(output: Any) -> tuple[Any, Any]:
+    """Transient and steady image without the components that describe the polarization."""
+    return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
+
+
 def _report_energy(output: Any) -> None:
     """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
     before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
-    inside = _mean_over_channels(output.transient)
+    inside = _mean_over_channels(_power(output)[0])
     total = before + after + inside
     if total > 0 and before + after > 0.001 * total:
         axis = output.axis

@@ -1,9 +1,10 @@
 """A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Both hold the same names. Arrays have torch's order: `transient` float32 (..., C, T, H, W), radiance integrated over
-each bin; `steady` float32 (..., C, H, W); `edges_opl` float64 (T + 1,), metres. The numbers of the axis (`start_opl`,
-`bin_width_opl` in metres, `num_bins`), `format` and `metadata` (JSON) are attributes of the HDF5 file and
-zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
+each bin; `steady` float32 (..., C, H, W); polarized variants have four Stokes components before C; `edges_opl` float64
+(T + 1,), metres. The numbers of the axis (`start_opl`, `bin_width_opl` in metres, `num_bins`), `format` and `metadata`
+(JSON) are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no
+second copy of it is needed.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.axes import TimeAxis
+from torchtransient.render.variant import stokes_components
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,9 @@ class RenderOutput:
 
     ``transient``: float32 (C, T, H, W), radiance integrated over each bin, so that its sum over T is ``steady`` (C,
     H, W) as far as the axis reaches. Leading dimensions come in the order (batch, sensor), each present only when
-    asked for. C is 1 in monochromatic variants and 3 (linear sRGB) otherwise. ``phasor`` is None: phasor films are
+    asked for. C is 1 in monochromatic variants and 3 (linear sRGB) otherwise. In polarized variants the Stokes
+    components S0, S1, S2, S3 come before C: (4, C, T, H, W) and (4, C, H, W), in the sensor's frame (x to the right of
+    the picture, y up, as the sensor sees it). ``phasor`` is None: phasor films are
     not supported yet. ``transient`` is a view of the film's own memory in the order (H, W, T, C): ``.contiguous()``
     makes a copy in torch's order.
     """
@@ -46,13 +49,26 @@ class RenderOutput:
     axis: TimeAxis
     stats: RenderStats
 
+    @property
+    def polarized(self) -> bool:
+        """Whether the Stokes components come before the channels."""
+        return stokes_components(self.stats.variant) > 1
+
 
 def channels_first(
-    steady: torch.Tensor, transient: torch.Tensor, leading: tuple[int, ...]
+    steady: torch.Tensor, transient: torch.Tensor, leading: tuple[int, ...], components: int = 1
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """From the film's layout, with or without one dimension of items, to torch's with the ``leading`` dimensions."""
+    """From the film's layout, with or without one dimension of items, to torch's with the ``leading`` dimensions.
+
+    ``components``: Stokes components that the film's channels consist of; more than one get a dimension of their own.
+    """
     steady = steady.reshape(*leading, *steady.shape[-3:])
     transient = transient.reshape(*leading, *transient.shape[-4:])
+    if components > 1:
+        steady, transient = steady.unflatten(-1, (components, -1)), transient.unflatten(-1, (components, -1))
     n = len(leading)
     lead = tuple(range(n))
-    return steady.permute(*lead, n + 2, n, n + 1), transient.permute(*lead, n + 3, n + 2, n, n + 1)
+    return (
+        steady.permute(*lead, *range(n + 2, steady.ndim), n, n + 1),
+        transient.permute(*lead, *range(n + 3, transient.ndim), n + 2, n, n + 1),
+    )

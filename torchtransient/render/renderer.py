@@ -29,7 +29,7 @@ from torchtransient.render.engine import Item, RenderJob
 from torchtransient.render.output import RenderOutput, RenderStats, channels_first
 from torchtransient.render.parameters import ParameterInfo
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.variant import active_variant, device_type
+from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
@@ -253,7 +253,7 @@ class TransientRenderer(nn.Module):
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, transient = channels_first(steady, transient, leading)
+        steady, transient = channels_first(steady, transient, leading, stokes_components(self.scene.variant))
         return RenderOutput(transient, steady, None, self.axis, self._stats(job))
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:

@@ -31,9 +31,10 @@ class TransientHDRFilm(mi.Film):
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
     A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
-    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
-    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
-    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
+    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones), in polarized
+    ones four times as many: all of S0, then S1, S2, S3, in the sensor's frame. There are no alpha or weight channels.
+    Light outside the window is not stored but counted: ``energy_before`` and ``energy_after`` are sums over pixels of
+    the mean over channels (of S0). With the sum over the stored bins they make up the steady image,
     whatever the temporal filter: what it spreads over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
@@ -124,8 +125,8 @@ class TransientHDRFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """1 in monochromatic variants, 3 otherwise."""
-        return 1 if mi.is_monochromatic else 3
+        """1 in monochromatic variants and 3 otherwise, times 4 Stokes components in polarized ones."""
+        return (1 if mi.is_monochromatic else 3) * (4 if mi.is_polarized else 1)
 
     def laser_count(self) -> int:
         """Number of laser positions of an exhaustive scan, otherwise 1."""
@@ -161,8 +162,6 @@ class TransientHDRFilm(mi.Film):
         """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"transient_hdr_film: arbitrary output variables are not supported, got {list(aovs)}.")
-        if mi.is_polarized:
-            raise SceneError("transient_hdr_film: polarized variants are not supported; use the unpolarized one.")
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
