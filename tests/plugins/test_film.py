@@ -213,7 +213,7 @@ def test_four_channels_a_colour_in_polarized_variants():
 
 
 def test_row_too_large(monkeypatch):
-    monkeypatch.setattr("torchtransient.plugins.films.histogram.MAX_ARRAY_ENTRIES", 100)
+    monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", 100)
     with pytest.raises(StorageError, match="fewer bins"):
         make_film().prepare()
 
