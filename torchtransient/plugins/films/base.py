@@ -59,9 +59,9 @@ class TimeResolvedFilm(mi.Film):
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
         return None
 
-    def lane(self, job, base, match, tangents: bool = False) -> Lane:
+    def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
         """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
         """
         return Lane(self, self.bands[job.band][2], base, match)
 
