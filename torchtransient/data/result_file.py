@@ -3,9 +3,9 @@
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
 (..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. The numbers of the axis
-(`start_opl`, and for a transient `bin_width_opl`, in metres, `num_bins`), `format` and `metadata` (JSON) are
-attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second
-copy of it is needed.
+(`start_opl`, and for a transient `bin_width_opl`, in metres, `num_bins`), `channels` (JSON: the names
+of the C channels), `format` and `metadata` (JSON) are attributes of the HDF5 file and zero-dimensional arrays of the
+`.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ class Result:
     metadata: dict[str, Any] = field(default_factory=dict)
     phasor: torch.Tensor | None = None
     frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
 
 
 def check_target(path: str | Path) -> Path:
@@ -84,7 +85,7 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
     measured, numbers = _measured(output)
-    entries: dict[str, Any] = {"format": FORMAT, **numbers, "metadata": note}
+    entries: dict[str, Any] = {"format": FORMAT, **numbers, "channels": json.dumps(output.channels), "metadata": note}
     arrays = {"steady": output.steady.detach().cpu().numpy(), **measured}
     with _replacing(target) as unfinished:
         if target.suffix.lower() in _HDF5:
@@ -154,12 +155,14 @@ def read_result(path: str | Path) -> Result:
 def _result(values: Mapping[str, Any]) -> Result:
     metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
     start = float(values["start_opl"])
+    # Files of earlier versions have no names of channels.
+    channels = tuple(json.loads(str(values.get("channels", "[]"))))
     if "phasor" in values:
         frequencies = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), start)
         phasor = torch.from_numpy(values["phasor"])
-        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies)
+        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies, channels=channels)
     axis = TimeAxis(start, float(values["bin_width_opl"]), int(values["num_bins"]))
-    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata)
+    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata, channels=channels)
 
 
 @contextmanager

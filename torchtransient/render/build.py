@@ -269,11 +269,12 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
 
 
 def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
-    """Turn a node into another plugin; keep the named properties and every child object."""
+    """Turn a node into another plugin; keep the named properties, every child object and every spectrum."""
     import mitsuba as mi
 
     old = state.nodes[index].props
     children = {key for key, _ in _children(state, state.nodes[index])}
+    children |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
     for key in list(old.keys()):

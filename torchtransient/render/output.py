@@ -42,7 +42,8 @@ class RenderOutput:
       ``frequencies``, so that its value at zero frequency is ``steady``.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
-    variants and 3 (linear sRGB) otherwise. ``transient`` and ``phasor`` are views of the film's own memory with the
+    variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
+    their names. ``transient`` and ``phasor`` are views of the film's own memory with the
     rows first: ``.contiguous()`` makes a copy in torch's order.
     """
 
@@ -52,6 +53,7 @@ class RenderOutput:
     axis: TimeAxis | None
     stats: RenderStats
     frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
 
 
 def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...]) -> torch.Tensor:

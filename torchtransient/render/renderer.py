@@ -164,6 +164,7 @@ class TransientRenderer(nn.Module):
         self.axis: TimeAxis | None = None
         self.frequencies: FrequencyAxis | None = None
         self._cube_shape = tuple(film.cube_shape())
+        self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter = ""
         if film.response == "phasor":
@@ -282,8 +283,10 @@ class TransientRenderer(nn.Module):
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
         steady, stats = steady_channels_first(steady, leading), self._stats(job)
         if self.frequencies is not None:
-            return RenderOutput(None, steady, phasor_channels_first(response, leading), None, stats, self.frequencies)
-        return RenderOutput(transient_channels_first(response, leading), steady, None, self.axis, stats)
+            phasor = phasor_channels_first(response, leading)
+            return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
+        transient = transient_channels_first(response, leading)
+        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""

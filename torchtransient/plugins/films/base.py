@@ -8,6 +8,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.lane import AdjointLane, Lane
+from torchtransient.plugins.films.response import SensorResponse
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -24,6 +25,8 @@ class TimeResolvedFilm(mi.Film):
     shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
     integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
     handed over as ``opl - start_opl`` in double precision.
+
+    Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
     """
 
     plugin = "time-resolved film"
@@ -37,10 +40,17 @@ class TimeResolvedFilm(mi.Film):
         self.start_opl = float(props.get("start_opl", 0.0))
         if not abs(self.start_opl) < float("inf"):
             raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
+        self.curves = SensorResponse.of(props)
         self.bands = []
         self.steady = None
         self.outside = None
         self._offset_distribution = None
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        if self.curves is not None:
+            for name, curve in zip(self.curves.names, self.curves.textures, strict=True):
+                cb.put(name, curve, mi.ParamFlags.NonDifferentiable)
 
     def base_channels_count(self):
         return self.channel_count()
@@ -74,8 +84,16 @@ class TimeResolvedFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """1 in monochromatic variants, 3 otherwise."""
-        return 1 if mi.is_monochromatic else 3
+        """The number of :meth:`channel_names`."""
+        return len(self.channel_names())
+
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
+        "B").
+        """
+        if self.curves is not None:
+            return self.curves.names
+        return ("L",) if mi.is_monochromatic else ("R", "G", "B")
 
     def band_rows(self) -> int:
         """Rows of one storage band: as many as 32-bit indices allow."""

@@ -23,11 +23,16 @@ class TransientHDRFilm(TimeResolvedFilm):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
-    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
-    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
-    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
-    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
-    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
+        which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
+
+    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T,
+    C)`` of the crop window with C = 1 in monochromatic variants, the number of response curves where there are
+    some, and 3 otherwise (linear sRGB in spectral variants); there are no alpha or weight channels. Light outside
+    the window is not stored but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean
+    over channels. With the sum over the stored bins they make up the steady image, whatever the temporal filter:
+    what it spreads over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the

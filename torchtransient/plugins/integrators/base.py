@@ -180,6 +180,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sensor.sample_ray_differential(
                 time=time, sample1=wavelength, sample2=position, sample3=aperture
             )
+            if film.curves is not None:
+                ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
         return sampler, ray, ray_weight, scale, row, column
 
@@ -217,7 +219,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _render_pass(self, scene, sensor, film, job):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         base, pixel = self.lane_bases(film, job, row, column)
         lane = film.lane(job, base, match, self.max_depth)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
@@ -261,7 +263,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -304,7 +306,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         base, pixel = self.lane_bases(film, job, row, column)
         lane = film.lane(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(sensor, film, ray)
