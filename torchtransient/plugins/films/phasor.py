@@ -55,7 +55,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "phasor_hdr_film"
-    response = "phasor"
+    measures = "phasor"
     has_window = False
 
     def __init__(self, props):
