@@ -714,8 +714,8 @@ CASES = [
 def weights(scene_film):
     """Loss weights, of the shape that lies behind a pixel.
 
-    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors a pattern in which no
-    two real or imaginary parts weigh the same.
+    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors a pattern in which
+    no two real or imaginary parts weigh the same.
     """
     if scene_film.measures == "phasor":
         shape = scene_film.cube_shape()[2:]

@@ -71,7 +71,8 @@ class TimeResolvedFilm(mi.Film):
 
     def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
         """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of
+        contributions (``put``).
         """
         return Lane(self, self.bands[job.band][2], base, match)
 

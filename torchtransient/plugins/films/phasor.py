@@ -6,9 +6,7 @@ import math
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventLane, events_at_most, rotation
@@ -28,22 +26,26 @@ class PhasorHDRFilm(TimeResolvedFilm):
         Any frequencies, zero and negative ones too.
     ``frequency_first``, ``frequency_step`` (float), ``frequency_count`` (int)
         A uniform grid.
-    ``wl_mean`` (float, 100), ``wl_sigma`` (float, 1000), ``temporal_bins`` (int, 4096), ``bin_width_opl`` (float, 0.003)
-        As in mitransient 1.x, also when nothing is given: the frequencies of the discrete Fourier transform of that many
-        bins that lie within ``1 / wl_mean +- 3 sigma``, with ``sigma = 1 / (6 wl_sigma)``, and not below zero.
+    ``wl_mean`` (float, 100), ``wl_sigma`` (float, 1000), ``temporal_bins`` (int, 4096), ``bin_width_opl`` (0.003)
+        As in mitransient 1.x, also when nothing is given: the frequencies of the discrete Fourier transform of that
+        many bins that lie within ``1 / wl_mean +- 3 sigma``, ``sigma = 1 / (6 wl_sigma)``, and not below zero.
 
     ``start_opl`` (float, 0)
         Where the phase is zero, in metres of optical path: at 0, when the light leaves the emitter.
 
     A uniform grid, however it is given, is faster than other lists: one complex multiplication for each step.
 
-    A phasor is integrated over time: its value at frequency zero is the steady image, and nothing is lost outside a
-    window. It is what a histogram's transform would be with infinitely narrow bins. ``develop()`` returns steady ``(H, W,
-    C)`` and phasors ``(H, W, F, 2 C)`` of the crop window: real and imaginary part for every channel in turn, C = 1 in
-    monochromatic variants and 3 otherwise (linear sRGB in spectral ones).
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, see :mod:`.response`.
 
-    Phases are counted in double precision, in whole turns and a rest; the rest is good to 1e-6 cycles. Path lengths come
-    from single-precision positions: at 1 km, a coordinate is good to 3e-5 m, which is 3e-3 cycles of a wavelength of 1 cm.
+    A phasor is integrated over time: its value at frequency zero is the steady image, and nothing is lost outside a
+    window. It is what a histogram's transform would be with infinitely narrow bins. ``develop()`` returns steady
+    ``(H, W, C)`` and phasors ``(H, W, F, 2 C)`` of the crop window: real and imaginary part for every channel in turn,
+    C = 1 in monochromatic variants, the number of response curves where there are some, and 3 otherwise (linear sRGB
+    in spectral variants).
+
+    Phases are counted in double precision, in whole turns and a rest; the rest is good to 1e-6 cycles. Path lengths
+    come from single-precision positions: at 1 km a coordinate is good to 3e-5 m, 3e-3 cycles of a wavelength of 1 cm.
 
     The film is smooth in time: gradients through the path length need no temporal filter, and filter settings of an
     integrator are ignored. The spatial filter and double precision above 2^16 samples per pixel are as in
@@ -96,7 +98,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         return EventLane(self, self.bands[job.band], base, match, job, depth, tangents)
 
     def turns(self, frequency, opl_from_start):
-        """Cosine and sine of ``2 pi frequency opl``; both are doubles, the whole turns are taken off before the cast."""
+        """Cosine and sine of ``2 pi frequency opl`` for doubles; whole turns are taken off before the cast."""
         return rotation(frequency * opl_from_start)
 
     def put(self, cube, base, opl_from_start, value, active):
@@ -134,8 +136,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
     def read(self, adjoint, base, opl_from_start, active):
         """``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, frequency stride, entry stride)`` and ``base`` the index of the pixel's first value
-        in it.
+        ``adjoint`` is ``(flat array, frequency stride, entry stride)`` and ``base`` the index of the pixel's first
+        value in it.
         """
         flat, stride, entry = adjoint
         channels = self.channel_count()
@@ -160,8 +162,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
     def to_string(self):
         return (
             f"PhasorHDRFilm[\n  size = {self.size()},\n  crop = {self.crop_size()} at {self.crop_offset()},\n"
-            f"  frequencies = {self.frequency_count()} from {self.frequencies.min():g} to {self.frequencies.max():g} per "
-            f"metre,\n  start_opl = {self.start_opl}\n]"
+            f"  frequencies = {self.frequency_count()} from {self.frequencies.min():g} to {self.frequencies.max():g} "
+            f"per metre,\n  start_opl = {self.start_opl}\n]"
         )
 
 

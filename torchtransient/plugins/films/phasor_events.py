@@ -2,9 +2,9 @@
 
 The kernel that traces paths writes every event (optical path length, channel values) into memory of its path. A second
 kernel takes a block of frequencies of a pixel each, walks the events of that pixel and keeps its sums in registers: no
-two of its threads write to the same place as long as a pixel has few samples, and a uniform grid of frequencies costs one
-complex multiplication for each event and step. Summing inside of the first kernel would need one atomic addition for
-each path, frequency and channel.
+two of its threads write to the same place as long as a pixel has few samples, and a uniform grid of frequencies costs
+one complex multiplication for each event and step. Summing inside of the first kernel would need one atomic addition
+for each path, frequency and channel.
 """
 
 from __future__ import annotations

@@ -24,7 +24,9 @@ def frequencies_of(props) -> np.ndarray:
     if given == [GRID]:
         missing = [name for name in GRID if name not in props]
         if missing:
-            raise SceneError(f"phasor_hdr_film: a uniform grid needs {', '.join(GRID)}; {', '.join(missing)} is missing.")
+            raise SceneError(
+                f"phasor_hdr_film: a uniform grid needs {', '.join(GRID)}; {', '.join(missing)} is missing."
+            )
         count = int(props["frequency_count"])
         if count < 1:
             raise SceneError(f"phasor_hdr_film: frequency_count must be at least 1, got {count}.")
