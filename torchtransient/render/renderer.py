@@ -167,7 +167,7 @@ class TransientRenderer(nn.Module):
         self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter = ""
-        if film.response == "phasor":
+        if film.measures == "phasor":
             self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
             if self.temporal_filter != "auto":
                 raise SceneError(

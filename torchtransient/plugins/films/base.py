@@ -21,7 +21,7 @@ MAX_SINGLE_PRECISION_SAMPLES = 2**16
 class TimeResolvedFilm(mi.Film):
     """Abstract base of films that keep an array behind every pixel beside the steady image.
 
-    A subclass has ``plugin`` (its name in messages), ``response`` (what its array is: ``transient`` or ``phasor``), the
+    A subclass has ``plugin`` (its name in messages), ``measures`` (what its array is: ``transient`` or ``phasor``), the
     shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
     integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
     handed over as ``opl - start_opl`` in double precision.
@@ -30,7 +30,7 @@ class TimeResolvedFilm(mi.Film):
     """
 
     plugin = "time-resolved film"
-    response = "transient"
+    measures = "transient"
     exhaustive_scan = False
     # Whether the film has a window that light can miss, which is then counted in `outside`.
     has_window = True
@@ -69,9 +69,10 @@ class TimeResolvedFilm(mi.Film):
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
         return None
 
-    def lane(self, job, base, match, tangents: bool = False) -> Lane:
+    def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
         """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of
+        contributions (``put``).
         """
         return Lane(self, self.bands[job.band][2], base, match)
 

@@ -227,7 +227,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
         match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match)
+        lane = film.lane(job, base, match, self.max_depth)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
         for c, value in enumerate(match.to_channels(L)):
             dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
@@ -314,7 +314,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
         match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, tangents=True)
+        lane = film.lane(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(sensor, film, ray)
         t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
         if facts.sensor_moves:
