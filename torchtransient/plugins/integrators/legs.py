@@ -12,18 +12,20 @@ import mitsuba as mi
 
 from torchtransient.plugins.integrators.media.free_flight import medium_interaction, transmittance, walk
 from torchtransient.plugins.integrators.media.medium_vertex import medium_behind, reference
+from torchtransient.plugins.polarized import faded
 from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 
 
 class Arrival:
     """The vertex at the end of a leg; a plain object that only lives within one iteration.
 
-    ``si``: valid at surfaces. ``at``: the point of reference. ``valid``: something was hit. ``scatter, mei``: in a
-    medium; None without media. ``medium``: that of the leg's end, None without media.
+    ``si``: valid at surfaces. ``at``: the point of reference. ``valid``: something was hit. ``surface``: not in a
+    medium. ``scatter, mei``: in a medium; None without media. ``medium``: that of the leg's end, None without media.
     """
 
-    def __init__(self, si, at, valid, scatter=None, mei=None, medium=None):
-        self.si, self.at, self.valid, self.scatter, self.mei, self.medium = si, at, valid, scatter, mei, medium
+    def __init__(self, si, at, valid, surface, scatter=None, mei=None, medium=None):
+        self.si, self.at, self.valid, self.surface = si, at, valid, surface
+        self.scatter, self.mei, self.medium = scatter, mei, medium
 
 
 def first_leg(scene, media, ray, sampler, hide_emitters):
@@ -43,12 +45,33 @@ def next_leg(scene, media, ray, here, carried, sampler, active):
     if media is None:
         return scene.ray_intersect_preliminary(ray, active=active), {}
     medium = medium_behind(here.si, ray.d, here.medium, ~here.scatter)
+    carried = mi.unpolarized_spectrum(carried)
     return place_of(walk(scene, media, ray, medium, carried, sampler.next_1d(), lane_numbers(sampler), active))
 
 
 def place_of(end):
     """The end of a walk as (next surface, place)."""
     return end.pi, {"scatter": end.scatter, "t": end.t, "medium": end.medium, "walk": end.weight}
+
+
+def carried_on(β, place):
+    """The throughput at the end of a leg."""
+    return faded(β, place["walk"]) if place else β
+
+
+def connectable(media, here, smooth):
+    """Whether a vertex is connected to emitters: at surfaces where ``smooth``, in media that allow it."""
+    if media is None:
+        return smooth
+    allowed = True if media.emitter_sampling else here.mei.medium.use_emitter_sampling()
+    return dr.select(here.scatter, allowed, smooth)
+
+
+def unconnected(media, here, delta):
+    """Whether emission found from a vertex has no other strategy: at surfaces after a ``delta`` lobe."""
+    if media is None or media.emitter_sampling:
+        return delta
+    return delta | (here.scatter & ~here.mei.medium.use_emitter_sampling())
 
 
 def lane_numbers(sampler):
@@ -60,11 +83,12 @@ def arrive(pi, ray, place):
     """The vertex at the end of a leg."""
     if not place:
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-        return Arrival(si, si, si.is_valid())
+        return Arrival(si, si, si.is_valid(), mi.Bool(True))
     scatter = place["scatter"]
     mei = medium_interaction(ray, place["medium"], place["t"])
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, ~scatter)
-    return Arrival(si, reference(si, mei, scatter), si.is_valid() | scatter, scatter, mei, place["medium"])
+    at = reference(si, mei, scatter)
+    return Arrival(si, at, si.is_valid() | scatter, ~scatter, scatter, mei, place["medium"])
 
 
 def connect(scene, media, here, ds, u_em, sampler, active):

@@ -131,7 +131,7 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
         tracked = dr.select(collides, tracked, 1)
         factor = dr.select(analytic, factor, tracked)
         real = analytic | delta_real
-    return collides, real, t_new, dr.select(inside, factor, 1)
+    return collides, real, t_new, mi.UnpolarizedSpectrum(dr.select(inside, factor, 1))
 
 
 def across(scene, ray, pi, medium, passes):
@@ -202,7 +202,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
         visible = active & ~scene.ray_test(ray, active)
         inside = visible & (medium != None)  # noqa: E711
         σ_t = medium.get_majorant(medium_interaction(ray, medium, mi.Float(0)), inside)
-        T = attenuation(dr.select(inside, σ_t, 0), length)
+        T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
     else:
         rng = generator(numbers, lanes, SHADOW)
         t = mi.Float(0)
@@ -243,4 +243,4 @@ def thin_out(media, medium, ray, t, t_end, rng, inside):
         factor = dr.select(collides, dr.maximum(1 - σ_t / rate, 0), 1)
     if media.homogeneous:
         factor = dr.select(inside & analytic, attenuation(majorant, t_end - t), factor)
-    return collides, t_new, factor
+    return collides, t_new, mi.UnpolarizedSpectrum(factor)

@@ -37,17 +37,6 @@ class MediaFacts:
         """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
         return not (self.heterogeneous or self.open_boundaries)
 
-    def connects(self, here: Any, smooth: Any) -> Any:
-        """Whether a vertex is connected to emitters: at surfaces where ``smooth``, in media that allow it."""
-        allowed = True if self.emitter_sampling else here.mei.medium.use_emitter_sampling()
-        return dr.select(here.scatter, allowed, smooth)
-
-    def unconnected(self, here: Any, delta: Any) -> Any:
-        """Whether emission found from a vertex has no other strategy: at surfaces after a ``delta`` lobe."""
-        if self.emitter_sampling:
-            return delta
-        return delta | (here.scatter & ~here.mei.medium.use_emitter_sampling())
-
 
 def media_facts(scene: Any, sensor: Any) -> MediaFacts | None:
     """The facts of a scene's media, None when it has none."""

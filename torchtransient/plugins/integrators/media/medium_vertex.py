@@ -23,6 +23,15 @@ def finite(value):
     return dr.select(dr.isfinite(value), value, 0)
 
 
+def unpolarizing(value):
+    """Scattering by ``value`` that leaves nothing of the polarization: what a scalar phase function says."""
+    if not mi.is_polarized:
+        return value
+    matrix = dr.zeros(mi.Spectrum)
+    matrix[0, 0] = value
+    return matrix
+
+
 def scatter_in_medium(media, here, d_em, u_lobe, u_dir, active, active_em, surface):
     """The scattering of the vertex ``here``, where it lies in a medium in place of that of its ``surface``.
 
@@ -44,8 +53,8 @@ def scatter_in_medium(media, here, d_em, u_lobe, u_dir, active, active_em, surfa
     bs.pdf = dr.select(scatter, w_pdf, bs.pdf)
     bs.eta = dr.select(scatter, 1, bs.eta)
     bs.sampled_type = dr.select(scatter, mi.UInt32(0), bs.sampled_type)
-    value = dr.select(scatter, finite(mi.unpolarized_spectrum(f)) * σ_s, mi.unpolarized_spectrum(value))
-    weight = dr.select(scatter, w, mi.unpolarized_spectrum(weight))
+    value = dr.select(scatter, unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s), value)
+    weight = dr.select(scatter, unpolarizing(w), weight)
     return value, dr.select(scatter, finite(f_pdf), pdf), bs, weight, dr.select(scatter, wo, out)
 
 
