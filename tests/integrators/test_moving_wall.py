@@ -50,10 +50,9 @@ def test_mean_arrival_of_a_moving_wall(fov, temporal_filter):
         scene, parameters=["wall.to_world"], spp=64, temporal_filter=temporal_filter, grad_seed="same"
     )
     z = torch.zeros((), requires_grad=True)
-    pose = (
-        torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0]))
-        + torch.nn.functional.one_hot(torch.tensor(2 * 4 + 3), 16).reshape(4, 4) * z
-    )
+    pose = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0])) + torch.nn.functional.one_hot(
+        torch.tensor(2 * 4 + 3), 16
+    ).reshape(4, 4) * z
     out = renderer({"wall.to_world": pose}, seed=0)
     centers = out.axis.centers_opl.float()
     histogram = out.transient.sum((0, 2, 3))

@@ -58,14 +58,14 @@ class TransientPath(TransientIntegrator):
         ctx = mi.BSDFContext()
 
         # ------------------------------------------------------------------- loop state
-        ray = mi.Ray3f(ray)  # Current ray
-        depth = mi.UInt32(0)  # Vertices so far
-        L = light_type()(0)  # Steady radiance
-        before, after = mi.Float(0), mi.Float(0)  # Energy outside the window
-        β = mi.Spectrum(1)  # Throughput before the current vertex
-        η = mi.Float(1)  # Index of the medium of the current ray
-        τ = mi.Float64(first_opl)  # Optical path length minus start_opl
-        prev = dr.zeros(mi.Interaction3f)  # Previous vertex
+        ray = mi.Ray3f(ray)                               # Current ray
+        depth = mi.UInt32(0)                              # Vertices so far
+        L = light_type()(0)                               # Steady radiance
+        before, after = mi.Float(0), mi.Float(0)          # Energy outside the window
+        β = mi.Spectrum(1)                                # Throughput before the current vertex
+        η = mi.Float(1)                                   # Index of the medium of the current ray
+        τ = mi.Float64(first_opl)                         # Optical path length minus start_opl
+        prev = dr.zeros(mi.Interaction3f)                 # Previous vertex
         prev.p = ray.o
         prev_pdf = mi.Float(1)
         prev_delta = mi.Bool(True)
@@ -74,7 +74,7 @@ class TransientPath(TransientIntegrator):
         if dr.hint(self.hide_emitters_, mode="scalar"):
             pi = behind_area_lights(scene, ray, pi)
         store = allocate(self.max_depth, facts) if record else {}
-        events = {} if record else lane.begin()  # What the film carries along
+        events = {} if record else lane.begin()           # What the film carries along
 
         while dr.hint(active, max_iterations=self.max_depth, label="transient_path"):
             active_next = mi.Bool(active)
@@ -168,23 +168,9 @@ class TransientPath(TransientIntegrator):
 
             if dr.hint(record, mode="scalar"):
                 write_vertex(
-                    store,
-                    depth,
-                    active,
-                    facts,
-                    ray_before,
-                    pi_before,
-                    β_before,
-                    τ,
-                    η_before,
-                    mis,
-                    rr,
-                    u_em,
-                    u_lobe,
-                    u_dir,
-                    active_em,
-                    is_delta,
-                    active_next,
+                    store, depth, active, facts,
+                    ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
+                    active_em, is_delta, active_next,
                 )
             pi = scene.ray_intersect_preliminary(ray, active=active_next)
             depth += 1

@@ -49,13 +49,13 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
     ``count`` is the number of recorded vertices and ``store`` the record. Must run with gradients suspended.
     """
     ctx = mi.BSDFContext()
-    i = mi.Int32(count) - 1  # Current vertex
+    i = mi.Int32(count) - 1                                            # Current vertex
     live = i >= 0
-    S, D = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)  # Suffixes beyond the current vertex
+    S, D = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)        # Suffixes beyond the current vertex
     next_p, next_n, next_d = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
     next_valid, next_η = mi.Bool(False), mi.Float(1)
-    a_o, a_d, a_w = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)  # Adjoint of the next ray; of its end's wi
-    a_η = mi.Float(0)  # Adjoint of the index along the next segment
+    a_o, a_d, a_w = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)     # Adjoint of the next ray; of its end's wi
+    a_η = mi.Float(0)                                                  # Adjoint of the index along the next segment
     while dr.hint(live, max_iterations=integrator.max_depth, label="transient_path reverse sweep"):
         k = mi.UInt32(i)
         v = read_vertex(store, k, live, ray0.time, ray0.wavelengths)
