@@ -38,7 +38,7 @@ from torchtransient.render.parameters import ParameterInfo
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.variant import active_variant, device_type
+from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
@@ -298,11 +298,12 @@ class TransientRenderer(nn.Module):
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, stats = steady_channels_first(steady, leading), self._stats(job)
+        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        steady = steady_channels_first(steady, leading, components)
         if self.frequencies is not None:
-            phasor = phasor_channels_first(response, leading)
+            phasor = phasor_channels_first(response, leading, components)
             return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
-        transient = transient_channels_first(response, leading)
+        transient = transient_channels_first(response, leading, components)
         return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
