@@ -16,7 +16,9 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
+from torchtransient.render.pulse_properties import write_pulse
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
 _COUNTERPARTS = {
@@ -47,7 +49,8 @@ class BuildOptions:
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
     that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``.
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``: shape
+    of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -58,6 +61,8 @@ class BuildOptions:
     transient: bool = False
     sampler: str | None = None
     frequencies: FrequencyAxis | None = None
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
 
 
 @dataclass
@@ -239,6 +244,8 @@ def _override_films(state: Any, options: BuildOptions) -> None:
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
+            write_pulse(state.nodes[film].props, "pulse", options.pulse)
+            write_pulse(state.nodes[film].props, "irf", options.irf)
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
