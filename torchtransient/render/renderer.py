@@ -34,6 +34,7 @@ from torchtransient.render.output import (
     transient_channels_first,
 )
 from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.plan import Plan
 from torchtransient.render.scene_handle import Scene, load, unknown_key
 from torchtransient.render.variant import active_variant, device_type
 
@@ -84,8 +85,10 @@ class TransientRenderer(nn.Module):
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
     gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with
-    the same number of samples.
+    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise. ``sampler``: plugin name of
+    a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -101,14 +104,21 @@ class TransientRenderer(nn.Module):
         max_depth: int | None = None,
         temporal_filter: str = "auto",
         sensors: int | Sequence[int] | str = 0,
-        effects: str = "auto",
+        effects: Plan | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
     ):
         super().__init__()
-        if effects != "auto":
-            raise SceneError(f"effects: only 'auto' is supported so far, got {effects!r}.")
+        if isinstance(effects, Plan):
+            scene = load(scene, variant=effects.variant)
+            if time_axis is None and frequencies is None:
+                time_axis, frequencies = effects.time_axis, effects.frequencies
+            max_depth = effects.max_depth if max_depth is None else max_depth
+            if temporal_filter == "auto" and effects.temporal_filter not in ("box", ""):
+                temporal_filter = effects.temporal_filter
+        elif effects != "auto":
+            raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
@@ -122,7 +132,8 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler)
+        integrator = effects.integrator if isinstance(effects, Plan) else None
+        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, integrator)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -134,7 +145,12 @@ class TransientRenderer(nn.Module):
     # --------------------------------------------------------------------------------------------------- set-up
 
     def _build_options(
-        self, time_axis: TimeAxis | None, frequencies: Any, max_depth: int | None, sampler: str | None
+        self,
+        time_axis: TimeAxis | None,
+        frequencies: Any,
+        max_depth: int | None,
+        sampler: str | None,
+        integrator: str | None,
     ) -> BuildOptions:
         if time_axis is not None and not isinstance(time_axis, TimeAxis):
             raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
@@ -145,8 +161,12 @@ class TransientRenderer(nn.Module):
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
             frequencies = FrequencyAxis(frequencies)
         axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies)
-        return self.scene.options_for(self._keys, options)
+        return self.scene.options_for(
+            self._keys,
+            BuildOptions(
+                axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, integrator=integrator
+            ),
+        )
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
         table = self.scene.parameters() if self._keys else {}
