@@ -16,6 +16,7 @@ del globals()["render"]
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
+    "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",
@@ -25,8 +26,10 @@ _LAZY = {
     "Plan": "torchtransient.render.plan",
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",
+    "losses": "torchtransient.losses",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
+    "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
 }
 
@@ -36,7 +39,7 @@ def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])
-    value = module if name in ("scenes", "stokes") else getattr(module, name)
+    value = module if _LAZY[name] == f"torchtransient.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

@@ -16,11 +16,16 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
-from torchtransient.render.nodes import children, find_child, is_film, is_integrator
+from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.pulse_properties import write_pulse
 
-# Steady integrators whose parameters mean the same for `transient_path`.
-_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
 _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 _TRANSIENT_PROPERTIES = (
     *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
@@ -48,8 +53,10 @@ class BuildOptions:
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
     that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``integrator``: plugin
-    name of a transient integrator that replaces the scene's, with the parameters that both have; None to keep it.
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``:
+    shape of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
+    ``integrator``: plugin name of a transient integrator that replaces the scene's, with the parameters that both have;
+    None to keep it.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -60,6 +67,8 @@ class BuildOptions:
     transient: bool = False
     sampler: str | None = None
     frequencies: FrequencyAxis | None = None
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
     integrator: str | None = None
 
 
@@ -207,6 +216,8 @@ def _override_films(state: Any, options: BuildOptions) -> None:
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
+            write_pulse(state.nodes[film].props, "pulse", options.pulse)
+            write_pulse(state.nodes[film].props, "irf", options.irf)
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
@@ -265,14 +276,13 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
         plugin = state.nodes[index].props.plugin_name()
         if options.integrator is not None and plugin != options.integrator:
             _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES)
-        elif plugin in _PATH_INTEGRATORS:
-            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        elif plugin in _COUNTERPARTS:
+            wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
+            _become(state, index, wanted, keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
-                f"stand "
-                "in for: "
-                f"{', '.join(_PATH_INTEGRATORS)}."
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)

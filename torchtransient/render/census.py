@@ -6,12 +6,11 @@ scene, through references, groups and nested plugins. What is declared and never
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.render.census_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
-from torchtransient.render.nodes import children, find_child, is_film, is_integrator
+from torchtransient.render.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")
@@ -22,8 +21,6 @@ POLARIZING_INTERFACES = (
 )  # fmt: skip
 # A single one of these shapes cannot be met twice in a row.
 _FLAT_SHAPES = ("rectangle", "disk")
-# Direct children of the scene that matter only where something refers to them.
-_DECLARATIONS = ("BSDF", "Medium", "Texture", "Volume", "PhaseFunction", "ReconstructionFilter", "Film", "Sampler")
 
 
 @dataclass(frozen=True)
@@ -67,8 +64,7 @@ class Census:
 def take_census(state: Any, folder_lookup: Any) -> Census:
     """Read a parser state. ``folder_lookup`` finds a file by the name that a scene uses, as Mitsuba would."""
     census = Census()
-    roots = list(_roots(state))
-    order = _reachable(state, roots)
+    order = reachable(state, roots(state))
     _note_unused(census, state, set(order))
     surfaces_of_interfaces: list[int] = []
     for index in order:
@@ -98,41 +94,10 @@ def name_of(state: Any, index: int) -> str:
     return f"{label}, {where}" if where else label
 
 
-# ---------------------------------------------------------------------------------------------------- reachability
-
-
-def _kind(node: Any) -> str:
-    """Mitsuba's kind of a node. It does not know plugins written in Python, whose kind our registry knows."""
-    from torchtransient.plugins import kind_of
-
-    kind = str(node.type).rsplit(".", 1)[-1]
-    if kind != "Unknown":
-        return kind
-    found = kind_of(node.props.plugin_name())
-    return {"bsdf": "BSDF", "medium": "Medium", "texture": "Texture", "film": "Film"}.get(found or "", "Unknown")
-
-
-def _roots(state: Any) -> Iterator[int]:
-    for _, index in children(state, state.root):
-        if _kind(state.nodes[index]) not in _DECLARATIONS:
-            yield index
-
-
-def _reachable(state: Any, roots: list[int]) -> list[int]:
-    seen: dict[int, None] = {}
-    waiting = list(reversed(roots))
-    while waiting:
-        index = waiting.pop()
-        if index not in seen:
-            seen[index] = None
-            waiting.extend(child for _, child in reversed(children(state, state.nodes[index])))
-    return list(seen)
-
-
 def _note_unused(census: Census, state: Any, used: set[int]) -> None:
     for _, index in children(state, state.root):
         node = state.nodes[index]
-        if index not in used and (_kind(node) == "Medium" or node.props.plugin_name() in POLARIZING_ELEMENTS):
+        if index not in used and (kind_of_node(node) == "Medium" or node.props.plugin_name() in POLARIZING_ELEMENTS):
             census.declared_only.append(Finding(node.props.plugin_name(), name_of(state, index)))
 
 
@@ -142,7 +107,7 @@ def _note_unused(census: Census, state: Any, used: set[int]) -> None:
 def _note_physics(census: Census, state: Any, index: int, interfaces: list[int]) -> None:
     node = state.nodes[index]
     plugin = node.props.plugin_name()
-    if _kind(node) == "Medium":
+    if kind_of_node(node) == "Medium":
         census.media.append(Finding("participating medium", name_of(state, index)))
     if plugin in POLARIZING_ELEMENTS:
         census.elements.append(Finding(plugin, name_of(state, index)))
@@ -172,7 +137,7 @@ def _note_film(census: Census, state: Any, node: Any) -> None:
     props = node.props
     for key, value in props.items():
         nested = isinstance(value, mi.Properties.ResolvedReference)
-        curve = nested and _kind(state.nodes[value.index()]) == "Texture"
+        curve = nested and kind_of_node(state.nodes[value.index()]) == "Texture"
         if curve or props.type(key) == mi.Properties.Type.Spectrum:
             census.bands.append(Finding(f"response curve {key!r}", props.plugin_name()))
     if census.film is not None:
@@ -212,10 +177,10 @@ def _note_albedo(census: Census, state: Any, order: list[int]) -> None:
         shapes = node.type == mi.ObjectType.Shape and node.props.plugin_name() not in ("instance", "shapegroup")
         bound = None
         if shapes:
-            surface = [child for _, child in children(state, node) if _kind(state.nodes[child]) == "BSDF"]
+            surface = [child for _, child in children(state, node) if kind_of_node(state.nodes[child]) == "BSDF"]
             # A shape without a BSDF is diffuse with an albedo of one half.
             bound = max((_reflectance(state, child) for child in surface), default=0.5)
-        elif _kind(node) == "Medium":
+        elif kind_of_node(node) == "Medium":
             bound = _largest(state, node, "albedo", 0.75)
         if bound is not None and bound > census.albedo:
             census.albedo, census.brightest = bound, name_of(state, index)
@@ -228,7 +193,7 @@ def _reflectance(state: Any, index: int) -> float:
     if plugin == "diffuse":
         return _largest(state, node, "reflectance", 0.5)
     if plugin in ("twosided", "blendbsdf", "bumpmap", "normalmap"):
-        nested = [child for _, child in children(state, node) if _kind(state.nodes[child]) == "BSDF"]
+        nested = [child for _, child in children(state, node) if kind_of_node(state.nodes[child]) == "BSDF"]
         return max((_reflectance(state, child) for child in nested), default=1.0)
     return 1.0
 
@@ -260,8 +225,8 @@ def _in_a_row(state: Any, order: list[int], interfaces: list[int]) -> bool:
     wanted, carriers = set(interfaces), []
     for index in order:
         node = state.nodes[index]
-        if node.type == mi.ObjectType.Shape and wanted & set(_reachable(state, [index])):
+        if node.type == mi.ObjectType.Shape and wanted & set(reachable(state, [index])):
             carriers.append(node.props.plugin_name())
-        elif _kind(node) == "Medium" and wanted & set(_reachable(state, [index])):
+        elif kind_of_node(node) == "Medium" and wanted & set(reachable(state, [index])):
             return True
     return len(carriers) > 1 or any(plugin not in _FLAT_SHAPES for plugin in carriers)

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.films.colour import ChannelMatch
+from torchtransient.plugins.films.colour import ChannelMatch, mean_of
 from torchtransient.plugins.integrators.base import Pass
 
 # Depth of a pilot's paths. Russian roulette ends most of them long before.
@@ -61,8 +61,8 @@ class _PilotLane:
     """Lists events, each path in slots of its own. The loops put twice per vertex, emission found and then emission
     sampled, which gives the depth."""
 
-    def __init__(self, weight, lanes: int, slots: int, spp: int):
-        self.weight, self.slots, self.spp = weight, slots, spp
+    def __init__(self, match, curves: bool, lanes: int, slots: int, spp: int):
+        self.match, self.curves, self.slots, self.spp = match, curves, slots, spp
         self.lane = dr.arange(mi.UInt32, lanes)
         size = slots * lanes
         self.opl = dr.zeros(mi.Float64, size)
@@ -75,7 +75,7 @@ class _PilotLane:
 
     def put(self, events, opl, value, active):
         puts, used = events["puts"], events["used"]
-        energy = dr.mean(mi.unpolarized_spectrum(value) * self.weight)
+        energy = self._energy(value)
         active = active & (energy != 0)
         slot, fits = dr.fma(self.lane, self.slots, used), active & (used < self.slots)
         dr.scatter(self.opl, opl, slot, fits)
@@ -85,6 +85,12 @@ class _PilotLane:
         events["puts"] = puts + 1
         events["used"] = used + dr.select(active, mi.UInt32(1), 0)
         return mi.Float(0), mi.Float(0)
+
+    def _energy(self, value):
+        """Never negative: wavelengths are averaged, since single ones have colours outside of sRGB."""
+        if self.curves:
+            return mean_of(self.match.to_channels(value))
+        return dr.mean(value * self.match.weight)
 
     def end(self, events):
         self.used = events["used"]
@@ -144,9 +150,10 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[_Pi
         job = Pass(band=0, first_row=0, rows=size[1], spp=spp, total=spp, seed=seed)
         sampler, ray, ray_weight, scale, _, _ = integrator.start(sensor, film, job)
         ray = dr.detach(ray)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
-        lane = _PilotLane(match.weight / (size[0] * size[1]), size[0] * size[1] * spp, slots, spp)
-        integrator.trace(scene, sampler, ray, integrator._first_opl(sensor, film, ray), lane)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale / (size[0] * size[1]), film.curves)
+        lane = _PilotLane(match, film.curves is not None, size[0] * size[1] * spp, slots, spp)
+        first = integrator._first_opl(sensor, film, ray)
+        integrator.trace(scene, sampler, ray, first, lane, integrator.facts(scene, sensor))
         most = dr.max(lane.used)
         dr.eval(most, lane.opl, lane.energy, lane.depth)
         dr.sync_thread()
