@@ -25,6 +25,7 @@ _LAZY = {
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
     "stokes": "torchtransient.stokes",
+    "vis": "torchtransient.vis",
 }
 
 
@@ -33,7 +34,7 @@ def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])
-    value = module if name in ("scenes", "stokes") else getattr(module, name)
+    value = module if name in ("scenes", "stokes", "vis") else getattr(module, name)
     globals()[name] = value
     return value
 
