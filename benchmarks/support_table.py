@@ -1,7 +1,7 @@
 """Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
 markers.
 
-The cases are those of ``tests/integrators/gradient_cases.py``: what the table says is what the tests check.
+The cases are those of ``tests/integrators/all_cases.py``: what the table says is what the tests check.
 """
 
 from __future__ import annotations
@@ -73,14 +73,14 @@ def main() -> None:
     arguments = parser.parse_args()
 
     sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "integrators")]
-    from gradient_cases import CASES
+    from all_cases import ALL_CASES
     from tqdm import tqdm
 
     import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
 
     rows = defaultdict(list)
     for case in tqdm(
-        [c for c in CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
+        [c for c in ALL_CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
     ):
         rows[case.row].append((case, measure(case)))
     text = table(rows)

@@ -15,6 +15,7 @@ importlib.import_module("torchtransient.render")
 del globals()["render"]
 
 _LAZY = {
+    "FrequencyAxis": "torchtransient.axes",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",

@@ -1,16 +1,17 @@
-"""The time axis of a transient: equal half-open bins over optical path length."""
+"""The axes of a measurement: equal half-open bins over optical path length, or frequencies."""
 
 from __future__ import annotations
 
 import math
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.units import opl_to_seconds, seconds_to_opl
+from torchtransient.units import SPEED_OF_LIGHT, opl_to_seconds, seconds_to_opl
 
 
 @dataclass(frozen=True)
@@ -107,11 +108,69 @@ class TimeAxis:
         return torch.bucketize(lengths, edges, right=True) - 1
 
 
-def _finite(value: float, name: str) -> float:
+@dataclass(frozen=True)
+class FrequencyAxis:
+    """The frequencies of a phasor image in cycles per metre of optical path: one over the wavelength.
+
+    A phasor is the sum of `radiance * exp(-2 pi i frequency (opl - start_opl))` over all arrivals; with `start_opl`
+    zero its phase counts from the moment when the light leaves the emitter. Any iterable of numbers is taken for
+    `frequencies`, zero and negative ones too. Frozen, hashable and picklable. Raises UnitError for a number that is
+    not finite, ShapeError for no frequency at all.
+    """
+
+    frequencies: tuple[float, ...]
+    start_opl: float = 0.0
+
+    def __post_init__(self) -> None:
+        given = self.frequencies.tolist() if isinstance(self.frequencies, Tensor) else self.frequencies
+        values = tuple(given) if isinstance(given, Iterable) else (given,)
+        numbers = tuple(_finite(value, "a frequency", "FrequencyAxis") for value in values)
+        if not numbers:
+            raise ShapeError("FrequencyAxis: expected at least one frequency, got none.")
+        object.__setattr__(self, "frequencies", numbers)
+        object.__setattr__(self, "start_opl", _finite(self.start_opl, "start_opl", "FrequencyAxis"))
+
+    @classmethod
+    def uniform(cls, first: float, step: float, count: int, start_opl: float = 0.0) -> FrequencyAxis:
+        """`count` frequencies `first + k step`, in cycles per metre. Equal steps render faster than arbitrary ones."""
+        return cls(tuple(float(first) + k * float(step) for k in range(count)), start_opl)
+
+    @classmethod
+    def from_hertz(cls, frequencies_hz: Iterable[float], start_opl: float = 0.0) -> FrequencyAxis:
+        """Modulation frequencies in hertz."""
+        return cls(tuple(float(f) / SPEED_OF_LIGHT for f in frequencies_hz), start_opl)
+
+    @property
+    def num_frequencies(self) -> int:
+        """F, the number of frequencies."""
+        return len(self.frequencies)
+
+    @property
+    def per_metre(self) -> Tensor:
+        """(F,) float64: cycles per metre of optical path."""
+        return torch.tensor(self.frequencies, dtype=torch.float64)
+
+    @property
+    def hertz(self) -> Tensor:
+        """(F,) float64: frequencies in hertz."""
+        return self.per_metre * SPEED_OF_LIGHT
+
+    @property
+    def wavelengths_opl(self) -> Tensor:
+        """(F,) float64: metres of optical path per cycle; infinite at zero frequency."""
+        return 1 / self.per_metre.abs()
+
+    def __repr__(self) -> str:
+        low, high = min(self.frequencies), max(self.frequencies)
+        start = f", start_opl={self.start_opl:g}" if self.start_opl else ""
+        return f"FrequencyAxis({self.num_frequencies} from {low:g} to {high:g} per metre{start})"
+
+
+def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
     try:
         number = float(value)
     except (TypeError, ValueError, RuntimeError):
-        raise UnitError(f"TimeAxis: expected {name} to be one number, got {value!r}.") from None
+        raise UnitError(f"{owner}: expected {name} to be one number, got {value!r}.") from None
     if not math.isfinite(number):
-        raise UnitError(f"TimeAxis: expected {name} to be finite, got {number!r}.")
+        raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")
     return number

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gradient_cases import CASES, Problem
+from all_cases import ALL_CASES
+from gradient_cases import Problem
 
 SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
@@ -31,7 +32,7 @@ def _problem(problems, case):
     return problems[case.name]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", ALL_CASES, ids=lambda case: case.name)
 def test_forward_equals_reverse(problems, case):
     problem = _problem(problems, case)
     reverse, forward = problem.reverse(100), problem.forward(100)
@@ -39,7 +40,7 @@ def test_forward_equals_reverse(problems, case):
     assert forward == pytest.approx(reverse, rel=ROUNDING)
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.support == "correct"], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [c for c in ALL_CASES if c.support == "correct"], ids=lambda case: case.name)
 def test_reverse_against_finite_differences(problems, case):
     problem = _problem(problems, case)
     reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])

@@ -210,7 +210,7 @@ def test_no_arbitrary_outputs_and_no_polarization():
 
 
 def test_row_too_large(monkeypatch):
-    monkeypatch.setattr("torchtransient.plugins.films.histogram.MAX_ARRAY_ENTRIES", 100)
+    monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", 100)
     with pytest.raises(StorageError, match="fewer bins"):
         make_film().prepare()
 

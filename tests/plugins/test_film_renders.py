@@ -14,7 +14,7 @@ from torchtransient.errors import SceneError, StorageError
 from torchtransient.testing.statistics import two_sample_z_test
 
 LANES = "torchtransient.plugins.integrators.base.MAX_LANES"
-ENTRIES = "torchtransient.plugins.films.histogram.MAX_ARRAY_ENTRIES"
+ENTRIES = "torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES"
 
 
 @pytest.fixture(autouse=True)

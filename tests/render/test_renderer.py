@@ -311,9 +311,9 @@ def test_available_memory_is_known_here():
 
 def small_bands(monkeypatch):
     """As if arrays were limited to two rows of pixels: two bands. Holds while the scene's variant stays active."""
-    from torchtransient.plugins.films import histogram
+    from torchtransient.plugins.films import base
 
-    monkeypatch.setattr(histogram, "MAX_ARRAY_ENTRIES", 2 * 4 * 24 * 3)
+    monkeypatch.setattr(base, "MAX_ARRAY_ENTRIES", 2 * 4 * 24 * 3)
 
 
 def small_launches(monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 
 from torchtransient import plugins
 
-FILM = "torchtransient.plugins.films.histogram.MAX_SINGLE_PRECISION_SAMPLES"
+FILM = "torchtransient.plugins.films.base.MAX_SINGLE_PRECISION_SAMPLES"
 LANES = "torchtransient.plugins.integrators.base.MAX_LANES"
 
 

@@ -12,7 +12,7 @@ import click
 if TYPE_CHECKING:
     import torch
 
-    from torchtransient.axes import TimeAxis
+    from torchtransient.axes import FrequencyAxis, TimeAxis
     from torchtransient.render.scene_handle import Scene
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -61,6 +61,18 @@ def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
                 f"expected a number, or numbers with commas, for '{key}', got '{text}'", param_hint=option
             ) from None
     return values
+
+
+def frequency_list(given: str | None, option: str) -> FrequencyAxis | None:
+    """`"0,0.5,1"` as an axis of frequencies in cycles per metre; None without any."""
+    if given is None:
+        return None
+    from torchtransient.axes import FrequencyAxis
+
+    try:
+        return FrequencyAxis(tuple(float(text) for text in given.split(",")))
+    except ValueError:
+        raise click.BadParameter(f"expected numbers with commas, got '{given}'", param_hint=option) from None
 
 
 def time_axis(start_opl: float | None, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values, time_axis
+from torchtransient.cli.options import assignments, frequency_list, load_scene, scene_options, scene_values, time_axis
 
 
 @click.command()
@@ -19,6 +19,7 @@ from torchtransient.cli.options import assignments, load_scene, scene_options, s
 @click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
 @click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
+@click.option("--frequencies", metavar="NU,NU,...", help="Phasors at these cycles per metre instead of a transient.")
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
 @click.option("--list-parameters", is_flag=True, help="Print the keys that --set takes, and stop.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
@@ -26,30 +27,40 @@ def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
     The file holds transient (C, T, H, W), steady (C, H, W), the time axis in metres of optical path, and how it was
-    made; torchtransient.data.result_file.read_result reads it.
+    made; with --frequencies, or for a scene with a phasor film, phasor (C, F, H, W) in place of the transient.
+    torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
     from torchtransient.vis.overview import check_picture, plot_overview
 
     assignments(options["params"], "--param")
     axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
+    frequencies = frequency_list(options["frequencies"], "--frequencies")
+    if axis is not None and frequencies is not None:
+        raise click.UsageError("--frequencies renders phasors, which have no time axis: leave out one of the two.")
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
     if options["overview"]:
         check_picture(options["overview"])
+        if options["frequencies"]:
+            raise click.UsageError("--overview shows a histogram over time; leave it out with --frequencies.")
     described = load_scene(scene, options["variant"], options["params"])
     if options["list_parameters"]:
         click.echo(described.parameters())
         return
-    output = _render(described, values, axis, options)
+    output = _render(described, values, axis, frequencies, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats = output.stats
-    click.echo(
-        f"{target}: {' x '.join(map(str, output.transient.shape))} (C x T x H x W), {stats.spp} samples per pixel, "
-        f"{stats.seconds:.1f} s, {stats.variant}, {stats.temporal_filter} filter"
-    )
-    _report_energy(output)
+    if output.transient is None:
+        what, how = f"{_sizes(output.phasor)} (C x F x H x W) phasors", ""
+    else:
+        what, how = f"{_sizes(output.transient)} (C x T x H x W)", f", {stats.temporal_filter} filter"
+    click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
+    if output.transient is not None:
+        _report_energy(output)
+    if options["overview"] and output.transient is None:
+        raise click.UsageError("--overview shows a histogram over time, and the scene's film keeps phasors.")
     if options["overview"]:
         plot_overview(
             output.transient, output.steady, output.axis, options["overview"], pixel=options["pixel"], title=scene.name
@@ -57,7 +68,11 @@ def command(scene: Path, **options: Any) -> None:
         click.echo(f"{options['overview']}: overview")
 
 
-def _render(described: Any, values: dict[str, Any], axis: Any, options: dict[str, Any]) -> Any:
+def _sizes(tensor: Any) -> str:
+    return " x ".join(map(str, tensor.shape))
+
+
+def _render(described: Any, values: dict[str, Any], axis: Any, frequencies: Any, options: dict[str, Any]) -> Any:
     import torch
 
     import torchtransient as tt
@@ -73,6 +88,7 @@ def _render(described: Any, values: dict[str, Any], axis: Any, options: dict[str
             max_depth=options["max_depth"],
             temporal_filter=options["temporal_filter"],
             sensors=options["sensor"],
+            frequencies=frequencies,
         )
 
 

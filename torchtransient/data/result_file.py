@@ -1,9 +1,11 @@
 """A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
-Both hold the same names. Arrays have torch's order: `transient` float32 (..., C, T, H, W), radiance integrated over
-each bin; `steady` float32 (..., C, H, W); `edges_opl` float64 (T + 1,), metres. The numbers of the axis (`start_opl`,
-`bin_width_opl` in metres, `num_bins`), `format` and `metadata` (JSON) are attributes of the HDF5 file and
-zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
+Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
+(..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. The numbers of the axis
+(`start_opl`, and for a transient `bin_width_opl`, in metres, `num_bins`), `channels` (JSON: the names
+of the C channels), `format` and `metadata` (JSON) are attributes of the HDF5 file and zero-dimensional arrays of the
+`.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.render.output import RenderOutput
 
@@ -34,12 +36,18 @@ _PART_BYTES = 2**26
 
 @dataclass(frozen=True)
 class Result:
-    """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making."""
+    """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    transient: torch.Tensor
+    Either `transient` and `axis`, or `phasor` and `frequencies`; the others are None.
+    """
+
+    transient: torch.Tensor | None
     steady: torch.Tensor
-    axis: TimeAxis
+    axis: TimeAxis | None
     metadata: dict[str, Any] = field(default_factory=dict)
+    phasor: torch.Tensor | None = None
+    frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
 
 
 def check_target(path: str | Path) -> Path:
@@ -76,19 +84,9 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
         note = json.dumps({**(metadata or {}), "stats": stats})
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
-    axis = output.axis
-    entries: dict[str, Any] = {
-        "format": FORMAT,
-        "start_opl": axis.start_opl,
-        "bin_width_opl": axis.bin_width_opl,
-        "num_bins": axis.num_bins,
-        "metadata": note,
-    }
-    arrays = {
-        "transient": output.transient.detach().cpu().numpy(),
-        "steady": output.steady.detach().cpu().numpy(),
-        "edges_opl": axis.edges_opl.numpy(),
-    }
+    measured, numbers = _measured(output)
+    entries: dict[str, Any] = {"format": FORMAT, **numbers, "channels": json.dumps(output.channels), "metadata": note}
+    arrays = {"steady": output.steady.detach().cpu().numpy(), **measured}
     with _replacing(target) as unfinished:
         if target.suffix.lower() in _HDF5:
             _write_hdf5(unfinished, arrays, entries)
@@ -98,6 +96,23 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
                 everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in entries.items()}}
                 np.savez(file, **everything)
     return target
+
+
+def _measured(output: RenderOutput) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays and numbers of what the film measured beside the steady image."""
+    if output.transient is not None and output.axis is not None:
+        axis = output.axis
+        arrays = {"transient": output.transient.detach().cpu().numpy(), "edges_opl": axis.edges_opl.numpy()}
+        return arrays, {
+            "start_opl": axis.start_opl,
+            "bin_width_opl": axis.bin_width_opl,
+            "num_bins": axis.num_bins,
+        }
+    if output.phasor is not None and output.frequencies is not None:
+        phasor = output.phasor.detach().resolve_conj().cpu().numpy()
+        arrays = {"phasor": phasor, "frequencies_per_metre": output.frequencies.per_metre.numpy()}
+        return arrays, {"start_opl": output.frequencies.start_opl}
+    raise StorageError("result file: expected an output with a transient or a phasor, got neither.")
 
 
 def read_result(path: str | Path) -> Result:
@@ -115,21 +130,39 @@ def read_result(path: str | Path) -> Result:
         form = str(values["format"])
         if form != FORMAT:
             raise StorageError(f"result file: '{source}' is of format '{form}'; this version reads '{FORMAT}'.")
-        axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
-        metadata = json.loads(str(values["metadata"]))
-        transient, steady = torch.from_numpy(values["transient"]), torch.from_numpy(values["steady"])
+        result = _result(values)
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise StorageError(
             f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
         ) from error
-    if transient.ndim < 4 or transient.shape[-3] != axis.num_bins:
+    name, cube, count = (
+        ("transient", result.transient, result.axis.num_bins)
+        if result.axis is not None
+        else ("phasor", result.phasor, 0 if result.frequencies is None else result.frequencies.num_frequencies)
+    )
+    if cube is None or cube.ndim < 4 or cube.shape[-3] != count:
+        shape = None if cube is None else tuple(cube.shape)
+        letter = "T" if name == "transient" else "F"
         raise StorageError(
-            f"result file: '{source}' holds a transient of shape {tuple(transient.shape)}; expected "
-            f"(..., C, T, H, W) with T = {axis.num_bins}."
+            f"result file: '{source}' holds a {name} of shape {shape}; expected "
+            f"(..., C, {letter}, H, W) with {letter} = {count}."
         )
-    return Result(transient, steady, axis, metadata)
+    return result
+
+
+def _result(values: Mapping[str, Any]) -> Result:
+    metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
+    start = float(values["start_opl"])
+    # Files of earlier versions have no names of channels.
+    channels = tuple(json.loads(str(values.get("channels", "[]"))))
+    if "phasor" in values:
+        frequencies = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), start)
+        phasor = torch.from_numpy(values["phasor"])
+        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies, channels=channels)
+    axis = TimeAxis(start, float(values["bin_width_opl"]), int(values["num_bins"]))
+    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata, channels=channels)
 
 
 @contextmanager
@@ -168,7 +201,7 @@ def _parts(array: NDArray[Any]) -> Iterator[Any]:
 
 def _read_hdf5(path: Path) -> dict[str, Any]:
     with _h5py().File(path, "r") as file:
-        return {**{name: file[name][()] for name in ("transient", "steady")}, **dict(file.attrs)}
+        return {**{name: file[name][()] for name in file if name != "edges_opl"}, **dict(file.attrs)}
 
 
 def _read_npz(path: Path) -> dict[str, Any]:

@@ -60,6 +60,7 @@ class PluginModule:
 
 # In the order of execution: a module comes after those whose classes it inherits from.
 PLUGIN_MODULES: tuple[PluginModule, ...] = (
+    PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),

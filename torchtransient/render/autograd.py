@@ -2,7 +2,8 @@
 
 ``Render`` keeps no Dr.Jit graph. It saves its inputs, and its derivatives are renders of their own: ``RenderVJP``
 and ``RenderJVP``, linear in the cotangents and tangents. They are functions of torch too, so that ``torch.func`` can
-batch them; differentiating *them* is refused, since the integrators have no second derivatives.
+batch them; differentiating *them* is refused, since the integrators have no second derivatives. All of them are real:
+complex phasors are a view that torch differentiates itself.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def _each(
 
 
 class Render(torch.autograd.Function):
-    """(job, *values) -> (steady, transient) in the film's layout."""
+    """(job, *values) -> (steady, response) in the film's layout."""
 
     @staticmethod
     def forward(job: RenderJob, *values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,11 +53,11 @@ class Render(torch.autograd.Function):
         ctx.save_for_forward(*values)
 
     @staticmethod
-    def backward(ctx: Any, g_steady: torch.Tensor | None, g_transient: torch.Tensor | None) -> tuple[Any, ...]:
+    def backward(ctx: Any, g_steady: torch.Tensor | None, g_response: torch.Tensor | None) -> tuple[Any, ...]:
         needs = tuple(ctx.needs_input_grad[1:])
-        if (g_steady is None and g_transient is None) or not any(needs):
+        if (g_steady is None and g_response is None) or not any(needs):
             return (None,) * (1 + len(needs))
-        grads = iter(RenderVJP.apply(replace(ctx.job, needs=needs), g_steady, g_transient, *ctx.saved_tensors))
+        grads = iter(RenderVJP.apply(replace(ctx.job, needs=needs), g_steady, g_response, *ctx.saved_tensors))
         return (None, *(next(grads) if need else None for need in needs))
 
     @staticmethod
@@ -71,13 +72,13 @@ class Render(torch.autograd.Function):
 
 
 class RenderVJP(torch.autograd.Function):
-    """(job, g_steady, g_transient, *values) -> gradients of the values that need one."""
+    """(job, g_steady, g_response, *values) -> gradients of the values that need one."""
 
     @staticmethod
     def forward(
-        job: RenderJob, g_steady: torch.Tensor | None, g_transient: torch.Tensor | None, *values: torch.Tensor
+        job: RenderJob, g_steady: torch.Tensor | None, g_response: torch.Tensor | None, *values: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        return tuple(engine.vjp(job, values, g_steady, g_transient))
+        return tuple(engine.vjp(job, values, g_steady, g_response))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -97,7 +98,7 @@ class RenderVJP(torch.autograd.Function):
 
 
 class RenderJVP(torch.autograd.Function):
-    """(job, *tangents of the values that need one, *values) -> derivatives of (steady, transient)."""
+    """(job, *tangents of the values that need one, *values) -> derivatives of (steady, response)."""
 
     @staticmethod
     def forward(job: RenderJob, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

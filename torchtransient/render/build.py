@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.render.description import Description
 
@@ -24,6 +25,11 @@ _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
+)  # fmt: skip
+_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film")
+# Properties of a phasor film that say which frequencies it keeps; explicit frequencies replace them.
+_PEER_FREQUENCIES = (
+    "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
 
@@ -37,7 +43,8 @@ class BuildOptions:
     ``real_bitmaps``: store every bitmap as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
-    that replaces those of the sensors, with the same number of samples; None to keep them.
+    that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -47,6 +54,7 @@ class BuildOptions:
     merge: bool = False
     transient: bool = False
     sampler: str | None = None
+    frequencies: FrequencyAxis | None = None
 
 
 @dataclass
@@ -218,7 +226,7 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
 def _override_films(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    if options.time_axis is None and not options.transient:
+    if options.time_axis is None and options.frequencies is None and not options.transient:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
@@ -231,28 +239,42 @@ def _override_films(state: Any, options: BuildOptions) -> None:
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
-    node = state.nodes[index]
-    plugin = node.props.plugin_name()
-    if options.transient and plugin in _STEADY_FILMS:
-        if options.time_axis is None and "temporal_bins" not in node.props:
+    props = state.nodes[index].props
+    plugin = props.plugin_name()
+    if options.time_axis is None and options.frequencies is None:
+        if options.transient and plugin in _STEADY_FILMS:
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., "
-                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...)), or make the film a "
-                "transient_hdr_film."
+                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...)) or TransientRenderer(..., "
+                "frequencies=tt.FrequencyAxis(...)), or make the film a transient_hdr_film or a phasor_hdr_film."
             )
-        _become(state, index, "transient_hdr_film", keep=_FILM_PROPERTIES)
+        return
+    wanted = "transient_hdr_film" if options.time_axis is not None else "phasor_hdr_film"
+    if plugin in _STEADY_FILMS and not options.transient:
+        return
+    if plugin in (*_STEADY_FILMS, *_TIME_FILMS) and plugin != wanted:
+        _become(state, index, wanted, keep=_FILM_PROPERTIES)
+        props = state.nodes[index].props
     if options.time_axis is not None:
         start, width, bins = options.time_axis
-        props = state.nodes[index].props
         props["start_opl"], props["bin_width_opl"], props["temporal_bins"] = float(start), float(width), int(bins)
+    elif options.frequencies is not None:
+        if props.plugin_name() != wanted:
+            raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
+        for name in _PEER_FREQUENCIES:
+            if name in props:
+                del props[name]
+        props["frequencies"] = ", ".join(repr(f) for f in options.frequencies.frequencies)
+        props["start_opl"] = options.frequencies.start_opl
 
 
 def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
-    """Turn a node into another plugin; keep the named properties and every child object."""
+    """Turn a node into another plugin; keep the named properties, every child object and every spectrum."""
     import mitsuba as mi
 
     old = state.nodes[index].props
     children = {key for key, _ in _children(state, state.nodes[index])}
+    children |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
     for key in list(old.keys()):

@@ -3,8 +3,9 @@
 Every run installs its values in the scene, renders, reads the result and puts the described values back, under one
 lock: between two runs a scene is always in the state of its description, and no Dr.Jit graph outlives a run.
 
-Tensors are in the film's layout here: steady (H, W, C), transient (H, W, T, C), with a leading dimension of items
-when there are several.
+Tensors are real and in the film's layout here: steady (H, W, C) and the film's response, which is the transient (H, W,
+T, C) or the phasors (H, W, F, 2 C) with real and imaginary parts in turn; with a leading dimension of items when there
+are several.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def _session(job: RenderJob) -> Iterator[_Session]:
 
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Render every item. Returns (steady, transient); a single item is a view of the film's own memory."""
+    """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
     _check_finite(job, values)
     with _session(job) as session:
         started = time.perf_counter()
@@ -172,7 +173,7 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
     import drjit as dr
 
     job, count = session.job, len(session.job.items)
-    steady_all = transient_all = None
+    steady_all = response_all = None
     before, after = [], []
     for n, item in enumerate(job.items):
         if n == 0 or item.entry != job.items[n - 1].entry:
@@ -189,22 +190,22 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
             )
             before.append(film.energy_before)
             after.append(film.energy_after)
-            steady, transient = _take(film, transient_all[n] if transient_all is not None else None)
+            steady, response = _take(film, response_all[n] if response_all is not None else None)
         if count == 1:
-            steady_all, transient_all = steady, transient
-        elif steady_all is None or transient_all is None:
-            steady_all, transient_all = (
+            steady_all, response_all = steady, response
+        elif steady_all is None or response_all is None:
+            steady_all, response_all = (
                 steady.new_empty((count, *steady.shape)),
-                transient.new_empty((count, *transient.shape)),
+                response.new_empty((count, *response.shape)),
             )
         if count > 1:
             steady_all[n].copy_(steady)
-            transient_all[n].copy_(transient)
-        del steady, transient
+            response_all[n].copy_(response)
+        del steady, response
     job.log["energy_before"], job.log["energy_after"] = tuple(before), tuple(after)
-    if steady_all is None or transient_all is None:
+    if steady_all is None or response_all is None:
         raise ShapeError("a batch must have at least one entry, got 0.")
-    return steady_all, transient_all
+    return steady_all, response_all
 
 
 def _drawn_samples(session: _Session) -> int:
@@ -228,17 +229,17 @@ def _take(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, torch.Ten
     shape = film.cube_shape()
     dr.eval(film.steady, *(band[2] for band in bands))
     dr.sync_thread()
-    steady = mi.TensorXf(film.steady, (shape[0], shape[1], shape[-1])).torch()
+    steady = mi.TensorXf(film.steady, (shape[0], shape[1], film.channel_count())).torch()
     if len(bands) == 1:
-        transient = mi.TensorXf(bands[0][2], shape).torch()
+        response = mi.TensorXf(bands[0][2], shape).torch()
     else:
-        transient = torch.empty(shape, dtype=steady.dtype, device=steady.device) if into is None else into
+        response = torch.empty(shape, dtype=steady.dtype, device=steady.device) if into is None else into
         while bands:
             first, rows, flat = bands.pop(0)
-            transient[first : first + rows].copy_(flat.torch().view(rows, *shape[1:]))
+            response[first : first + rows].copy_(flat.torch().view(rows, *shape[1:]))
             del flat
     film.clear()
-    return steady, transient
+    return steady, response
 
 
 def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
@@ -248,13 +249,14 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
             raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
         if not hasattr(sensors[item.sensor].film(), "cube_shape"):
             raise SceneError(
-                "the sensor's film has no time axis; use transient_hdr_film or give time_axis=tt.TimeAxis(...)."
+                "the sensor's film has no time axis; use transient_hdr_film or phasor_hdr_film, or give "
+                "time_axis=tt.TimeAxis(...) or frequencies=tt.FrequencyAxis(...)."
             )
     shapes = {item.sensor: tuple(sensors[item.sensor].film().cube_shape()) for item in items}
     if len(set(shapes.values())) > 1:
         raise SceneError(
-            f"sensors: films rendered in one call must have one shape (H, W, T, C), got {shapes}. Use one "
-            "TransientRenderer per sensor."
+            f"sensors: films rendered in one call must have one shape (H, W, T, C) or (H, W, F, 2 C), got {shapes}. "
+            "Use one TransientRenderer per sensor."
         )
 
 
@@ -271,31 +273,31 @@ def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
 
 
 def vjp(
-    job: RenderJob, values: Sequence[torch.Tensor], g_steady: torch.Tensor | None, g_transient: torch.Tensor | None
+    job: RenderJob, values: Sequence[torch.Tensor], g_steady: torch.Tensor | None, g_response: torch.Tensor | None
 ) -> list[torch.Tensor]:
-    """Gradients of ``<g_steady, steady> + <g_transient, transient>`` for the values that need one, in their shapes."""
+    """Gradients of ``<g_steady, steady> + <g_response, response>`` for the values that need one, in their shapes."""
     import drjit as dr
 
     grads: list[torch.Tensor | None] = [
         torch.zeros_like(v) if need else None for v, need in zip(values, job.needs, strict=True)
     ]
-    if g_steady is not None or g_transient is not None:
+    if g_steady is not None or g_response is not None:
         with _session(job) as session:
             _check_slope(session)
             for n, item in enumerate(job.items):
                 leaves = session.install(item, values, job.needs)
                 several = len(job.items) > 1
                 gs = None if g_steady is None else _steady_adjoint(g_steady[n] if several else g_steady)
-                gt = None if g_transient is None else _cube_adjoint(g_transient[n] if several else g_transient)
+                gr = None if g_response is None else _cube_adjoint(g_response[n] if several else g_response)
                 session.integrator.render_backward(
-                    session.scene, session.params, (gs, gt), sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
+                    session.scene, session.params, (gs, gr), sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad
                 )
                 _finish_backward(session, leaves)
                 for grad, leaf, batched in zip(grads, leaves, job.batched, strict=True):
                     if grad is not None:
                         target = grad[item.entry] if batched else grad
                         target += dr.grad(leaf).torch().view(target.shape)
-                del leaves, gs, gt
+                del leaves, gs, gr
     return [grad for grad in grads if grad is not None]
 
 
@@ -315,10 +317,10 @@ def _finish_backward(session: _Session, leaves: Sequence[Any]) -> None:
 def jvp(
     job: RenderJob, values: Sequence[torch.Tensor], tangents: Sequence[torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Derivatives of (steady, transient) along ``tangents``, given for the values that need one."""
+    """Derivatives of (steady, response) along ``tangents``, given for the values that need one."""
     import drjit as dr
 
-    steady_all, transient_all = [], []
+    steady_all, response_all = [], []
     with _session(job) as session:
         _check_slope(session)
         for item in job.items:
@@ -335,13 +337,13 @@ def jvp(
             session.integrator.render_forward(
                 session.scene, session.params, sensor=item.sensor, seed=item.grad_seed, spp=job.spp_grad, develop=False
             )
-            d_steady, d_transient = _take(session.film(item), None)
+            d_steady, d_response = _take(session.film(item), None)
             steady_all.append(d_steady)
-            transient_all.append(d_transient)
-            del leaves, d_steady, d_transient
+            response_all.append(d_response)
+            del leaves, d_steady, d_response
     if len(job.items) == 1:
-        return steady_all[0], transient_all[0]
-    return torch.stack(steady_all), torch.stack(transient_all)
+        return steady_all[0], response_all[0]
+    return torch.stack(steady_all), torch.stack(response_all)
 
 
 def _check_slope(session: _Session) -> None:
@@ -353,7 +355,7 @@ def _check_slope(session: _Session) -> None:
         if need and table[key].moves_path_length
     ]
     film = session.film(session.job.items[0])
-    if moving and not film.filter.has_slope:
+    if moving and not film.has_slope:
         raise GradientError(no_slope(moving, film.temporal_filter))
 
 

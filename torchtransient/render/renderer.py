@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
@@ -26,7 +26,13 @@ from torchtransient.render.arguments import (
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.engine import Item, RenderJob
-from torchtransient.render.output import RenderOutput, RenderStats, channels_first
+from torchtransient.render.output import (
+    RenderOutput,
+    RenderStats,
+    phasor_channels_first,
+    steady_channels_first,
+    transient_channels_first,
+)
 from torchtransient.render.parameters import ParameterInfo
 from torchtransient.render.scene_handle import Scene, load, unknown_key
 from torchtransient.render.variant import active_variant, device_type
@@ -64,12 +70,15 @@ class TransientRenderer(nn.Module):
     or a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes,
     since torch forbids dots; ``renderer.values`` maps keys to parameters.
 
-    ``time_axis``: replaces the one of the scene's films. ``max_depth``: replaces the integrator's. ``spp``,
+    ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
+    :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
+    place of ``out.transient``. At most one of the two. ``max_depth``: replaces the integrator's. ``spp``,
     ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
     soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
-    a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``.
+    a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
+    are smooth in time and take no filter.
 
     ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
@@ -95,6 +104,7 @@ class TransientRenderer(nn.Module):
         effects: str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
+        frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
     ):
         super().__init__()
         if effects != "auto":
@@ -112,7 +122,7 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        self._options = self._build_options(time_axis, max_depth, sampler)
+        self._options = self._build_options(time_axis, frequencies, max_depth, sampler)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -123,13 +133,20 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(self, time_axis: TimeAxis | None, max_depth: int | None, sampler: str | None) -> BuildOptions:
+    def _build_options(
+        self, time_axis: TimeAxis | None, frequencies: Any, max_depth: int | None, sampler: str | None
+    ) -> BuildOptions:
         if time_axis is not None and not isinstance(time_axis, TimeAxis):
             raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
+        if time_axis is not None and frequencies is not None:
+            raise SceneError("time_axis and frequencies: a film is a histogram or a phasor film, give one of them.")
+        if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
+            frequencies = FrequencyAxis(frequencies)
         axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        return self.scene.options_for(self._keys, BuildOptions(axis, max_depth, transient=True, sampler=sampler))
+        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies)
+        return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
         table = self.scene.parameters() if self._keys else {}
@@ -144,9 +161,20 @@ class TransientRenderer(nn.Module):
         self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
         engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
         film = found[self._sensors[0]].film()
-        self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
+        self.axis: TimeAxis | None = None
+        self.frequencies: FrequencyAxis | None = None
         self._cube_shape = tuple(film.cube_shape())
+        self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
+        self._scene_filter = ""
+        if film.response == "phasor":
+            self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+            if self.temporal_filter != "auto":
+                raise SceneError(
+                    f"temporal_filter: a phasor film has none, expected 'auto', got {self.temporal_filter!r}."
+                )
+            return
+        self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
         self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
@@ -175,7 +203,7 @@ class TransientRenderer(nn.Module):
 
     @property
     def effective_filter(self) -> str:
-        """The temporal filter that renders use."""
+        """The temporal filter that renders use; empty for a phasor film."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
@@ -244,17 +272,21 @@ class TransientRenderer(nn.Module):
             batched=tuple(batched),
             spp=used,
             spp_grad=self.spp_grad or used,
-            temporal_filter=temporal_filter,
+            temporal_filter=temporal_filter or None,
             progress=bar,
         )
         try:
-            steady, transient = Render.apply(job, *tensors)
+            steady, response = Render.apply(job, *tensors)
         finally:
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, transient = channels_first(steady, transient, leading)
-        return RenderOutput(transient, steady, None, self.axis, self._stats(job))
+        steady, stats = steady_channels_first(steady, leading), self._stats(job)
+        if self.frequencies is not None:
+            phasor = phasor_channels_first(response, leading)
+            return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
+        transient = transient_channels_first(response, leading)
+        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
@@ -340,7 +372,8 @@ class TransientRenderer(nn.Module):
     def extra_repr(self) -> str:
         """Shown by ``print(renderer)``."""
         keys, used = list(self._keys), self.effective_filter
-        return f"{self.scene!r}, parameters={keys}, axis={self.axis}, temporal_filter={used!r}"
+        measured = f"axis={self.axis}, temporal_filter={used!r}" if self.axis else f"frequencies={self.frequencies}"
+        return f"{self.scene!r}, parameters={keys}, {measured}"
 
 
 def render(

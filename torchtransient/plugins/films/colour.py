@@ -9,14 +9,17 @@ import mitsuba as mi
 class ChannelMatch:
     """Linear map from a sample's spectrum to the film's channels, weight of the primary ray included.
 
-    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves of the ray's
-    own wavelengths, whose weights are evaluated once per ray instead of once per event.
+    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves at the ray's
+    own wavelengths, or against the film's response curves (see :mod:`.response`), whose weights are evaluated once per
+    ray instead of once per event.
     """
 
-    def __init__(self, wavelengths, weight):
+    def __init__(self, wavelengths, weight, response=None):
         self.weight = mi.unpolarized_spectrum(weight)
         self.matrix = None
-        if mi.is_spectral:
+        if response is not None:
+            self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
+        elif mi.is_spectral:
             self.matrix = []
             for k in range(len(wavelengths)):
                 unit = mi.UnpolarizedSpectrum(0)
@@ -29,7 +32,7 @@ class ChannelMatch:
         if self.matrix is None:
             weighted = value * self.weight
             return [weighted[c] for c in range(len(weighted))]
-        return [sum(value[k] * row[c] for k, row in enumerate(self.matrix)) for c in range(3)]
+        return [sum(value[k] * row[c] for k, row in enumerate(self.matrix)) for c in range(len(self.matrix[0]))]
 
     def to_spectrum(self, channels: list):
         """The transposed map: adjoint spectrum of adjoint channel values."""
@@ -40,7 +43,7 @@ class ChannelMatch:
             return result
         result = mi.UnpolarizedSpectrum(0)
         for k, row in enumerate(self.matrix):
-            result[k] = sum(channels[c] * row[c] for c in range(3))
+            result[k] = sum(a * r for a, r in zip(channels, row, strict=True))
         return result
 
 

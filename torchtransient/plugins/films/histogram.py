@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from torchtransient.errors import SceneError, StorageError
+from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.temporal_filter import check_stddev, make_temporal_filter
 
-# Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
-MAX_ARRAY_ENTRIES = 2**32 - 1
-# Above this many samples per pixel single precision sums lose mass: 2^16 equal terms are good to 2e-4 (5e-5 on 16-wide
-# processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double
-# precision.
-MAX_SINGLE_PRECISION_SAMPLES = 2**16
 
-
-class TransientHDRFilm(mi.Film):
+class TransientHDRFilm(TimeResolvedFilm):
     r"""Time-resolved film (:monosp:`transient_hdr_film`).
 
     Parameters beside those of ``hdrfilm`` (size, crop, ``rfilter``):
@@ -30,11 +23,16 @@ class TransientHDRFilm(mi.Film):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
-    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
-    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
-    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
-    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
-    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
+        which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
+
+    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T,
+    C)`` of the crop window with C = 1 in monochromatic variants, the number of response curves where there are
+    some, and 3 otherwise (linear sRGB in spectral variants); there are no alpha or weight channels. Light outside
+    the window is not stored but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean
+    over channels. With the sum over the stored bins they make up the steady image, whatever the temporal filter:
+    what it spreads over the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
@@ -47,11 +45,12 @@ class TransientHDRFilm(mi.Film):
     Not supported: alpha channel, half precision.
     """
 
+    plugin = "transient_hdr_film"
+
     def __init__(self, props):
         super().__init__(props)
         self.temporal_bins = int(props.get("temporal_bins", 2048))
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
-        self.start_opl = float(props.get("start_opl", 0.0))
         self._filter_name = str(props.get("temporal_filter", "box"))
         self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
@@ -59,10 +58,6 @@ class TransientHDRFilm(mi.Film):
         self.laser_scan_height = int(props.get("laser_scan_height", 0))
         self._check()
         self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
-        self.bands = []
-        self.steady = None
-        self.outside = None
-        self._offset_distribution = None
 
     # ------------------------------------------------------------------------------------- parameters
 
@@ -73,8 +68,6 @@ class TransientHDRFilm(mi.Film):
             raise SceneError(
                 f"transient_hdr_film: bin_width_opl must be a positive length in metres, got {self.bin_width_opl}."
             )
-        if not abs(self.start_opl) < float("inf"):
-            raise SceneError(f"transient_hdr_film: start_opl must be a finite length in metres, got {self.start_opl}.")
         check_stddev(self._gaussian_stddev)
         laser = self.laser_scan_width, self.laser_scan_height
         if self.exhaustive_scan and min(laser) < 1:
@@ -109,6 +102,17 @@ class TransientHDRFilm(mi.Film):
         self._gaussian_stddev = float(stddev)
         self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
 
+    def take_filter(self, name: str, stddev: float | None):
+        if stddev is not None:
+            self.gaussian_stddev = stddev
+        if name:
+            self.temporal_filter = name
+
+    @property
+    def has_slope(self) -> bool:
+        """Whether the temporal filter has a slope."""
+        return self.filter.has_slope
+
     def end_opl(self) -> float:
         """End of the last bin in metres."""
         return self.start_opl + self.bin_width_opl * self.temporal_bins
@@ -118,14 +122,7 @@ class TransientHDRFilm(mi.Film):
         for name in ("temporal_bins", "bin_width_opl", "start_opl"):
             cb.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
 
-    def base_channels_count(self):
-        return self.channel_count()
-
     # ---------------------------------------------------------------------------------------- storage
-
-    def channel_count(self) -> int:
-        """1 in monochromatic variants, 3 otherwise."""
-        return 1 if mi.is_monochromatic else 3
 
     def laser_count(self) -> int:
         """Number of laser positions of an exhaustive scan, otherwise 1."""
@@ -140,110 +137,6 @@ class TransientHDRFilm(mi.Film):
     def entries_per_pixel(self) -> int:
         """Floats behind one pixel."""
         return self.laser_count() * self.temporal_bins * self.channel_count()
-
-    def band_rows(self) -> int:
-        """Rows of one storage band: as many as 32-bit indices allow."""
-        per_row = int(self.crop_size()[0]) * self.entries_per_pixel()
-        rows = MAX_ARRAY_ENTRIES // per_row
-        if rows < 1:
-            raise StorageError(
-                f"transient_hdr_film: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} "
-                "values each exceeds 2^32 values; use fewer bins, a narrower crop or a smaller laser grid."
-            )
-        return min(rows, int(self.crop_size()[1]))
-
-    def band_layout(self) -> list[tuple[int, int]]:
-        """The storage bands as (first row, rows); one, unless the cube exceeds 32-bit indices."""
-        height, rows = self.cube_shape()[0], self.band_rows()
-        return [(first, min(rows, height - first)) for first in range(0, height, rows)]
-
-    def prepare(self, aovs=(), samples: int = 0):
-        """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
-        if len(aovs):
-            raise SceneError(f"transient_hdr_film: arbitrary output variables are not supported, got {list(aovs)}.")
-        if mi.is_polarized:
-            raise SceneError("transient_hdr_film: polarized variants are not supported; use the unpolarized one.")
-        height, width = self.cube_shape()[:2]
-        real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
-        per_row = width * self.entries_per_pixel()
-        self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
-        self.steady = dr.zeros(real, height * width * self.channel_count())
-        # By pixel: one sum over all samples would drown small terms, and be one address that every thread waits for.
-        self.outside = dr.zeros(real, height * width * 2)
-        return self.channel_count()
-
-    def settle(self):
-        """End of a render: sums kept in double precision become single precision."""
-        if dr.type_v(self.steady) != dr.type_v(mi.Float):
-            self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
-            self.steady, self.outside = mi.Float(self.steady), mi.Float(self.outside)
-            dr.eval(self.steady, self.outside, *(band[2] for band in self.bands))
-
-    def clear(self):
-        """Drop the storage; tensors developed before keep their memory."""
-        self.bands, self.steady, self.outside = [], None, None
-
-    def transient_bands(self):
-        """The storage as (first row, rows, flat array) for each band."""
-        return self.bands
-
-    def check_one_band(self):
-        """Raise ``StorageError`` when the cube does not fit into one tensor."""
-        if self.band_rows() < int(self.crop_size()[1]):
-            raise StorageError(
-                f"transient_hdr_film: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
-                "develop=False and read the film's transient_bands(), or use a smaller crop."
-            )
-
-    def develop(self, raw: bool = False):
-        """The pair (steady ``(H, W, C)``, transient ``cube_shape()``), without a copy.
-
-        A cube of more than 2^32 entries cannot be one Dr.Jit tensor: use :meth:`transient_bands`.
-        """
-        if self.steady is None:
-            raise SceneError("transient_hdr_film: nothing was rendered yet; call render() first.")
-        self.check_one_band()
-        shape = self.cube_shape()
-        steady = mi.TensorXf(self.steady, (shape[0], shape[1], shape[-1]))
-        return steady, mi.TensorXf(self.bands[0][2], shape)
-
-    @property
-    def energy_before(self) -> float:
-        """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
-        return self._energy_outside(0)
-
-    @property
-    def energy_after(self) -> float:
-        """Light that arrived at or after :meth:`end_opl`: sum over pixels, mean over channels."""
-        return self._energy_outside(1)
-
-    def _energy_outside(self, side: int) -> float:
-        return 0.0 if self.outside is None else float(np.array(self.outside, dtype=np.float64)[side::2].sum())
-
-    # ----------------------------------------------------------------------------------- pixel sampling
-
-    def sample_offset(self, sample):
-        """Offset from the pixel's centre drawn from the spatial filter, and the sample's weight."""
-        rfilter = self.rfilter()
-        if rfilter.is_box_filter():
-            return sample - 0.5, None
-        if self._offset_distribution is None:
-            radius = rfilter.radius()
-            x = dr.linspace(mi.Float, -radius, radius, 513)
-            h = rfilter.eval(x)
-            dr.eval(h)
-            # A floor keeps the density positive wherever the filter is not zero between two nodes.
-            density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
-            fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)
-            self._offset_distribution = (
-                mi.ContinuousDistribution(mi.ScalarVector2f(-radius, radius), density),
-                float((fine.sum() - 0.5 * (fine[0] + fine[-1])) * 2 * radius / (fine.size - 1)),
-            )
-        distribution, integral = self._offset_distribution
-        x, pdf_x = distribution.sample_pdf(sample.x)
-        y, pdf_y = distribution.sample_pdf(sample.y)
-        weight = rfilter.eval(x) * rfilter.eval(y) / (pdf_x * pdf_y * integral * integral)
-        return mi.Point2f(x, y), weight
 
     # ----------------------------------------------------------------------------------- splat and read
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import GradientError, SceneError, VariantError
-from torchtransient.plugins.films.colour import ChannelMatch, mean_of
+from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
@@ -51,43 +51,6 @@ def _launch_counts(sampler, spp: int, most: int) -> list[int]:
     while (left := spp - sum(counts)) > 0:
         counts.append(drawn(min(most, left)))
     return counts
-
-
-class Lane:
-    """The film's side of the samples in flight: where they write, with which weight.
-
-    A plain object, which Dr.Jit loops leave alone: the arrays in it are targets of scatters, not loop state.
-    """
-
-    def __init__(self, film, cube, base, match):
-        self.film, self.cube, self.base, self.match = film, cube, base, match
-
-    def put(self, opl, value, active):
-        """Write a contribution; returns what fell before and after the window (mean over channels)."""
-        channels = self.match.to_channels(value)
-        before, after = self.film.put(self.cube, self.base, opl, channels, active)
-        energy = dr.select(active, mean_of(channels), 0)
-        return energy * before, energy * after
-
-    def put_slope(self, opl, d_value, value_d_opl, active):
-        """Forward mode: write ``k df + f k' dtau``."""
-        d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
-        self.film.put_slope(self.cube, self.base, opl, d, slope, active)
-
-
-class AdjointLane:
-    """Reads ``A(tau)`` and ``A'(tau)`` of the incoming adjoint for the samples in flight."""
-
-    def __init__(self, film, transient, base, steady, match):
-        self.film, self.transient, self.base, self.steady, self.match = film, transient, base, steady, match
-
-    def read(self, opl, active):
-        """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
-        if self.transient is None:
-            return self.match.to_spectrum(self.steady), mi.UnpolarizedSpectrum(0)
-        A, slope = self.film.read(self.transient, self.base, opl, active)
-        A = [a + s for a, s in zip(A, self.steady, strict=True)]
-        return self.match.to_spectrum(A), self.match.to_spectrum(slope)
 
 
 class TransientIntegrator(mi.CppADIntegrator):
@@ -138,8 +101,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not hasattr(film, "transient_bands"):
             raise SceneError(
-                f"transient integrators need a film of type transient_hdr_film, the sensor has {film.class_name()}; "
-                "change the film's type in the scene."
+                f"transient integrators need a film of type transient_hdr_film or phasor_hdr_film, the sensor has "
+                f"{film.class_name()}; change the film's type in the scene."
             )
         if film.exhaustive_scan:
             raise SceneError(
@@ -151,10 +114,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Remove the interior and exterior media of its shapes."
             )
-        if self.gaussian_stddev is not None:
-            film.gaussian_stddev = self.gaussian_stddev
-        if self.temporal_filter:
-            film.temporal_filter = self.temporal_filter
+        film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
 
     def facts(self, scene) -> SceneFacts:
@@ -181,10 +141,11 @@ class TransientIntegrator(mi.CppADIntegrator):
             sampler.set_sample_count(spp)
         spp = sampler.sample_count()
         width = int(film.crop_size()[0])
+        most = min(MAX_LANES, film.lanes_at_most(self.max_depth) or MAX_LANES)
         result = []
         for band, (first_row, rows) in enumerate(film.band_layout()):
-            counts = _launch_counts(sampler, spp, max(1, MAX_LANES // (width * rows)))
-            rows_per_pass = rows if width * rows * max(counts) <= MAX_LANES else max(1, MAX_LANES // width)
+            counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))
+            rows_per_pass = rows if width * rows * max(counts) <= most else max(1, most // width)
             for row in range(first_row, first_row + rows, rows_per_pass):
                 some = min(rows_per_pass, first_row + rows - row)
                 result += [Pass(band, row, some, count, sum(counts), 0) for count in counts]
@@ -219,6 +180,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sensor.sample_ray_differential(
                 time=time, sample1=wavelength, sample2=position, sample3=aperture
             )
+            if film.curves is not None:
+                ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
         return sampler, ray, ray_weight, scale, row, column
 
@@ -232,9 +195,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # ----------------------------------------------------------------------------------- entry points
 
-    def render(
-        self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None
-    ):
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None):
         """Render steady ``(H, W, C)`` and transient ``(H, W, T, C)``.
 
         ``progress_callback(fraction)`` is called after every pass. With ``develop=False`` nothing is returned and the
@@ -258,14 +219,16 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _render_pass(self, scene, sensor, film, job):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = Lane(film, film.bands[job.band][2], base, match)
+        lane = film.lane(job, base, match)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
         for c, value in enumerate(match.to_channels(L)):
             dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
-        for side, value in enumerate((before, after)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
+        if film.outside is not None:
+            for side, value in enumerate((before, after)):
+                dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
+        lane.finish()
 
     def _first_opl(self, sensor, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
@@ -300,7 +263,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -311,7 +274,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             flat, offset, strides = self._adjoint_layout(film, g_transient)
             base = row * strides[0] + column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
-        lane = AdjointLane(film, transient, base, steady, match)
+        lane = film.adjoint_lane(transient, base, steady, match)
         first = self._first_opl(sensor, film, ray)
         a_o, a_d, a_first = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
@@ -343,9 +306,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = Lane(film, film.bands[job.band][2], base, match)
+        lane = film.lane(job, base, match, tangents=True)
         first = self._first_opl(sensor, film, ray)
         t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
         if facts.sensor_moves:
@@ -357,6 +320,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first)
         for c, value in enumerate(match.to_channels(dL)):
             dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        lane.finish()
 
     @staticmethod
     def _adjoint_layout(film, g_transient):
@@ -371,7 +335,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
 
     def _check_differentiable(self, film, facts):
-        if facts.geometry and not film.filter.has_slope:
+        if facts.geometry and not film.has_slope:
             raise GradientError(
                 "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
                 f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "

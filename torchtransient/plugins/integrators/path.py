@@ -62,6 +62,7 @@ class TransientPath(TransientIntegrator):
         if dr.hint(self.hide_emitters_, mode="scalar"):
             pi = behind_area_lights(scene, ray, pi)
         store = allocate(self.max_depth, facts) if record else {}
+        events = {} if record else lane.begin()           # What the film carries along
 
         while dr.hint(active, max_iterations=self.max_depth, label="transient_path"):
             active_next = mi.Bool(active)
@@ -90,7 +91,7 @@ class TransientPath(TransientIntegrator):
             if dr.hint(primal, mode="scalar"):
                 Le = β * mis * mi.unpolarized_spectrum(emitter.eval(si, hit))
                 L += Le
-                low, high = lane.put(τ, Le, hit)
+                low, high = lane.put(events, τ, Le, hit)
                 before += low
                 after += high
 
@@ -120,7 +121,7 @@ class TransientPath(TransientIntegrator):
                     far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
                     length_em = dr.select(far, facts.distant.length(si.p, ds.d), length_em)
                 η_em = facts.index_towards(bsdf, si, wo, η)
-                low, high = lane.put(τ + mi.Float64(length_em * η_em), Lr, active_em)
+                low, high = lane.put(events, τ + mi.Float64(length_em * η_em), Lr, active_em)
                 before += low
                 after += high
 
@@ -162,6 +163,8 @@ class TransientPath(TransientIntegrator):
             depth += 1
             active = active_next
 
+        if dr.hint(primal, mode="scalar"):
+            lane.end(events)
         return (depth, store) if record else (L, before, after)
 
     def sweep(self, scene, sampler, ray, first_opl, lane, facts):

@@ -78,6 +78,7 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
     dτ = mi.Float(d_first)
     dη = mi.Float(0)
     t_o, t_d, t_w = mi.Vector3f(t_o), mi.Vector3f(t_d), mi.Vector3f(t_d)
+    events = lane.begin()
     while dr.hint(live, max_iterations=integrator.max_depth, label="transient_path forward mode"):
         v = read_vertex(store, k, live, ray0.time, ray0.wavelengths)
         follow = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
@@ -96,14 +97,14 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
         d_Le = dβ * Le + v.β * t[0]
         d_f = dβ * f + v.β * t[1]
         dL += dr.select(live, d_Le + d_f, 0)
-        lane.put_slope(v.τ, d_Le, v.β * Le * dτ_v, x.hit)
-        lane.put_slope(v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
+        lane.put_slope(events, v.τ, d_Le, v.β * Le * dτ_v, x.hit)
+        lane.put_slope(events, v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
             E = x.E
             d_E = dβ * E + v.β * t[-2]
             dL += dr.select(live, d_E, 0)
             dτ_E = dτ_v + dη * x.step * x.length_E + follow.η * t[-1]
-            lane.put_slope(follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
+            lane.put_slope(events, follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
 
         # ------------------------------------------------------------------- to the next vertex
         dβ = dβ * W + v.β * t[2]
@@ -119,4 +120,5 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
                 t_w = dr.select(x.mirrored, t_d, t_w)
         k += 1
         live = k < count
+    lane.end(events)
     return dL

@@ -1,0 +1,85 @@
+"""Gradient cases of the light's colour and time: response curves of the film, pulses, gates, delays."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+from gradient_cases import Case, camera, film, move, room
+
+BANDS = {
+    "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},
+    "blue": {"type": "spectrum", "value": [(400, 0.0), (450, 1.0), (500, 0.0)]},
+}
+
+
+def spectrum(values):
+    """A spectrum over the visible range with some values at equal distances."""
+    return {"type": "regular", "wavelength_min": 360, "wavelength_max": 830, "values": values}
+
+
+def banded_room(**arguments):
+    """The room seen by a film with response curves."""
+    sensor = camera()
+    sensor["film"] = {**film(), **BANDS}
+    return room(sensor=sensor, **arguments)
+
+
+def measured_panel():
+    """A panel whose reflectance is a measured spectrum."""
+    scene = banded_room()
+    scene["side"]["bsdf"] = {"type": "diffuse", "reflectance": spectrum("0.2, 0.6, 0.4")}
+    return scene
+
+
+def coloured_lamp():
+    """A point light with a measured spectrum."""
+    return banded_room(light={"type": "point", "position": [0.5, 0.0, 4.0], "intensity": spectrum("2, 9, 4, 6")})
+
+
+def tilt_spectrum(key):
+    """Add ``x`` to the longer half of a tabulated spectrum."""
+
+    def apply(params, x):
+        values = params[key]
+        n = dr.width(values)
+        ramp = dr.select(dr.arange(mi.UInt32, n) >= n // 2, mi.Float(1), 0)
+        params[key] = type(values)(mi.Float(values) + ramp * x)
+
+    return apply
+
+
+CASES = [
+    Case(
+        "banded_albedo_spectrum",
+        "measured spectra, response curves",
+        measured_panel,
+        tilt_spectrum("side.bsdf.reflectance.values"),
+        0.0,
+        0.02,
+        "llvm_ad_spectral",
+        2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "banded_lamp_spectrum",
+        "measured spectra, response curves",
+        coloured_lamp,
+        tilt_spectrum("light.intensity.values"),
+        0.0,
+        0.2,
+        "llvm_ad_spectral",
+        2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "banded_wall",
+        "shape to_world",
+        banded_room,
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        "llvm_ad_spectral",
+        2048,
+        fd_spp=2048,
+    ),
+]

@@ -1,0 +1,203 @@
+"""What every time-resolved film shares: storage in bands of rows, the steady image, sampling of the spatial filter."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.plugins.films.lane import AdjointLane, Lane
+from torchtransient.plugins.films.response import SensorResponse
+
+# Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
+MAX_ARRAY_ENTRIES = 2**32 - 1
+# Above this many samples per pixel single precision sums lose mass: 2^16 equal terms are good to 2e-4 (5e-5 on 16-wide
+# processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double
+# precision.
+MAX_SINGLE_PRECISION_SAMPLES = 2**16
+
+
+class TimeResolvedFilm(mi.Film):
+    """Abstract base of films that keep an array behind every pixel beside the steady image.
+
+    A subclass has ``plugin`` (its name in messages), ``response`` (what its array is: ``transient`` or ``phasor``), the
+    shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
+    integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
+    handed over as ``opl - start_opl`` in double precision.
+
+    Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
+    """
+
+    plugin = "time-resolved film"
+    response = "transient"
+    exhaustive_scan = False
+    # Whether the film has a window that light can miss, which is then counted in `outside`.
+    has_window = True
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.start_opl = float(props.get("start_opl", 0.0))
+        if not abs(self.start_opl) < float("inf"):
+            raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
+        self.curves = SensorResponse.of(props)
+        self.bands = []
+        self.steady = None
+        self.outside = None
+        self._offset_distribution = None
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        if self.curves is not None:
+            for name, curve in zip(self.curves.names, self.curves.textures, strict=True):
+                cb.put(name, curve, mi.ParamFlags.NonDifferentiable)
+
+    def base_channels_count(self):
+        return self.channel_count()
+
+    # ------------------------------------------------------------------------------------- for integrators
+
+    @property
+    def has_slope(self) -> bool:
+        """Whether what is stored changes smoothly with the path length."""
+        return True
+
+    def take_filter(self, name: str, stddev: float | None):
+        """Take over an integrator's settings of the temporal filter; empty name and None leave the film's own."""
+
+    def lanes_at_most(self, depth: int) -> int | None:
+        """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
+        return None
+
+    def lane(self, job, base, match, tangents: bool = False) -> Lane:
+        """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
+        ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        """
+        return Lane(self, self.bands[job.band][2], base, match)
+
+    def adjoint_lane(self, response, base, steady, match) -> AdjointLane:
+        """How the samples of one pass read the adjoint: ``response`` is None or (array, bin stride, channel stride),
+        ``base`` the index of each sample's first entry in it, ``steady`` the adjoint of the steady image by channel.
+        """
+        return AdjointLane(self, response, base, steady, match)
+
+    # ---------------------------------------------------------------------------------------- storage
+
+    def channel_count(self) -> int:
+        """The number of :meth:`channel_names`."""
+        return len(self.channel_names())
+
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
+        "B").
+        """
+        if self.curves is not None:
+            return self.curves.names
+        return ("L",) if mi.is_monochromatic else ("R", "G", "B")
+
+    def band_rows(self) -> int:
+        """Rows of one storage band: as many as 32-bit indices allow."""
+        per_row = int(self.crop_size()[0]) * self.entries_per_pixel()
+        rows = MAX_ARRAY_ENTRIES // per_row
+        if rows < 1:
+            raise StorageError(
+                f"{self.plugin}: one row of {int(self.crop_size()[0])} pixels with {self.entries_per_pixel()} "
+                "values each exceeds 2^32 values; use fewer bins or frequencies, a narrower crop or a smaller laser "
+                "grid."
+            )
+        return min(rows, int(self.crop_size()[1]))
+
+    def band_layout(self) -> list[tuple[int, int]]:
+        """The storage bands as (first row, rows); one, unless the cube exceeds 32-bit indices."""
+        height, rows = self.cube_shape()[0], self.band_rows()
+        return [(first, min(rows, height - first)) for first in range(0, height, rows)]
+
+    def prepare(self, aovs=(), samples: int = 0):
+        """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
+        if len(aovs):
+            raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
+        if mi.is_polarized:
+            raise SceneError(f"{self.plugin}: polarized variants are not supported; use the unpolarized one.")
+        height, width = self.cube_shape()[:2]
+        real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
+        per_row = width * self.entries_per_pixel()
+        self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
+        self.steady = dr.zeros(real, height * width * self.channel_count())
+        # By pixel: one sum over all samples would drown small terms, and be one address that every thread waits for.
+        self.outside = dr.zeros(real, height * width * 2) if self.has_window else None
+        return self.channel_count()
+
+    def settle(self):
+        """End of a render: sums kept in double precision become single precision."""
+        if dr.type_v(self.steady) != dr.type_v(mi.Float):
+            self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
+            self.steady = mi.Float(self.steady)
+            if self.outside is not None:
+                self.outside = mi.Float(self.outside)
+            dr.eval(self.steady, self.outside, *(band[2] for band in self.bands))
+
+    def clear(self):
+        """Drop the storage; tensors developed before keep their memory."""
+        self.bands, self.steady, self.outside = [], None, None
+
+    def transient_bands(self):
+        """The storage as (first row, rows, flat array) for each band."""
+        return self.bands
+
+    def check_one_band(self):
+        """Raise ``StorageError`` when the cube does not fit into one tensor."""
+        if self.band_rows() < int(self.crop_size()[1]):
+            raise StorageError(
+                f"{self.plugin}: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
+                "develop=False and read the film's transient_bands(), or use a smaller crop."
+            )
+
+    def develop(self, raw: bool = False):
+        """The pair (steady ``(H, W, C)``, array of shape ``cube_shape()``), without a copy.
+
+        A cube of more than 2^32 entries cannot be one Dr.Jit tensor: use :meth:`transient_bands`.
+        """
+        if self.steady is None:
+            raise SceneError(f"{self.plugin}: nothing was rendered yet; call render() first.")
+        self.check_one_band()
+        shape = self.cube_shape()
+        steady = mi.TensorXf(self.steady, (shape[0], shape[1], self.channel_count()))
+        return steady, mi.TensorXf(self.bands[0][2], shape)
+
+    @property
+    def energy_before(self) -> float:
+        """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
+        return self._energy_outside(0)
+
+    @property
+    def energy_after(self) -> float:
+        """Light that arrived after the end of the window: sum over pixels, mean over channels."""
+        return self._energy_outside(1)
+
+    def _energy_outside(self, side: int) -> float:
+        return 0.0 if self.outside is None else float(np.array(self.outside, dtype=np.float64)[side::2].sum())
+
+    # ----------------------------------------------------------------------------------- pixel sampling
+
+    def sample_offset(self, sample):
+        """Offset from the pixel's centre drawn from the spatial filter, and the sample's weight."""
+        rfilter = self.rfilter()
+        if rfilter.is_box_filter():
+            return sample - 0.5, None
+        if self._offset_distribution is None:
+            radius = rfilter.radius()
+            x = dr.linspace(mi.Float, -radius, radius, 513)
+            h = rfilter.eval(x)
+            dr.eval(h)
+            # A floor keeps the density positive wherever the filter is not zero between two nodes.
+            density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
+            fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)
+            self._offset_distribution = (
+                mi.ContinuousDistribution(mi.ScalarVector2f(-radius, radius), density),
+                float((fine.sum() - 0.5 * (fine[0] + fine[-1])) * 2 * radius / (fine.size - 1)),
+            )
+        distribution, integral = self._offset_distribution
+        x, pdf_x = distribution.sample_pdf(sample.x)
+        y, pdf_y = distribution.sample_pdf(sample.y)
+        weight = rfilter.eval(x) * rfilter.eval(y) / (pdf_x * pdf_y * integral * integral)
+        return mi.Point2f(x, y), weight
