@@ -40,7 +40,7 @@ def peak_time_picture(
     axis = axis_of(cube, axis, "peak_time_picture")
     peaks = peak_time(torch.nan_to_num(cube, posinf=0.0, neginf=0.0), axis).numpy()
     low, high = _limits(peaks, axis, limits)
-    figure, (panel,) = picture_figure(*peaks.shape, side=5.0)
+    figure, (panel,) = picture_figure(peaks.shape[0], peaks.shape[1], side=5.0)
     panel.set_facecolor("0.6")
     panel.set_axis_on()
     panel.set_xticks([])
@@ -65,10 +65,10 @@ def rainbow(
 
     `style` "peak" gives every pixel the hue of its `peak_time`; "fusion" adds up the light of all bins, each in its own
     hue, so that early and late light mix as coloured lamps do. Hues run once over `limits` (metres; None: from 1 % to
-    99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time. Brightness
-    is the steady intensity (sum over channels) on the sRGB curve; `exposure` as in `tone_map`. Pixels that are not
-    finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path` is given. Raises
-    ShapeError, UnitError and StorageError.
+    99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time.
+    Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % white. Pixels that
+    are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path` is given.
+    Raises ShapeError, UnitError and StorageError.
     """
     if style not in STYLES:
         raise UnitError(f"rainbow: expected style 'peak' or 'fusion', got {style!r}.")
@@ -78,7 +78,7 @@ def rainbow(
     broken = ~torch.isfinite(steady).numpy()
     cube = torch.nan_to_num(cube, posinf=0.0, neginf=0.0)
     image = torch.nan_to_num(steady, nan=0.0, posinf=0.0, neginf=0.0)[None]
-    level = tone_map(image, exposure_of(image) if exposure is None else exposure)[..., 0].numpy()
+    level = tone_map(image, exposure_of(image, 0.95) if exposure is None else exposure)[..., 0].numpy()
     low, high = _arrival_limits(cube, axis) if limits is None else _checked(limits)
     if style == "peak":
         shown = colour_maps.rainbow(_hue(peak_time(cube, axis).numpy(), low, high, period_opl), level)
@@ -90,10 +90,13 @@ def rainbow(
 
 def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: float, high: float) -> None:
     """A colour bar with metres on its right and nanoseconds on its left."""
-    bar = figure.colorbar(image, ax=panel, shrink=0.85, pad=0.1)
+    bar = figure.colorbar(image, ax=panel, shrink=0.85, pad=0.2)
     bar.set_label("optical path length (m)")
     twin = bar.ax.twinx()
     twin.set_ylim(1e9 * opl_to_seconds(low), 1e9 * opl_to_seconds(high))
+    # A twin pushes the first axis to the left; here it is the other way round.
+    bar.ax.yaxis.set_ticks_position("right")
+    bar.ax.yaxis.set_label_position("right")
     twin.yaxis.set_ticks_position("left")
     twin.yaxis.set_label_position("left")
     twin.set_ylabel("time (ns)")
@@ -121,9 +124,7 @@ def _to_linear(shown: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4))
 
 
-def _limits(
-    peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, float] | None
-) -> tuple[float, float]:
+def _limits(peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, float] | None) -> tuple[float, float]:
     if limits is not None:
         return _checked(limits)
     known = peaks[np.isfinite(peaks)]

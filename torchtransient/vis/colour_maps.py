@@ -36,7 +36,8 @@ def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
     lab = np.stack([light, chrom * np.cos(angle), chrom * np.sin(angle)], axis=-1)
     linear = (lab @ _LAB_TO_LMS.T) ** 3 @ _LMS_TO_RGB.T
     linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-12) ** (1 / 2.4) - 0.055)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-12) ** (1 / 2.4) - 0.055)
+    return np.asarray(shown, dtype=np.float64)
 
 
 def rainbow(position: Any, value: Any = 1.0) -> Array:

@@ -56,8 +56,8 @@ def figure_type() -> Any:
 
 def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, columns: int = 4) -> tuple[Any, Any]:
     """A figure for `panels` images of the given size in pixels, and its axes as a flat list without frames."""
-    columns = min(panels, columns)
     rows = math.ceil(panels / columns)
+    columns = math.ceil(panels / rows)  # five as three and two, not as four and one
     ratio = min(max(height / width, 0.25), 4.0)
     # Room for a colour bar beside and a title above each image.
     size = (columns * side * 1.15, rows * (side * ratio * 0.92 + 0.35))
@@ -76,6 +76,4 @@ def enlarge(image: Image, factor: int) -> Image:
 
 
 def _missing(package: str) -> StorageError:
-    return StorageError(
-        f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
-    )
+    return StorageError(f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'.")

@@ -47,7 +47,7 @@ def gradient_picture(
     import matplotlib
 
     colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="limegreen")
-    figure, panels = picture_figure(*images.shape[1:], panels=len(images), side=4.4, columns=min(len(images), 4))
+    figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
     names = ("red", "green", "blue") if len(images) == 3 else tuple(f"channel {n}" for n in range(len(images)))
     shown = None
     for panel, image, name in zip(panels, images, names, strict=False):

@@ -12,15 +12,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import enlarge, picture_figure, save_figure, to_bytes
-from torchtransient.vis.sources import Source, phasor_of
+from torchtransient.vis.sources import Source, frequencies_of, phasor_of
 from torchtransient.vis.stamps import with_strip
 from torchtransient.vis.video import Frames
 from torchtransient.vis.video_file import check_video, write_video
 
+_UNITS = (("THz", 1e12), ("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0))
 SHOWS = ("real", "imaginary", "amplitude", "phase", "domain")
 
 
@@ -30,14 +32,14 @@ def phasor_picture(
     *,
     show: Sequence[str] = ("real", "domain"),
     which: Sequence[int] = (0,),
-    frequencies: Sequence[float] | None = None,
+    frequencies: FrequencyAxis | Sequence[float] | None = None,
     percentile: float = 99.0,
     title: str = "",
 ) -> Any:
     """A matplotlib figure of phasor images: a row for each frequency of `which`, a panel for each of `show`.
 
     "real" and "imaginary": blue to red around zero, on one symmetric scale that holds `percentile` of the pixels;
-    "amplitude"; "phase": cyclic hue; "domain": hue by phase and brightness by amplitude. `source`: complex (C, F, H, W)
+    "amplitude"; "phase": cyclic hue, grey where dark; "domain": hue by phase and brightness by amplitude. `source`: complex (C, F, H, W)
     or a result with such a `phasor`; channels are added up. `frequencies` in cycles per metre of optical path, for the
     titles. Pixels that are not finite are grey. Writes the figure when `path` is given. Raises ShapeError for another
     shape or an index outside, UnitError for an unknown panel, StorageError.
@@ -45,9 +47,10 @@ def phasor_picture(
     if not show or any(name not in SHOWS for name in show):
         raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")
     images, known = _images(source, "phasor_picture")
-    frequencies = known if frequencies is None else frequencies
+    frequencies = known if frequencies is None else frequencies_of(frequencies)
     _check_indices(which, images, frequencies)
-    figure, panels = picture_figure(*images.shape[1:], panels=len(show) * len(which), side=3.6, columns=len(show))
+    height, width = images.shape[1:]
+    figure, panels = picture_figure(height, width, panels=len(show) * len(which), side=3.6, columns=len(show))
     for row, index in enumerate(which):
         values = images[index].numpy()
         for panel, name in zip(panels[row * len(show) :], show, strict=False):
@@ -65,19 +68,19 @@ def phasor_video(
     which: int = 0,
     steps: int = 48,
     fps: float = 24.0,
-    frequencies: Sequence[float] | None = None,
+    frequencies: FrequencyAxis | Sequence[float] | None = None,
     scale: int | None = None,
     progress: bool = False,
 ) -> Path:
     """Write one period of `Re(P exp(i phi))` as a video that can be looped: the wave that the modulated light makes.
 
     `phi` grows, and with the phasor `exp(-2 pi i nu opl)` of this library crests run from early to late pixels, as
-    light does. Blue to red around zero on one symmetric scale. `source` as in `phasor_picture`. Returns the path. Raises
-    ShapeError, and StorageError as `video` does.
+    light does. Blue to red around zero on one symmetric scale. `source` as in `phasor_picture`. Returns the path.
+    Raises ShapeError, and StorageError as `video` does.
     """
     check_video(path)
     images, known = _images(source, "phasor_video")
-    frequencies = known if frequencies is None else frequencies
+    frequencies = known if frequencies is None else frequencies_of(frequencies)
     _check_indices((which,), images, frequencies)
     if steps < 1:
         raise ShapeError(f"phasor_video: expected at least one step, got {steps!r}.")
@@ -126,7 +129,9 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: 
     else:
         level: Any = colour_maps.cyclic(np.angle(values) / (2 * math.pi))
         if name == "phase":
-            level[~np.isfinite(values)] = 0.5
+            # What is as good as dark has no phase.
+            amplitude = np.where(np.isfinite(values), np.abs(values), 0)
+            level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude, percentile)] = 0.5
         panel.imshow(level if name == "phase" else domain_colours(values, percentile), interpolation="nearest")
         bar = figure.colorbar(
             ScalarMappable(Normalize(-1, 1), colour_maps.cyclic_map()), ax=panel, shrink=0.8, label="phase"
@@ -154,7 +159,7 @@ def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
     if nu == 0:
         return f"{name}, steady light"
     hertz = abs(nu) * SPEED_OF_LIGHT
-    unit, size = next((u, s) for u, s in (("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0)) if hertz >= s or s == 1)
+    unit, size = next(pair for pair in _UNITS if hertz >= pair[1] or pair[1] == 1)
     return f"{name}, wavelength {1 / nu:.3g} m ({hertz / size:.3g} {unit})"
 
 

@@ -70,7 +70,7 @@ def polarization_picture(
     elif not floor >= 0:
         raise UnitError(f"polarization_picture: expected floor >= 0, got {floor!r}.")
     dark = ((total[0] <= floor) | broken).numpy()
-    figure, panels = picture_figure(*total.shape[1:], panels=len(quantities), side=3.4, columns=min(len(quantities), 4))
+    figure, panels = picture_figure(total.shape[1], total.shape[2], panels=len(quantities), side=3.4)
     for panel, name in zip(panels, quantities, strict=False):
         panel.set_title(_TITLES[name], fontsize=10)
         if name == "intensity":
@@ -84,9 +84,7 @@ def polarization_picture(
     return save_figure(figure, path, "polarization_picture")
 
 
-def angle_image(
-    stokes: Tensor, dark: NDArray[np.bool_], angle_map: str = "even"
-) -> NDArray[np.float64]:
+def angle_image(stokes: Tensor, dark: NDArray[np.bool_], angle_map: str = "even") -> NDArray[np.float64]:
     """RGB (H, W, 3) in [0, 1]: hue by the angle of linear polarization of `stokes` (4, H, W), colourful by its degree.
 
     Where `dark`, grey. "even" goes from grey of the same lightness to the full hue, so that the picture's lightness

@@ -90,7 +90,7 @@ def frame_grid(
     for index in bins:
         if not 0 <= index < total:
             raise ShapeError(f"frame_grid: bin {index} lies outside of {total} bins.")
-    figure, panels = picture_figure(*cube.shape[2:], panels=len(bins), side=2.4, columns=columns)
+    figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
     for panel, index in zip(panels, bins, strict=False):
         panel.imshow(tone_map(cube[:, index], exposure, curve).numpy(), interpolation="nearest")
         panel.set_title(moment(axis, index, total).replace("   ", " = "), fontsize=8)
@@ -110,11 +110,11 @@ def histogram(
 ) -> Any:
     """A matplotlib figure of what some pixels (row, column) see over time, a panel each.
 
-    Channels are red, green and blue lines, or one black one; `log` takes a logarithmic scale. `source` and `axis` as in
-    `frames`. Writes the figure when `path` is given. Raises ShapeError without pixels, or for one outside of the image,
-    and StorageError.
+    Three channels are red, green and blue lines, one is black, others go from violet to yellow; `log` takes a
+    logarithmic scale. `source` and `axis` as in `frames`, with any number of channels. Writes the figure when `path` is
+    given. Raises ShapeError without pixels, or for one outside of the image, and StorageError.
     """
-    cube, axis = transient_of(source, axis, "histogram")
+    cube, axis = transient_of(source, axis, "histogram", any_channels=True)
     height, width = cube.shape[2:]
     if not len(pixels):
         raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
@@ -126,9 +126,11 @@ def histogram(
     edges = np.arange(cube.shape[1] + 1) if axis is None else axis.edges_opl.numpy()
     for panel, (row, column) in zip(panels, pixels, strict=True):
         curves = cube[:, :, row, column].numpy()
-        colours = ("tab:red", "tab:green", "tab:blue") if len(curves) == 3 else ("black",)
-        for curve, colour in zip(curves, colours, strict=True):
-            panel.stairs(curve, edges, color=colour, linewidth=1.0)
+        colours = _line_colours(len(curves))
+        # On a logarithmic scale an empty bin is a gap, not a line down to the frame.
+        shown = np.where(curves > 0, curves, np.nan) if log and bool((curves > 0).any()) else curves
+        for curve, colour in zip(shown, colours, strict=True):
+            panel.stairs(curve, edges, baseline=None if log else 0, color=colour, linewidth=1.0)
         panel.set_title(f"row {row}, column {column}", fontsize=9, loc="left")
         panel.set_ylabel("radiance in a bin")
         if log and bool((curves > 0).any()):
@@ -143,6 +145,14 @@ def histogram(
     if title:
         figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, "histogram")
+
+
+def _line_colours(count: int) -> Any:
+    import matplotlib
+
+    if count in (1, 3):
+        return ("tab:red", "tab:green", "tab:blue") if count == 3 else ("black",)
+    return matplotlib.colormaps["viridis"](np.linspace(0, 0.9, count))
 
 
 def _to_nanoseconds(opl: Any) -> Any:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
@@ -30,7 +30,9 @@ class Loaded:
     frequencies: tuple[float, ...] | None = None
 
 
-def transient_of(source: Source, axis: TimeAxis | None = None, who: str = "picture") -> tuple[Tensor, TimeAxis | None]:
+def transient_of(
+    source: Source, axis: TimeAxis | None = None, who: str = "picture", any_channels: bool = False
+) -> tuple[Tensor, TimeAxis | None]:
     """The intensity over time (C, T, H, W), C = 1 or 3, on the CPU without gradients, and its axis if it is known.
 
     `source`: a tensor or array (C, T, H, W), or polarized (4, C, T, H, W) of which the first component is taken; an
@@ -42,7 +44,7 @@ def transient_of(source: Source, axis: TimeAxis | None = None, who: str = "pictu
     cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
     if cube.ndim == 5 and cube.shape[0] == 4:
         cube = cube[0]
-    if cube.ndim != 4 or cube.shape[0] not in (1, 3) or cube.numel() == 0:
+    if cube.ndim != 4 or cube.numel() == 0 or not (any_channels or cube.shape[0] in (1, 3)):
         raise ShapeError(
             f"{who}: expected a transient (C, T, H, W) or (4, C, T, H, W) with C = 1 or 3, got {tuple(cube.shape)}; of "
             "a batch, choose one, and of many channels, choose one or three."
@@ -92,7 +94,8 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
             raise ShapeError(f"{who}: bin {frame} of {cube.shape[2]} does not exist.")
         result = cube.sum(2) if frame is None else cube[:, :, frame]
     else:
-        shape = tuple((cube if cube is not None else image).shape) if (cube is not None or image is not None) else None
+        found = cube if cube is not None else image
+        shape = "neither" if found is None else tuple(found.shape)
         raise ShapeError(
             f"{who}: expected Stokes vectors (4, C, T, H, W) or (4, C, H, W), got {shape}; polarized variants such as "
             "llvm_ad_mono_polarized render them."
@@ -134,6 +137,15 @@ def as_tensor(value: Any, who: str) -> Tensor:
     return tensor.to(torch.float32)
 
 
+def frequencies_of(given: Any) -> tuple[float, ...] | None:
+    """Cycles per metre of a FrequencyAxis or of a row of numbers; None stays None."""
+    if given is None:
+        return None
+    if isinstance(given, FrequencyAxis):
+        return given.frequencies
+    return tuple(float(f) for f in np.ravel(given))
+
+
 def _only(value: Tensor | None, name: str, shape: str, who: str) -> Tensor:
     if value is None:
         raise ShapeError(f"{who}: the source holds no {name} {shape}.")
@@ -149,17 +161,16 @@ def _load(source: Source, name: str) -> Loaded:
     if isinstance(source, Loaded):
         return source
     if hasattr(source, "transient") or hasattr(source, "phasor"):
-        values = {}
-        for key in ("transient", "steady", "phasor"):
-            value = getattr(source, key, None)
-            values[key] = None if value is None else as_tensor(value, key)
-        frequencies = getattr(source, "frequencies", None)
-        known = None if frequencies is None else tuple(float(f) for f in frequencies)
-        return Loaded(**values, axis=getattr(source, "axis", None), frequencies=known)
+        given = [(key, getattr(source, key, None)) for key in ("transient", "steady", "phasor")]
+        known = frequencies_of(getattr(source, "frequencies", None))
+        transient, steady, phasor = (None if value is None else as_tensor(value, key) for key, value in given)
+        return Loaded(transient, steady, phasor, axis=getattr(source, "axis", None), frequencies=known)
     tensor = as_tensor(source, "picture")
-    if not name:
-        name = "transient" if tensor.ndim == 5 or (tensor.ndim == 4 and tensor.shape[0] != 4) else "steady"
-    return Loaded(**{name: tensor})
+    if name == "phasor":
+        return Loaded(phasor=tensor)
+    if name == "transient" or tensor.ndim == 5 or (tensor.ndim == 4 and tensor.shape[0] != 4):
+        return Loaded(transient=tensor)
+    return Loaded(steady=tensor)
 
 
 def read_file(path: Path) -> Any:
@@ -186,9 +197,13 @@ def read_file(path: Path) -> Any:
         raise StorageError(f"picture: '{path}' cannot be read: {error}.") from error
     if not arrays:
         raise StorageError(f"picture: '{path}' holds none of transient, steady and phasor.")
-    frequencies = values.get("frequencies")
-    known = None if frequencies is None else tuple(float(f) for f in np.ravel(frequencies))
-    return Loaded(**arrays, axis=axis, frequencies=known)
+    return Loaded(
+        transient=arrays.get("transient"),
+        steady=arrays.get("steady"),
+        phasor=arrays.get("phasor"),
+        axis=axis,
+        frequencies=frequencies_of(values.get("frequencies")),
+    )
 
 
 def _npz_values(path: Path) -> dict[str, NDArray[Any]]:

@@ -10,7 +10,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import Image
 
-_INK, _DIM, _GROUND = (235, 235, 235), (95, 95, 95), (20, 20, 20)
+INK, DIM, GROUND = (235, 235, 235), (95, 95, 95), (20, 20, 20)
 
 
 def moment(axis: TimeAxis | None, index: int, bins: int) -> str:
@@ -41,14 +41,14 @@ def with_strip(image: Image, text: str, share: float | None = None) -> Image:
 
     height, width = image.shape[:2]
     rows = max(16, round(0.075 * max(height, width)))
-    strip = Pillow.new("RGB", (width, rows), _GROUND)
+    strip = Pillow.new("RGB", (width, rows), GROUND)
     draw = ImageDraw.Draw(strip)
     bar = max(2, rows // 9)
     font = _font(draw, text, 0.58 * rows, width - rows // 2)
-    draw.text((rows // 4, (rows - bar) / 2 + bar), text, fill=_INK, font=font, anchor="lm")
+    draw.text((rows // 4, (rows - bar) / 2 + bar), text, fill=INK, font=font, anchor="lm")
     if share is not None:
-        draw.rectangle((0, 0, width, bar - 1), fill=_DIM)
-        draw.rectangle((0, 0, round(share * width) - 1, bar - 1), fill=_INK) if share * width >= 1 else None
+        draw.rectangle((0, 0, width, bar - 1), fill=DIM)
+        draw.rectangle((0, 0, round(share * width) - 1, bar - 1), fill=INK) if share * width >= 1 else None
     return np.concatenate([image, np.asarray(strip)])
 
 

@@ -36,7 +36,7 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
 def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
     """One factor for all frames: it brings the given quantile of the *lit* pixels of all frames to white.
 
-    `transient`: (C, T, H, W) linear radiance in a bin. Most pixels of most frames are black, so only what is lit counts.
+    `transient`: (C, T, H, W) linear radiance in a bin. Most pixels of most frames are black: only what is lit counts.
     The quantile is found to 1 % of its value over nine decades below the maximum; nothing of the size of the cube is
     allocated. 1 for a black cube. Raises ShapeError and UnitError.
     """

@@ -12,10 +12,12 @@ import numpy as np
 
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.vis.files import Image
+from torchtransient.vis.stamps import DIM, GROUND, INK
 
 ENDINGS = (".mp4", ".gif")
 _PALETTE_FRAMES = 24
 _PALETTE_PIXELS = 2**18
+_KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255))  # mixed with neighbours, these would look tinted
 
 
 def check_video(path: str | Path) -> Path:
@@ -86,10 +88,10 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
             even = np.pad(frame, (*odd, (0, 0)), mode="edge")
             if writer is None:
                 height, width = even.shape[:2]
-                # yuv420p is what browsers and slides play; crf 16 keeps small pixels sharp.
+                # yuv420p is what browsers and slides play; crf 18 keeps small pixels sharp.
                 writer = _ffmpeg().write_frames(
                     str(target), (width, height), fps=fps, codec="libx264", pix_fmt_in="rgb24", pix_fmt_out="yuv420p",
-                    macro_block_size=2, quality=None, output_params=["-crf", "16", "-movflags", "+faststart"],
+                    macro_block_size=2, quality=None, output_params=["-crf", "18", "-movflags", "+faststart"],
                     ffmpeg_log_level="error",
                 )  # fmt: skip
                 writer.send(None)
@@ -102,7 +104,7 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
 
 
 def _palette(frames: Iterable[Image], count: int) -> Any:
-    """255 colours that serve up to 24 frames out of all."""
+    """256 colours that serve up to 24 frames out of all."""
     pillow = _pillow()
     step = max(1, math.ceil(count / _PALETTE_FRAMES))
     seen = []
@@ -114,8 +116,12 @@ def _palette(frames: Iterable[Image], count: int) -> Any:
         raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none.")
     # A colour that fills the picture, such as black, must not use up the palette.
     colours = np.unique(np.concatenate(seen) & 0xFC, axis=0)
-    strip = pillow.fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
-    return strip.quantize(255, method=pillow.Quantize.MEDIANCUT)
+    row = pillow.fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
+    chosen = row.quantize(256 - len(_KEPT), method=pillow.Quantize.MEDIANCUT).getpalette() or []
+    palette = pillow.new("P", (1, 1))
+    kept = [level for colour in _KEPT for level in colour]
+    palette.putpalette(kept + chosen[: 768 - len(kept)])
+    return palette
 
 
 def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) -> None:
