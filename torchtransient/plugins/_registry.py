@@ -62,6 +62,7 @@ class PluginModule:
 PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),

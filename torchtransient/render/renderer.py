@@ -35,7 +35,7 @@ from torchtransient.render.output import (
 )
 from torchtransient.render.parameters import ParameterInfo
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.variant import active_variant, device_type
+from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
@@ -167,7 +167,7 @@ class TransientRenderer(nn.Module):
         self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter = ""
-        if film.response == "phasor":
+        if film.measures == "phasor":
             self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
             if self.temporal_filter != "auto":
                 raise SceneError(
@@ -281,11 +281,12 @@ class TransientRenderer(nn.Module):
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, stats = steady_channels_first(steady, leading), self._stats(job)
+        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        steady = steady_channels_first(steady, leading, components)
         if self.frequencies is not None:
-            phasor = phasor_channels_first(response, leading)
+            phasor = phasor_channels_first(response, leading, components)
             return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
-        transient = transient_channels_first(response, leading)
+        transient = transient_channels_first(response, leading, components)
         return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:

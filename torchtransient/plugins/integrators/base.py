@@ -14,6 +14,7 @@ from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
+from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -185,6 +186,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
         return sampler, ray, ray_weight, scale, row, column
 
+    def channel_match(self, sensor, film, ray, ray_weight, scale):
+        """The map from samples of the primary rays to the film's channels, detached."""
+        turn = sensor_turn(sensor, dr.detach(ray)) if mi.is_polarized else None
+        return ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves, turn)
+
     def lane_bases(self, film, job, row, column):
         """Index of a pixel's first bin in its band, and of the pixel in the film."""
         width = int(film.crop_size()[0])
@@ -219,9 +225,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _render_pass(self, scene, sensor, film, job):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match)
+        lane = film.lane(job, base, match, self.max_depth)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
         for c, value in enumerate(match.to_channels(L)):
             dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
@@ -263,7 +269,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -306,9 +312,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, tangents=True)
+        lane = film.lane(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(sensor, film, ray)
         t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
         if facts.sensor_moves:
@@ -341,6 +347,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
                 "'tent' or 'gaussian'."
             )
+        if mi.is_polarized:
+            raise GradientError("Polarized variants have no derivatives yet; use the unpolarized one.")
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "

@@ -11,13 +11,25 @@ from torchtransient.plugins.integrators.path_record import allocate, write_verte
 from torchtransient.plugins.integrators.push import push as forward_push
 from torchtransient.plugins.integrators.sweep import sweep as reverse_sweep
 from torchtransient.plugins.integrators.vertex import mis_weight
+from torchtransient.plugins.polarized import (
+    column,
+    intensity,
+    light_type,
+    product,
+    scattered,
+    scattering,
+    transported,
+    turn_in,
+    turn_out,
+)
 from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 
 
 class TransientPath(TransientIntegrator):
     r"""Time-resolved path tracer (:monosp:`transient_path`).
 
-    Next-event estimation with multiple importance sampling over surfaces; monochromatic, RGB and spectral variants.
+    Next-event estimation with multiple importance sampling over surfaces; monochromatic, RGB and spectral variants, and
+    the polarized ones, where every event is a Stokes vector in the frame of the sensor.
     Parameters as in :class:`TransientIntegrator`. The optical path length is counted from the sensor's origin, segment
     by segment between hit points, each times the index of refraction it runs through; light from environment and
     directional emitters arrives as plane waves that leave the sphere around the scene at t = 0 (see
@@ -26,7 +38,7 @@ class TransientPath(TransientIntegrator):
     Gradients: reverse mode walks every path backwards over a record in thread-local memory, forward mode carries
     tangents along; both include the time of flight. Visibility changes are not differentiated (no boundary term).
 
-    Not supported: participating media (``SceneError``), polarization.
+    Not supported: participating media (``SceneError``).
     """
 
     def __init__(self, props):
@@ -48,9 +60,9 @@ class TransientPath(TransientIntegrator):
         # ------------------------------------------------------------------- loop state
         ray = mi.Ray3f(ray)                               # Current ray
         depth = mi.UInt32(0)                              # Vertices so far
-        L = mi.UnpolarizedSpectrum(0)                     # Steady radiance
+        L = light_type()(0)                               # Steady radiance
         before, after = mi.Float(0), mi.Float(0)          # Energy outside the window
-        β = mi.UnpolarizedSpectrum(1)                     # Throughput before the current vertex
+        β = mi.Spectrum(1)                                # Throughput before the current vertex
         η = mi.Float(1)                                   # Index of the medium of the current ray
         τ = mi.Float64(first_opl)                         # Optical path length minus start_opl
         prev = dr.zeros(mi.Interaction3f)                 # Previous vertex
@@ -89,7 +101,7 @@ class TransientPath(TransientIntegrator):
             em_pdf = scene.pdf_emitter_direction(prev, ds, hit & ~prev_delta)
             mis = dr.select(hit, mis_weight(prev_pdf, em_pdf), 0)
             if dr.hint(primal, mode="scalar"):
-                Le = β * mis * mi.unpolarized_spectrum(emitter.eval(si, hit))
+                Le = column(β) * mis * mi.unpolarized_spectrum(emitter.eval(si, hit))
                 L += Le
                 low, high = lane.put(events, τ, Le, hit)
                 before += low
@@ -107,10 +119,11 @@ class TransientPath(TransientIntegrator):
             wo = si.to_local(ds.d)
             bsdf_val, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next)
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
-            Lr = β * mis_em * mi.unpolarized_spectrum(bsdf_val) * mi.unpolarized_spectrum(em_weight)
+            turn = turn_out(si, ray.d)
+            Lr = transported(β, mis_em, scattered(bsdf_val, turn)) * mi.unpolarized_spectrum(em_weight)
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
-                active_em &= dr.max(dr.abs(Lr)) > 0
+                active_em &= dr.max(dr.abs(intensity(Lr))) > 0
             occluded = scene.ray_test(si.spawn_ray_to(ds.p), active_em)
             active_em &= ~occluded
             if dr.hint(primal, mode="scalar"):
@@ -126,9 +139,9 @@ class TransientPath(TransientIntegrator):
                 after += high
 
             # ----------------------------------------------------------------- to the next vertex
-            β_before, η_before = mi.UnpolarizedSpectrum(β), mi.Float(η)
+            β_before, η_before = mi.Spectrum(β), mi.Float(η)
             ray_before, pi_before, is_delta = mi.Ray3f(ray), pi, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            β *= mi.unpolarized_spectrum(bsdf_weight)
+            β = product(β, scattering(bsdf_weight, turn, turn_in(si, bs.wo)))
             η *= bs.eta
             ray = si.spawn_ray(si.to_world(bs.wo))
             prev.p, prev.n, prev.time, prev.wavelengths = si.p, si.n, si.time, si.wavelengths
@@ -136,14 +149,14 @@ class TransientPath(TransientIntegrator):
             prev_delta = is_delta
 
             # --------------------------------------------------------------------------- roulette
-            β_max = dr.max(β)
+            β_max = dr.max(mi.unpolarized_spectrum(β))
             if dr.hint(primal, mode="scalar"):
                 active_next &= β_max != 0
             else:
                 # The derivative of a product with one factor of zero needs the light beyond it: go on past the first
                 # black surface.
                 weight_max = dr.max(mi.unpolarized_spectrum(bsdf_weight))
-                first_black = (weight_max == 0) & (dr.max(β_before) > 0) & (bs.pdf > 0)
+                first_black = (weight_max == 0) & (dr.max(mi.unpolarized_spectrum(β_before)) > 0) & (bs.pdf > 0)
                 active_next &= (weight_max > 0) | first_black
                 β_max = dr.select(β_max == 0, 1, β_max)
             rr_prob = dr.minimum(β_max * dr.square(η), 0.95)
