@@ -42,10 +42,13 @@ def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> Non
     from torchtransient.data.result_file import read_result
 
     def overview() -> None:
-        stored = read_result(result)
-        tt.vis.plot_overview(
-            stored.transient, stored.steady, stored.axis, target, pixel=options["pixel"], title=result.name
-        )
+        from torchtransient.vis.sources import steady_of, transient_of
+
+        axis = read_result(result).axis
+        if axis is None:
+            raise click.UsageError("--kind overview shows a histogram over time, and this file holds phasors.")
+        cube, _ = transient_of(result)
+        tt.vis.plot_overview(cube, steady_of(result), axis, target, pixel=options["pixel"], title=result.name)
 
     draw: dict[str, Callable[[], Any]] = {
         "overview": overview,

@@ -66,9 +66,9 @@ def rainbow(
     `style` "peak" gives every pixel the hue of its `peak_time`; "fusion" adds up the light of all bins, each in its own
     hue, so that early and late light mix as coloured lamps do. Hues run once over `limits` (metres; None: from 1 % to
     99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time.
-    Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % white. Pixels that
-    are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path` is given.
-    Raises ShapeError, UnitError and StorageError.
+    Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % of it white.
+    Pixels that are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path`
+    is given. Raises ShapeError, UnitError and StorageError.
     """
     if style not in STYLES:
         raise UnitError(f"rainbow: expected style 'peak' or 'fusion', got {style!r}.")

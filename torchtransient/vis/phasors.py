@@ -39,10 +39,11 @@ def phasor_picture(
     """A matplotlib figure of phasor images: a row for each frequency of `which`, a panel for each of `show`.
 
     "real" and "imaginary": blue to red around zero, on one symmetric scale that holds `percentile` of the pixels;
-    "amplitude"; "phase": cyclic hue, grey where dark; "domain": hue by phase and brightness by amplitude. `source`: complex (C, F, H, W)
-    or a result with such a `phasor`; channels are added up. `frequencies` in cycles per metre of optical path, for the
-    titles. Pixels that are not finite are grey. Writes the figure when `path` is given. Raises ShapeError for another
-    shape or an index outside, UnitError for an unknown panel, StorageError.
+    "amplitude"; "phase": cyclic hue, grey where dark; "domain": hue by phase and brightness by amplitude. `source`:
+    complex (C, F, H, W) or a result with such a `phasor`; channels are added up. `frequencies` (cycles per metre of
+    optical path, or a FrequencyAxis) are for the titles. Pixels that are not finite are grey. Writes the figure when
+    `path` is given. Raises ShapeError for another shape or an index outside, UnitError for an unknown panel,
+    StorageError.
     """
     if not show or any(name not in SHOWS for name in show):
         raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -108,10 +110,13 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
 def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float, ...] | None]:
     """Phasor images, complex (C, F, H, W), and their frequencies in cycles per metre if the source knows them.
 
-    A complex tensor or array, or the `phasor` of a result. Raises ShapeError for another shape or a real dtype.
+    A complex tensor or array (C, F, H, W), or polarized (4, C, F, H, W) of which the first component is taken, or the
+    `phasor` of a result. Raises ShapeError for another shape or a real dtype.
     """
     loaded = _load(source, "phasor")
     phasor = _only(loaded.phasor, "phasor", "complex (C, F, H, W)", who)
+    if phasor.ndim == 5 and phasor.shape[0] == 4:
+        phasor = phasor[0]
     if phasor.ndim != 4 or phasor.numel() == 0 or not phasor.is_complex():
         raise ShapeError(
             f"{who}: expected complex phasors (C, F, H, W), got {phasor.dtype} of shape {tuple(phasor.shape)}."
@@ -135,6 +140,23 @@ def as_tensor(value: Any, who: str) -> Tensor:
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
         return tensor
     return tensor.to(torch.float32)
+
+
+def _refuse_batch(source: Any) -> None:
+    """Four entries of a batch must not pass for four components of polarized light, where the source can tell."""
+    transient, polarized = getattr(source, "transient", None), getattr(source, "polarized", None)
+    if polarized is None and isinstance(getattr(source, "metadata", None), dict):
+        polarized = _variant_is_polarized(source.metadata)
+    if polarized is False and transient is not None and transient.ndim > 4:
+        raise ShapeError(
+            f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(transient.shape)}; "
+            "choose one entry."
+        )
+
+
+def _variant_is_polarized(metadata: dict[str, Any]) -> bool | None:
+    variant = (metadata.get("stats") or {}).get("variant")
+    return None if variant is None else "polarized" in variant
 
 
 def frequencies_of(given: Any) -> tuple[float, ...] | None:
@@ -161,6 +183,7 @@ def _load(source: Source, name: str) -> Loaded:
     if isinstance(source, Loaded):
         return source
     if hasattr(source, "transient") or hasattr(source, "phasor"):
+        _refuse_batch(source)
         given = [(key, getattr(source, key, None)) for key in ("transient", "steady", "phasor")]
         known = frequencies_of(getattr(source, "frequencies", None))
         transient, steady, phasor = (None if value is None else as_tensor(value, key) for key, value in given)
@@ -176,7 +199,7 @@ def _load(source: Source, name: str) -> Loaded:
 def read_file(path: Path) -> Any:
     """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
 
-    Of a result, the names `transient`, `steady`, `phasor` and the three numbers of the axis are read, each if it is
+    Of a result, the names `transient`, `steady`, `phasor` and the numbers of the axis are read, each if it is
     there. Raises StorageError for a missing, damaged or unknown file.
     """
     if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
@@ -188,13 +211,16 @@ def read_file(path: Path) -> Any:
             return np.load(path, allow_pickle=False)
         values = _hdf5_values(path) if path.suffix.lower() in _HDF5 else _npz_values(path)
         axis = None
-        if "start_opl" in values:
+        if "num_bins" in values:
             axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         arrays = {key: as_tensor(values[key], key) for key in ("transient", "steady", "phasor") if key in values}
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise StorageError(f"picture: '{path}' cannot be read: {error}.") from error
+    if (cube := arrays.get("transient")) is not None and cube.ndim > 4 and "metadata" in values:
+        metadata = json.loads(str(values["metadata"]))
+        _refuse_batch(SimpleNamespace(transient=cube, metadata=metadata))
     if not arrays:
         raise StorageError(f"picture: '{path}' holds none of transient, steady and phasor.")
     return Loaded(
@@ -202,7 +228,7 @@ def read_file(path: Path) -> Any:
         steady=arrays.get("steady"),
         phasor=arrays.get("phasor"),
         axis=axis,
-        frequencies=frequencies_of(values.get("frequencies")),
+        frequencies=frequencies_of(values.get("frequencies_per_metre")),
     )
 
 

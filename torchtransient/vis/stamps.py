@@ -26,8 +26,8 @@ def _nanoseconds(*lengths: float) -> list[float]:
 
 
 def _digits(value: float, step: float) -> str:
-    """As many decimals as tell neighbouring bins apart."""
-    decimals = int(np.clip(np.ceil(-np.log10(step)), 0, 6))
+    """As many decimals as tell the halves of a bin apart."""
+    decimals = int(np.clip(np.ceil(-np.log10(step / 2)), 0, 6))
     return f"{value:.{decimals}f}"
 
 
