@@ -43,8 +43,9 @@ def write_video(
     them first for its palette, which is one for all frames (colours of one palette per frame would flicker), and
     therefore takes a second look at the iterable: give a list, or an object that can be iterated twice. An MP4 has an
     even number of rows and columns: an odd last one is repeated. GIF players know hundredths of a second: `fps` is
-    rounded to that, and equal frames that follow each other become one that is shown longer. Raises ShapeError without frames or for frames of different size, UnitError unless fps > 0,
-    StorageError when the file cannot be written or imageio-ffmpeg is missing (extra `vis`).
+    rounded to that, and equal frames that follow each other become one that is shown longer. Raises ShapeError without
+    frames or for frames of different size, UnitError unless fps > 0, StorageError when the file cannot be written or
+    imageio-ffmpeg is missing (extra `vis`).
     """
     target = check_video(path)
     if not (math.isfinite(fps) and fps > 0):
