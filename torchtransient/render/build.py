@@ -250,17 +250,17 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
         props["start_opl"] = options.frequencies.start_opl
 
 
-def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
-    """Turn a node into another plugin; keep the named properties, every child object and every spectrum."""
+def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:
+    """Turn a node into another plugin; keep the named properties and, if ``nested``, child objects and spectra."""
     import mitsuba as mi
 
     old = state.nodes[index].props
-    nested = {key for key, _ in children(state, state.nodes[index])}
-    nested |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
+    inner = {key for key, _ in children(state, state.nodes[index])}
+    inner |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
     for key in list(old.keys()):
-        if key in keep or key in nested:
+        if key in keep or (nested and key in inner):
             new[key] = old[key]
     state.nodes[index].props = new
 
@@ -275,7 +275,7 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
         if options.integrator is not None and plugin != options.integrator:
-            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES)
+            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
         elif plugin in _COUNTERPARTS:
             wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
             _become(state, index, wanted, keep=_PATH_PROPERTIES)

@@ -40,7 +40,7 @@ class Census:
 
     ``albedo``: no surface or medium scatters more than this share of the light, 1 when that is not known, with the
     node that sets it in ``brightest``. ``integrator`` and ``film`` are plugin names, with the properties that a plan
-    reads; ``films`` is the number of different film plugins.
+    reads. ``pulsed``: the film spreads arrivals by a pulse or an impulse response.
     """
 
     media: list[Finding] = field(default_factory=list)
@@ -58,6 +58,7 @@ class Census:
     film: str | None = None
     film_axis: tuple[float, float, int] | None = None
     temporal_filter: str | None = None
+    pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
 
 
@@ -143,6 +144,7 @@ def _note_film(census: Census, state: Any, node: Any) -> None:
     if census.film is not None:
         return
     census.film = props.plugin_name()
+    census.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
         census.temporal_filter = str(props["temporal_filter"])
     if census.film == "transient_hdr_film":

@@ -121,11 +121,10 @@ class TransientRenderer(nn.Module):
         super().__init__()
         if isinstance(effects, Plan):
             scene = load(scene, variant=effects.variant)
-            if time_axis is None and frequencies is None:
-                time_axis, frequencies = effects.time_axis, effects.frequencies
+            time_axis, frequencies = effects.axes(time_axis, frequencies)
             max_depth = effects.max_depth if max_depth is None else max_depth
-            if temporal_filter == "auto" and effects.temporal_filter not in ("box", ""):
-                temporal_filter = effects.temporal_filter
+            pulse, irf = pulse or effects.pulse, irf or effects.irf
+            temporal_filter = effects.filter_unless(temporal_filter)
         elif effects != "auto":
             raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
