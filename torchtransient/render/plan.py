@@ -20,7 +20,7 @@ from torchtransient.render.plan_finder import Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load
-from torchtransient.render.variant import active_variant, is_differentiable
+from torchtransient.render.variant import active_variant
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,8 @@ def plan(
 
     Raises ``SceneError`` for unknown outputs and parameters, for outputs that need different films, for scenes that
     cannot be read or rendered, and when the pilot run sees no light and no time axis is given; ``UnitError`` for
-    shares outside (0, 1); ``GradientError`` for a box filter with parameters that change path lengths.
+    shares outside (0, 1); ``VariantError`` for unknown variants; ``GradientError`` for a box filter with parameters
+    that change path lengths.
     """
     for name, share in (("tail", tail), ("missed", missed)):
         if not 0 < share < 1:
@@ -214,11 +215,6 @@ def _frequencies(given: Any, film: str, census: Census) -> FrequencyAxis | None:
 
 def _check_known(draft: Plan, gates: Any, census: Census) -> None:
     """What the plan calls for has to be part of this installation."""
-    import mitsuba as mi
-
-    if not is_differentiable(draft.variant) or draft.variant not in mi.variants():
-        usable = ", ".join(v for v in mi.variants() if is_differentiable(v))
-        raise SceneError(f"tt.plan: variant {draft.variant!r} cannot be used here; expected one of {usable}.")
     for kind, plugin in (("integrator", draft.integrator), ("film", choices.FILM_PLUGINS[draft.film])):
         if plugins.kind_of(plugin) != kind:
             raise SceneError(
