@@ -55,9 +55,9 @@ def column(matrix):
 
 # ------------------------------------------------------------------------------------------------------- adjoints
 #
-# Every event of a path has its own adjoint A, a row vector in polarized variants, and the throughput stands between it
-# and the light f: A^T β f. What lies beyond a vertex is therefore kept as the matrix f A^T per unit throughput, of which
-# β takes the trace; no matrix is ever inverted.
+# Every event of a path has its own adjoint A, a vector in polarized variants, and the throughput stands between it and
+# the light f: A^T β f. What lies beyond a vertex is therefore kept as the matrix f A^T per unit throughput, so that the
+# number is trace(β f A^T); no matrix is ever inverted.
 
 
 def matched(A, light):

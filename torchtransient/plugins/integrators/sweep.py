@@ -6,9 +6,9 @@ vertex:
     S_i = sum of A f  over the events at and beyond vertex i,      D_i = sum of A' f over the same events,
 
 so that ``dLoss = beta_i (A df + A' f dtau + dW S + W D dtau)`` at every vertex. In polarized variants the suffixes are
-matrices ``f A^T`` and the loss is their trace behind the throughput, see :mod:`torchtransient.plugins.polarized`. Nothing is divided by a BSDF value: a
-zero albedo has its right gradient. Where a delta lobe determines the next ray, the adjoint of that ray (origin,
-direction) is handed back to the vertex that sent it.
+matrices ``f A^T`` and the loss is the trace of them behind the throughput, see :mod:`torchtransient.plugins.polarized`.
+Nothing is divided by a BSDF value: a zero albedo has its right gradient. Where a delta lobe determines the next ray,
+the adjoint of that ray (origin, direction) is handed back to the vertex that sent it.
 """
 
 from __future__ import annotations
