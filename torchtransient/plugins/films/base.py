@@ -85,8 +85,10 @@ class TimeResolvedFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """The number of :meth:`channel_names`."""
-        return len(self.channel_names())
+        """The number of :meth:`channel_names`, in polarized variants four times that: first all of S0, then S1, S2,
+        S3.
+        """
+        return len(self.channel_names()) * (4 if mi.is_polarized else 1)
 
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
@@ -117,8 +119,6 @@ class TimeResolvedFilm(mi.Film):
         """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
-        if mi.is_polarized:
-            raise SceneError(f"{self.plugin}: polarized variants are not supported; use the unpolarized one.")
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
@@ -167,12 +167,12 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def energy_before(self) -> float:
-        """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
+        """Light that arrived before ``start_opl``: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(0)
 
     @property
     def energy_after(self) -> float:
-        """Light that arrived after the end of the window: sum over pixels, mean over channels."""
+        """Light that arrived after the end of the window: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(1)
 
     def _energy_outside(self, side: int) -> float:
