@@ -16,6 +16,7 @@ del globals()["render"]
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
+    "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",
@@ -28,6 +29,7 @@ _LAZY = {
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
+    "vis": "torchtransient.vis",
 }
 
 

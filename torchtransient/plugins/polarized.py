@@ -37,6 +37,13 @@ def transported(β, weight, x):
     return product(β, x) * weight
 
 
+def faded(β, T):
+    """A throughput times a spectrum ``T`` that acts on all of its components alike."""
+    if not mi.is_polarized:
+        return β * T
+    return mi.Spectrum(*[β[i, j] * T for i in range(4) for j in range(4)])
+
+
 def product(a, b):
     """``a b``: of two spectra, two Mueller matrices, or a Mueller matrix and a Stokes vector."""
     if not mi.is_polarized:
