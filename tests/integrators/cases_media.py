@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
-from gradient_cases import Case, area_light, camera, move, move_point, move_vertices, room, scale_texture, set_color, transform
+from gradient_cases import Case, area_light, camera, move, move_point, room, scale_texture, set_color, transform
 
 
 def homogeneous(sigma_t=0.8, albedo=0.7, g=0.4, **arguments):
@@ -88,6 +89,12 @@ def lamp(shape="rectangle"):
     return {"light": area_light(shape)}
 
 
+def wide_lamp():
+    """A lamp beside the camera's field of view."""
+    pose = transform().translate([1.0, 0.2, 2.0]).rotate([0, 1, 0], 215).scale(0.5)
+    return {"light": {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": 9.0}}, "depth": 3}
+
+
 def set_rgb(key, channel):
     """One channel of a colour."""
 
@@ -103,6 +110,17 @@ def coloured():
     return homogeneous({"type": "rgb", "value": [0.4, 0.8, 0.2]}, {"type": "rgb", "value": [0.9, 0.3, 0.6]}, scale=2.0)
 
 
+def thicken(key):
+    """Move the front of the block towards the camera."""
+
+    def apply(params, x):
+        p = dr.unravel(mi.Point3f, params[key])
+        p.z += dr.select(p.z > 1.25, x, 0)
+        params[key] = dr.ravel(p)
+
+    return apply
+
+
 def blended():
     parts = {"a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}
     return homogeneous() | {"phase": {"type": "blendphase", "weight": 0.4, **parts}}
@@ -114,16 +132,14 @@ def case(name, row, scene, apply, value, step, **arguments):
 
 CASES = [
     case("medium_sigma_t", ROW_DENSITY, lambda: block(homogeneous()), set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
-    case("medium_sigma_t_zero", ROW_DENSITY, lambda: block(homogeneous(0.0)), set_color(BLOCK + "sigma_t.value.value"), 0.0, 0.01),
-    case("medium_sigma_t_rgb", ROW_DENSITY, lambda: block(coloured()), set_rgb(BLOCK + "sigma_t.value.value", 1), 0.8, 0.02, variant="llvm_ad_rgb"),
-    case("medium_sigma_t_fog", ROW_DENSITY, lambda: fog(homogeneous(0.3)), set_color("sensor.medium.sigma_t.value.value"), 0.3, 0.02),
+    case("medium_sigma_t_rgb", ROW_DENSITY, lambda: block(coloured()), set_rgb(BLOCK + "sigma_t.value.value", 1), 0.8, 0.05, variant="llvm_ad_rgb", spp=1024, fd_spp=8192),
+    case("medium_sigma_t_fog", ROW_DENSITY, lambda: fog(homogeneous(0.3)), set_color("sensor.medium.sigma_t.value.value"), 0.3, 0.05, spp=4096, fd_spp=16384),
     case("medium_albedo", ROW_ALBEDO, lambda: block(homogeneous()), set_color(BLOCK + "albedo.value.value"), 0.7, 0.02),
     case("medium_albedo_zero", ROW_ALBEDO, lambda: block(homogeneous(albedo=0.0)), set_color(BLOCK + "albedo.value.value"), 0.0, 0.02),
     case("medium_g", ROW_PHASE, lambda: block(homogeneous()), set_color(BLOCK + "phase_function.g"), 0.4, 0.02),
     case("medium_blend", ROW_PHASE, lambda: block(blended()), set_color(BLOCK + "phase_function.weight.value.value"), 0.4, 0.02),
     case("medium_grid", ROW_GRID, lambda: block(clouds()), scale_texture(BLOCK + "sigma_t.data"), 0.0, 0.02),
     case("medium_grid_sparse", ROW_GRID, lambda: block(clouds(sparse())), scale_texture(BLOCK + "sigma_t.data"), 0.0, 0.02),
-    case("medium_grid_empty", ROW_GRID, lambda: block(clouds(np.zeros((3, 3, 3)))), scale_texture(BLOCK + "sigma_t.data"), 0.0, 0.02),
     case("medium_albedo_grid", ROW_GRID, lambda: block(clouds(albedo=volume(sparse()))), scale_texture(BLOCK + "albedo.data"), 0.0, 0.02),
     case("medium_sigma_t_smooth", ROW_DENSITY, smooth_pool, set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
     case("medium_sigma_t_rough", ROW_DENSITY, rough_pool, set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
@@ -132,12 +148,12 @@ CASES = [
     case("medium_wall_grid", ROW_LENGTHS, lambda: block(clouds()), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3),
     case("medium_light", ROW_LENGTHS, lambda: fog(homogeneous(0.3)), move_point("light.position", (0, 0, 1)), 0.0, 2e-3),
     case("medium_light_block", ROW_LENGTHS, lambda: block(homogeneous()), move_point("light.position", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_lamp", ROW_LENGTHS, lambda: fog(homogeneous(0.3), **lamp()), move("light.to_world", (0, 0, 1)), 0.0, 2e-3),
+    case("medium_lamp", ROW_LENGTHS, lambda: fog(homogeneous(0.1), **wide_lamp()), move("light.to_world", (0, 0, 1)), 0.0, 4e-3, spp=4096),
     case("medium_ball", ROW_LENGTHS, lambda: fog(homogeneous(0.3), **lamp("sphere")), move("light.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_lamp_block", ROW_LENGTHS, lambda: block(homogeneous(), **lamp()), move("light.to_world", (0, 0, 1)), 0.0, 2e-3),
+    case("medium_lamp_block", ROW_LENGTHS, lambda: block(homogeneous(), **lamp()), move("light.to_world", (1, 0, 0)), 0.0, 2e-3),
     case("medium_camera", ROW_LENGTHS, lambda: block(homogeneous()), move("sensor.to_world", (0, 0, 1)), 0.0, 2e-3),
     case("medium_camera_fog", ROW_LENGTHS, lambda: fog(homogeneous(0.3)), move("sensor.to_world", (0, 0, 1)), 0.0, 2e-3),
     case("medium_index_smooth", ROW_LENGTHS, smooth_pool, set_color("block.bsdf.eta"), 1.3, 2e-3),
     case("medium_index_rough", ROW_LENGTHS, rough_pool, set_color("block.bsdf.eta"), 1.3, 2e-3),
-    case("medium_boundary", ROW_LENGTHS, lambda: block(homogeneous()), move_vertices("block.vertex_positions", (0, 0, 1)), 0.0, 2e-3),
+    case("medium_boundary", ROW_LENGTHS, lambda: block(homogeneous()), thicken("block.vertex_positions"), 0.0, 2e-2),
 ]  # fmt: skip

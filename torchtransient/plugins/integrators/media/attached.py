@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.integrators.media.free_flight import medium_interaction
+from torchtransient.plugins.integrators.media.medium_vertex import unpolarizing
 
 
 class InMedium:
@@ -70,5 +71,5 @@ def evaluate(inside, ctx, bsdf, si, wo, d, active):
         return val, pdf
     value, density = inside.phase.eval_pdf(mi.PhaseFunctionContext(None), inside.mei, d, active & inside.scatter)
     usable = dr.isfinite(dr.detach(density)) & inside.scatter
-    value = dr.select(usable, mi.unpolarized_spectrum(value) * inside.σ_s, 0)
-    return dr.select(inside.scatter, value, mi.unpolarized_spectrum(val)), dr.select(usable, density, pdf)
+    value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value) * inside.σ_s, 0))
+    return dr.select(inside.scatter, value, val), dr.select(usable, density, pdf)

@@ -14,11 +14,12 @@ from torchtransient.plugins.integrators.media.leg_gradient import (
     leg_forward,
 )
 from torchtransient.plugins.integrators.media.medium_vertex import medium_behind
+from torchtransient.plugins.polarized import faded, matched, traced, traced_colours
 
 
 def before_leg(v, suffix):
     """A suffix per unit throughput at the start of the leg that led to the vertex."""
-    return suffix if v.medium is None else suffix * v.medium.walk
+    return suffix if v.medium is None else faded(suffix, v.medium.walk)
 
 
 def legs_at(v, x, facts):
@@ -46,24 +47,25 @@ def slope_along(a, p, active):
 def sweep_legs(scene, facts, v, x, nxt, lane, f_em, S, a_x):
     """Reverse mode at a vertex: (objective to be propagated, adjoint of the start of the arriving leg).
 
-    ``f_em``: the emitter sample times its adjoint, ``S``: the suffix at the vertex, both per unit throughput. ``a_x``:
+    ``f_em``: the emitter sample matched with its adjoint, ``S``: the suffix, both per unit throughput at the vertex. ``a_x``:
     adjoint of the start of the next leg.
     """
     arriving, connecting = legs_at(v, x, facts)
     objective = mi.Float(0)
     with dr.suspend_grad():  # the loops along the legs attach what they need by themselves
-        before, here = leg_backward(scene, facts, arriving, v.β * S, mi.Bool(x.live))
-        em_here, em_there = leg_backward(scene, facts, connecting, v.β * f_em, v.lit)
+        before, here = leg_backward(scene, facts, arriving, traced_colours(v.β, S), mi.Bool(x.live))
+        em_here, em_there = leg_backward(scene, facts, connecting, traced_colours(v.β, f_em), v.lit)
     if not facts.geometry:
         return objective, a_x
     objective += slope_along(here, x.si.p, x.valid) + slope_along(em_here, x.si.p, v.lit)
     objective += slope_along(em_there, x.p_em, v.lit) + slope_along(a_x, x.si.p, v.goes_on)
     stretch = dr.replace_grad(mi.Float(0), dr.log(dr.select(v.scatter, x.inside.stretch, 1)))
-    objective += dr.select(v.scatter, dr.sum(v.β * S) * stretch, 0)
+    objective += dr.select(v.scatter, traced(v.β, S) * stretch, 0)
     if facts.emitter_shape_moves:
         leg, (A_E, _) = emitting_leg(v, x, nxt), lane.read(nxt.vertex.τ, x.lit_ahead)
+        g_E = traced_colours(v.β, matched(A_E, dr.detach(x.E)))
         with dr.suspend_grad():
-            e_here, e_there = leg_backward(scene, facts, leg, v.β * A_E * dr.detach(x.E), x.lit_ahead)
+            e_here, e_there = leg_backward(scene, facts, leg, g_E, x.lit_ahead)
         objective += slope_along(e_here, x.si.p, x.lit_ahead) + slope_along(e_there, x.p_E, x.lit_ahead)
     return objective, dr.select(x.live, before, a_x)
 
@@ -119,4 +121,6 @@ def push_legs(scene, facts, v, x, nxt, t_points, t_x):
 
 def after_leg(v, dβ, legs):
     """The tangent of the throughput behind the leg that led to the vertex."""
-    return dβ if v.medium is None else dβ * v.medium.walk + v.β * legs.arriving
+    if v.medium is None:
+        return dβ
+    return faded(dβ, v.medium.walk) + faded(v.β, legs.arriving)
