@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from gradient_cases import Case, area_light, camera, move, move_point, room, scale_texture, set_color, transform
+from gradient_cases import Case, area_light, move, move_point, room, scale_texture, set_color, transform
 
 
 def homogeneous(sigma_t=0.8, albedo=0.7, g=0.4, **arguments):
@@ -55,12 +55,6 @@ def fog(medium, light=None, **arguments):
     for name in ("wall", "side"):
         scene[name]["interior"] = scene[name]["exterior"] = {"type": "ref", "id": "fog"}
     return scene
-
-
-ROW_DENSITY, ROW_ALBEDO, ROW_PHASE = "medium extinction", "medium albedo", "phase function"
-ROW_GRID, ROW_LENGTHS = "density and albedo grids", "path lengths in media"
-
-BLOCK = "block.interior_medium."
 
 
 def sparse():
@@ -126,34 +120,68 @@ def blended():
     return homogeneous() | {"phase": {"type": "blendphase", "weight": 0.4, **parts}}
 
 
+SLOW = ("slow",)
+SIGMA_T, ALBEDO = "block.interior_medium.sigma_t.value.value", "block.interior_medium.albedo.value.value"
+PHASE = "block.interior_medium.phase_function."
+FOG = "sensor.medium.sigma_t.value.value"
+GRID, ALBEDO_GRID = "block.interior_medium.sigma_t.data", "block.interior_medium.albedo.data"
+FORWARD = (0, 0, 1)
+
+BLOCKS = {
+    "plain": lambda: block(homogeneous()),
+    "coloured": lambda: block(coloured()),
+    "black": lambda: block(homogeneous(albedo=0.0)),
+    "blended": lambda: block(blended()),
+    "clouds": lambda: block(clouds()),
+    "sparse": lambda: block(clouds(sparse())),
+    "albedo grid": lambda: block(clouds(albedo=volume(sparse()))),
+    "lamp": lambda: block(homogeneous(), **lamp()),
+    "fog": lambda: fog(homogeneous(0.3)),
+    "fog and lamp": lambda: fog(homogeneous(0.1), **wide_lamp()),
+    "fog and ball": lambda: fog(homogeneous(0.3), **lamp("sphere")),
+    "smooth glass": smooth_pool,
+    "rough glass": rough_pool,
+}
+
+
 def case(name, row, scene, apply, value, step, **arguments):
-    return Case(name, row, scene, apply, value, step, **arguments)
+    return Case("medium_" + name, row, BLOCKS[scene], apply, value, step, **arguments)
+
+
+def lengths(name, scene, apply, step=2e-3, value=0.0, **arguments):
+    return case(name, "path lengths in media", scene, apply, value, step, **arguments)
 
 
 CASES = [
-    case("medium_sigma_t", ROW_DENSITY, lambda: block(homogeneous()), set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
-    case("medium_sigma_t_rgb", ROW_DENSITY, lambda: block(coloured()), set_rgb(BLOCK + "sigma_t.value.value", 1), 0.8, 0.05, variant="llvm_ad_rgb", spp=1024, fd_spp=8192),
-    case("medium_sigma_t_fog", ROW_DENSITY, lambda: fog(homogeneous(0.3)), set_color("sensor.medium.sigma_t.value.value"), 0.3, 0.05, spp=4096, fd_spp=16384),
-    case("medium_albedo", ROW_ALBEDO, lambda: block(homogeneous()), set_color(BLOCK + "albedo.value.value"), 0.7, 0.02),
-    case("medium_albedo_zero", ROW_ALBEDO, lambda: block(homogeneous(albedo=0.0)), set_color(BLOCK + "albedo.value.value"), 0.0, 0.02),
-    case("medium_g", ROW_PHASE, lambda: block(homogeneous()), set_color(BLOCK + "phase_function.g"), 0.4, 0.02),
-    case("medium_blend", ROW_PHASE, lambda: block(blended()), set_color(BLOCK + "phase_function.weight.value.value"), 0.4, 0.02),
-    case("medium_grid", ROW_GRID, lambda: block(clouds()), scale_texture(BLOCK + "sigma_t.data"), 0.0, 0.02),
-    case("medium_grid_sparse", ROW_GRID, lambda: block(clouds(sparse())), scale_texture(BLOCK + "sigma_t.data"), 0.0, 0.02),
-    case("medium_albedo_grid", ROW_GRID, lambda: block(clouds(albedo=volume(sparse()))), scale_texture(BLOCK + "albedo.data"), 0.0, 0.02),
-    case("medium_sigma_t_smooth", ROW_DENSITY, smooth_pool, set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
-    case("medium_sigma_t_rough", ROW_DENSITY, rough_pool, set_color(BLOCK + "sigma_t.value.value"), 0.8, 0.02),
-    case("medium_wall_behind", ROW_LENGTHS, lambda: block(homogeneous()), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_wall_in_fog", ROW_LENGTHS, lambda: fog(homogeneous(0.3)), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_wall_grid", ROW_LENGTHS, lambda: block(clouds()), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_light", ROW_LENGTHS, lambda: fog(homogeneous(0.3)), move_point("light.position", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_light_block", ROW_LENGTHS, lambda: block(homogeneous()), move_point("light.position", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_lamp", ROW_LENGTHS, lambda: fog(homogeneous(0.1), **wide_lamp()), move("light.to_world", (0, 0, 1)), 0.0, 4e-3, spp=4096),
-    case("medium_ball", ROW_LENGTHS, lambda: fog(homogeneous(0.3), **lamp("sphere")), move("light.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_lamp_block", ROW_LENGTHS, lambda: block(homogeneous(), **lamp()), move("light.to_world", (1, 0, 0)), 0.0, 2e-3),
-    case("medium_camera", ROW_LENGTHS, lambda: block(homogeneous()), move("sensor.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_camera_fog", ROW_LENGTHS, lambda: fog(homogeneous(0.3)), move("sensor.to_world", (0, 0, 1)), 0.0, 2e-3),
-    case("medium_index_smooth", ROW_LENGTHS, smooth_pool, set_color("block.bsdf.eta"), 1.3, 2e-3),
-    case("medium_index_rough", ROW_LENGTHS, rough_pool, set_color("block.bsdf.eta"), 1.3, 2e-3),
-    case("medium_boundary", ROW_LENGTHS, lambda: block(homogeneous()), thicken("block.vertex_positions"), 0.0, 2e-2),
+    case("sigma_t", "medium extinction", "plain", set_color(SIGMA_T), 0.8, 0.02),
+    case("sigma_t_smooth", "medium extinction", "smooth glass", set_color(SIGMA_T), 0.8, 0.02, tags=SLOW),
+    case("sigma_t_rough", "medium extinction", "rough glass", set_color(SIGMA_T), 0.8, 0.02),
+    case("sigma_t_fog", "medium extinction", "fog", set_color(FOG), 0.3, 0.05, spp=4096, fd_spp=16384, tags=SLOW),
+    case(
+        "sigma_t_rgb", "medium extinction", "coloured", set_rgb(SIGMA_T, 1), 0.8, 0.05,
+        variant="llvm_ad_rgb", fd_spp=8192,
+    ),
+    case("albedo", "medium albedo", "plain", set_color(ALBEDO), 0.7, 0.02, spp=4096, fd_spp=4096),
+    case("albedo_zero", "medium albedo", "black", set_color(ALBEDO), 0.0, 0.02),
+    case("g", "phase function", "plain", set_color(PHASE + "g"), 0.4, 0.02),
+    case("blend", "phase function", "blended", set_color(PHASE + "weight.value.value"), 0.4, 0.02, tags=SLOW),
+    case("grid", "density and albedo grids", "clouds", scale_texture(GRID), 0.0, 0.02),
+    case("grid_sparse", "density and albedo grids", "sparse", scale_texture(GRID), 0.0, 0.02),
+    case(
+        "albedo_grid", "density and albedo grids", "albedo grid", scale_texture(ALBEDO_GRID), 0.0, 0.02,
+        spp=4096, fd_spp=4096, tags=SLOW,
+    ),
+    lengths("wall_behind", "plain", move("wall.to_world", FORWARD)),
+    lengths("wall_in_fog", "fog", move("wall.to_world", FORWARD)),
+    lengths("wall_behind_grid", "clouds", move("wall.to_world", FORWARD), tags=SLOW),
+    lengths("light_in_fog", "fog", move_point("light.position", FORWARD)),
+    lengths("light_behind", "plain", move_point("light.position", FORWARD), tags=SLOW),
+    lengths("lamp_in_fog", "fog and lamp", move("light.to_world", FORWARD), step=4e-3, spp=4096, fd_spp=4096),
+    lengths("ball_in_fog", "fog and ball", move("light.to_world", FORWARD), tags=SLOW),
+    lengths("lamp_behind", "lamp", move("light.to_world", (1, 0, 0)), spp=4096, fd_spp=4096, tags=SLOW),
+    lengths("camera", "plain", move("sensor.to_world", FORWARD), tags=SLOW),
+    lengths("camera_in_fog", "fog", move("sensor.to_world", FORWARD), tags=SLOW),
+    lengths("index_smooth", "smooth glass", set_color("block.bsdf.eta"), value=1.3),
+    lengths("index_rough", "rough glass", set_color("block.bsdf.eta"), value=1.3, tags=SLOW),
+    lengths("boundary", "plain", thicken("block.vertex_positions"), step=2e-2, tags=SLOW),
 ]  # fmt: skip

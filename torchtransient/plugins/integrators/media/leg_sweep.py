@@ -47,8 +47,8 @@ def slope_along(a, p, active):
 def sweep_legs(scene, facts, v, x, nxt, lane, f_em, S, a_x):
     """Reverse mode at a vertex: (objective to be propagated, adjoint of the start of the arriving leg).
 
-    ``f_em``: the emitter sample matched with its adjoint, ``S``: the suffix, both per unit throughput at the vertex. ``a_x``:
-    adjoint of the start of the next leg.
+    ``f_em``: the emitter sample matched with its adjoint, ``S``: the suffix, both per unit throughput at the vertex.
+    ``a_x``: adjoint of the start of the next leg.
     """
     arriving, connecting = legs_at(v, x, facts)
     objective = mi.Float(0)
