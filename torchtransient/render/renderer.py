@@ -35,6 +35,7 @@ from torchtransient.render.output import (
     transient_channels_first,
 )
 from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.plan import Plan
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
@@ -91,8 +92,10 @@ class TransientRenderer(nn.Module):
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
     gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with
-    the same number of samples.
+    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise. ``sampler``: plugin name of
+    a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -108,7 +111,7 @@ class TransientRenderer(nn.Module):
         max_depth: int | None = None,
         temporal_filter: str = "auto",
         sensors: int | Sequence[int] | str = 0,
-        effects: str = "auto",
+        effects: Plan | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
@@ -116,8 +119,14 @@ class TransientRenderer(nn.Module):
         irf: Pulse | None = None,
     ):
         super().__init__()
-        if effects != "auto":
-            raise SceneError(f"effects: only 'auto' is supported so far, got {effects!r}.")
+        if isinstance(effects, Plan):
+            scene = load(scene, variant=effects.variant)
+            time_axis, frequencies = effects.axes(time_axis, frequencies)
+            max_depth = effects.max_depth if max_depth is None else max_depth
+            pulse, irf = pulse or effects.pulse, irf or effects.irf
+            temporal_filter = effects.filter_unless(temporal_filter)
+        elif effects != "auto":
+            raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
@@ -131,8 +140,9 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        spread = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, spread)
+        changes = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        changes["integrator"] = effects.integrator if isinstance(effects, Plan) else None
+        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -149,7 +159,7 @@ class TransientRenderer(nn.Module):
         frequencies: Any,
         max_depth: int | None,
         sampler: str | None,
-        spread: dict[str, Pulse | None],
+        changes: dict[str, Any],
     ) -> BuildOptions:
         if time_axis is not None and not isinstance(time_axis, TimeAxis):
             raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
@@ -160,7 +170,7 @@ class TransientRenderer(nn.Module):
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
             frequencies = FrequencyAxis(frequencies)
         axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, **spread)
+        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
