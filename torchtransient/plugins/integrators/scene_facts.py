@@ -18,7 +18,8 @@ class SceneFacts:
     ``distant``: reference sphere of
     infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
     BSDFs, None when there are none. ``media``: the participating media, None when there are none (or the integrator
-    refuses them). The remaining ones describe which gradients are asked for: ``geometry`` (path
+    refuses them). ``window``: which arrivals the film counts, None where its steady image counts them all. The
+    remaining ones describe which gradients are asked for: ``geometry`` (path
     lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
     spherical ones), ``sensor_moves``,
     ``index_moves``.
@@ -33,6 +34,7 @@ class SceneFacts:
         self.distant = distant
         self.refraction = refraction
         self.media = None
+        self.window = None
         self.geometry = False
         self.light_moves = False
         self.emitter_shape_moves = False
