@@ -35,7 +35,7 @@ FORBIDDEN = {
     "interfaces": {"torch", *MITSUBA},
     **dict.fromkeys(TORCH_PILLAR, MITSUBA),
 }
-HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "click", "rich"}
+HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich"}
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 

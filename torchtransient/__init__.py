@@ -29,6 +29,7 @@ _LAZY = {
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
+    "vis": "torchtransient.vis",
 }
 
 
