@@ -135,7 +135,7 @@ class Gate:
         return values
 
     def spread(self, pulse: Pulse) -> Gate:
-        """The gate as a pulsed light sees it: an arrival at ``opl`` is spread over the pulse before the gate is asked."""
+        """The gate as a pulsed light sees it: an arrival is spread over the pulse before the gate is asked."""
         low, high = pulse.support_opl
         at = np.linspace(self.start_opl - high, self.end_opl - low, NODES)
         if self.kind == "rectangular":

@@ -714,10 +714,10 @@ CASES = [
 def weights(scene_film):
     """Loss weights, of the shape that lies behind a pixel.
 
-    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors a pattern in which
-    no two real or imaginary parts weigh the same.
+    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors and gates a
+    pattern in which no two entries weigh the same.
     """
-    if scene_film.measures == "phasor":
+    if scene_film.measures != "transient":
         shape = scene_film.cube_shape()[2:]
         number = np.arange(int(np.prod(shape)))
         return (np.cos(1.7 * number + 0.4) / (1 + 0.3 * number)).reshape(shape)

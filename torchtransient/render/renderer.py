@@ -12,12 +12,14 @@ from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
+from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
     as_float,
     checked_grad_seed,
+    film_choice,
     fit_shape,
     mangle,
     mix_seed,
@@ -75,13 +77,17 @@ class TransientRenderer(nn.Module):
 
     ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
-    place of ``out.transient``. At most one of the two. ``max_depth``: replaces the integrator's. ``spp``,
+    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films. At most one of the
+    three. ``max_depth``: replaces the integrator's. ``spp``,
     ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
     soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
     a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
     are smooth in time and take no filter.
+
+    ``steady``: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
+    is the sum over the bins.
 
     ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
     instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
@@ -114,6 +120,8 @@ class TransientRenderer(nn.Module):
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
         pulse: Pulse | None = None,
         irf: Pulse | None = None,
+        gates: Sequence[Gate] | None = None,
+        steady: bool = True,
     ):
         super().__init__()
         if effects != "auto":
@@ -132,7 +140,8 @@ class TransientRenderer(nn.Module):
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
         spread = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, spread)
+        measured = film_choice(time_axis, frequencies, gates)
+        self._options = self._build_options(max_depth, sampler, {**measured, **spread, "steady": bool(steady)})
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -143,24 +152,10 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(
-        self,
-        time_axis: TimeAxis | None,
-        frequencies: Any,
-        max_depth: int | None,
-        sampler: str | None,
-        spread: dict[str, Pulse | None],
-    ) -> BuildOptions:
-        if time_axis is not None and not isinstance(time_axis, TimeAxis):
-            raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
+    def _build_options(self, max_depth: int | None, sampler: str | None, film: dict[str, Any]) -> BuildOptions:
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
-        if time_axis is not None and frequencies is not None:
-            raise SceneError("time_axis and frequencies: a film is a histogram or a phasor film, give one of them.")
-        if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-            frequencies = FrequencyAxis(frequencies)
-        axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, **spread)
+        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **film)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -178,19 +173,23 @@ class TransientRenderer(nn.Module):
         film = found[self._sensors[0]].film()
         self.axis: TimeAxis | None = None
         self.frequencies: FrequencyAxis | None = None
+        self.gates: tuple[Gate, ...] | None = None
         self._cube_shape = tuple(film.cube_shape())
         self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter, self._pulsed = "", False
-        if film.measures == "phasor":
-            self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+        self._pulsed = bool(getattr(film, "pulses", ()))
+        if film.measures != "transient":
+            if film.measures == "phasor":
+                self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+            else:
+                self.gates = film.gates
             if self.temporal_filter != "auto":
                 raise SceneError(
-                    f"temporal_filter: a phasor film has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {film.measures} film has none, expected 'auto', got {self.temporal_filter!r}."
                 )
             return
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
-        self._pulsed = bool(getattr(film, "pulses", ()))
         self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
@@ -304,7 +303,7 @@ class TransientRenderer(nn.Module):
             phasor = phasor_channels_first(response, leading, components)
             return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
         transient = transient_channels_first(response, leading, components)
-        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
+        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels, gates=self.gates)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
@@ -391,6 +390,8 @@ class TransientRenderer(nn.Module):
         """Shown by ``print(renderer)``."""
         keys, used = list(self._keys), self.effective_filter
         measured = f"axis={self.axis}, temporal_filter={used!r}" if self.axis else f"frequencies={self.frequencies}"
+        if self.gates is not None:
+            measured = f"gates={len(self.gates)}"
         return f"{self.scene!r}, parameters={keys}, {measured}"
 
 

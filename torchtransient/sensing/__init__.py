@@ -4,6 +4,8 @@ from torchtransient.sensing.policies import GRAD_POLICIES as GRAD_POLICIES
 from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.pulse import apply_pulse as apply_pulse
+from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
 from torchtransient.sensing.sensor import RandomSensor as RandomSensor
 from torchtransient.sensing.sensor import Sensor as Sensor
 from torchtransient.sensing.shot_noise import ShotNoise as ShotNoise

@@ -69,7 +69,6 @@ class TimeResolvedFilm(mi.Film):
 
     def arrivals(self):
         """Which arrivals count (:class:`.window.ArrivalWindow`), None for all: for a film without a steady image."""
-        return None
 
     def lanes_at_most(self, depth: int) -> int | None:
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""

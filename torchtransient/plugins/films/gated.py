@@ -96,7 +96,7 @@ class GatedHDRFilm(TimeResolvedFilm):
     # ----------------------------------------------------------------------------------- splat and read
 
     def put(self, cube, base, opl_from_start, value, active):
-        """Add ``value`` (a list of channel values) that arrives at ``opl - start_opl`` to the gates from ``base`` on."""
+        """Add ``value`` (a list of channel values) arriving at ``opl - start_opl`` to the gates from ``base`` on."""
         put_gates(self._spot(cube, base), self.table, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 

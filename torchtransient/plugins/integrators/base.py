@@ -106,8 +106,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not hasattr(film, "transient_bands"):
             raise SceneError(
-                f"transient integrators need a film of type transient_hdr_film or phasor_hdr_film, the sensor has "
-                f"{film.class_name()}; change the film's type in the scene."
+                "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
+                f"sensor has {film.class_name()}; change the film's type in the scene."
             )
         if film.exhaustive_scan:
             raise SceneError(

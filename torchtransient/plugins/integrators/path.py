@@ -117,8 +117,7 @@ class TransientPath(TransientIntegrator):
 
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
-            if dr.hint(facts.window is not None, mode="scalar"):
-                active_next &= ~facts.window.over(τ)
+            active_next = facts.in_time(active_next, τ)
             bsdf = si.bsdf(ray)
             active_em = active_next & connectable(media, here, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             u_em = sampler.next_2d()
@@ -138,13 +137,8 @@ class TransientPath(TransientIntegrator):
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
                 active_em &= dr.max(dr.abs(intensity(Lr))) > 0
-            length_em = ds.dist
-            if dr.hint(facts.distant is not None, mode="scalar"):
-                far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                length_em = dr.select(far, facts.distant.length(at.p, ds.d), length_em)
-            τ_em = τ + mi.Float64(length_em * facts.index_towards(bsdf, si, wo, η))
-            if dr.hint(facts.window is not None, mode="scalar"):
-                active_em &= facts.window.counts(τ_em)
+            τ_em = τ + mi.Float64(facts.length_to_light(at.p, ds) * facts.index_towards(bsdf, si, wo, η))
+            active_em = facts.counted(active_em, τ_em)
             visible, T_em = connect(scene, media, here, ds, u_em, sampler, active_em)
             Lr *= T_em
             active_em &= visible

@@ -62,6 +62,21 @@ class SceneFacts:
             return η
         return η * self.refraction.relative_index(bsdf, si, wo)
 
+    def length_to_light(self, p, ds):
+        """Length of the connection from ``p`` to a sampled point or direction of a light."""
+        if self.distant is None:
+            return ds.dist
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        return dr.select(far, self.distant.length(p, ds.d), ds.dist)
+
+    def in_time(self, active, τ):
+        """Which paths of length ``τ`` can still have an event that the film counts."""
+        return active if self.window is None else active & ~self.window.over(τ)
+
+    def counted(self, active, τ):
+        """Which arrivals at ``τ`` the film counts."""
+        return active if self.window is None else active & self.window.counts(τ)
+
     @property
     def ray_adjoint(self) -> bool:
         """Whether the adjoint of the ray itself is handed from vertex to vertex."""
