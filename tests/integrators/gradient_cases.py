@@ -714,7 +714,8 @@ CASES = [
 def weights(scene_film):
     """Loss weights, of the shape that lies behind a pixel.
 
-    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors and gates a
+    Of a histogram the sine of three times the optical path length at each bin's centre, in polarized variants with
+    factors that differ between the Stokes components and let the polarization count; of phasors and gates a
     pattern in which no two entries weigh the same.
     """
     if scene_film.measures != "transient":
@@ -722,7 +723,8 @@ def weights(scene_film):
         number = np.arange(int(np.prod(shape)))
         return (np.cos(1.7 * number + 0.4) / (1 + 0.3 * number)).reshape(shape)
     centers = scene_film.start_opl + (np.arange(scene_film.temporal_bins) + 0.5) * scene_film.bin_width_opl
-    return np.sin(3 * centers)[:, None]
+    components = np.repeat([0.2, 1.0, -0.7, 1.3], scene_film.channel_count() // 4) if mi.is_polarized else np.ones(1)
+    return np.sin(3 * centers)[:, None] * components
 
 
 class Changes(dict):

@@ -63,6 +63,7 @@ class GatedHDRFilm(TimeResolvedFilm):
             seen = tuple(gate.spread(pulse) for gate in seen)
         self._has_slope = all(gate.is_continuous for gate in seen)
         self.table = GateTable(seen, self.start_opl)
+        self._window = GappedWindow(self.table.first, self.table.last, self.table.open_cells)
 
     @property
     def has_slope(self) -> bool:
@@ -76,7 +77,7 @@ class GatedHDRFilm(TimeResolvedFilm):
 
     def arrivals(self):
         """What can count: arrivals while some gate is open."""
-        return GappedWindow(self.table.first, self.table.last, self.table.open_cells)
+        return self._window
 
     # ---------------------------------------------------------------------------------------- storage
 

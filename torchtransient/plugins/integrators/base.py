@@ -303,12 +303,14 @@ class TransientIntegrator(mi.CppADIntegrator):
             transient = (flat, strides[2], strides[3])
         lane = film.adjoint_lane(transient, base, steady, match)
         first = self._first_opl(sensor, film, ray)
-        a_o, a_d, a_first = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
+        a_o, a_d, a_first, a_turn = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
             with dr.resume_grad():
                 objective = dr.dot(a_o, ray.o) + dr.dot(a_d, ray.d)
                 if not self.camera_unwarp:
                     objective += a_first * length_to_sensor_origin(sensor, ray)
+                if mi.is_polarized:
+                    objective += a_turn * sensor_turn(sensor, ray).angle()
                 dr.backward_from(objective)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -337,14 +339,18 @@ class TransientIntegrator(mi.CppADIntegrator):
         base, pixel = self.lane_bases(film, job, row, column)
         lane = film.lane(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(sensor, film, ray)
-        t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
+        t_ray, d_first, t_turn = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0), None
         if facts.sensor_moves:
             with dr.resume_grad():
                 length = length_to_sensor_origin(sensor, ray)
-                t_o, t_d, t_first = tangents([ray.o, ray.d, length])
+                attached = [ray.o, ray.d, length]
+                if mi.is_polarized:
+                    attached.append(sensor_turn(sensor, ray).angle())
+                t_o, t_d, t_first, *t_angle = tangents(attached)
+                t_turn = t_angle[0] if mi.is_polarized else None
                 t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
                 d_first = mi.Float(0) if self.camera_unwarp else t_first
-        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first)
+        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first, t_turn)
         self._add_steady(film, match.to_channels(dL), pixel)
         lane.finish()
 
@@ -367,8 +373,6 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
                 "'tent' or 'gaussian'."
             )
-        if mi.is_polarized:
-            raise GradientError("Polarized variants have no derivatives yet; use the unpolarized one.")
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "

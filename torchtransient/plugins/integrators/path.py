@@ -197,10 +197,10 @@ class TransientPath(TransientIntegrator):
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
         return reverse_sweep(self, scene, count, store, lane, facts, ray)
 
-    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
+    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first, t_turn=None):
         """Record the paths of one pass and carry tangents along them, see :mod:`.push`."""
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
-        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first)
+        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first, t_turn)
 
 
 register("integrator", "transient_path", TransientPath)
