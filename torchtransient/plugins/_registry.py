@@ -149,6 +149,16 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
             raise
 
 
+def kind_of(name: str) -> str | None:
+    """The kind of a plugin of this library or of a module that was added to it, such as "bsdf"; None for others."""
+    with _state.lock:
+        for entry in (*PLUGIN_MODULES, *_state.third_party):
+            for kind, plugin in entry.plugins:
+                if plugin == name:
+                    return kind
+        return next((kind for kind, plugin in _state.constructors if plugin == name), None)
+
+
 def sync() -> str | None:
     """Make the plugins of this library available in the active variant. Idempotent; called before every scene load.
 

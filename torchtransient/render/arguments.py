@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError, UnitError
@@ -112,3 +113,22 @@ def film_choice(time_axis: Any, frequencies: Any, gates: Any) -> dict[str, Any]:
             )
     axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
     return {"time_axis": axis, "frequencies": frequencies, "gates": gates}
+
+
+class Values(Mapping[str, nn.Parameter]):
+    """The renderer's parameters under their Mitsuba keys."""
+
+    def __init__(self, module: nn.Module, names: Mapping[str, str]):
+        self._module, self._names = module, names
+
+    def __getitem__(self, key: str) -> nn.Parameter:
+        return getattr(self._module, self._names[key])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
+    Values,
     as_float,
     checked_grad_seed,
     film_choice,
@@ -37,31 +38,13 @@ from torchtransient.render.output import (
     transient_channels_first,
 )
 from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.plan import Plan
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
-
-
-class _Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys."""
-
-    def __init__(self, module: nn.Module, names: Mapping[str, str]):
-        self._module, self._names = module, names
-
-    def __getitem__(self, key: str) -> nn.Parameter:
-        return getattr(self._module, self._names[key])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
 
 
 class TransientRenderer(nn.Module):
@@ -97,8 +80,10 @@ class TransientRenderer(nn.Module):
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
     gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with
-    the same number of samples.
+    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise. ``sampler``: plugin name of
+    a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -114,7 +99,7 @@ class TransientRenderer(nn.Module):
         max_depth: int | None = None,
         temporal_filter: str = "auto",
         sensors: int | Sequence[int] | str = 0,
-        effects: str = "auto",
+        effects: Plan | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
@@ -124,8 +109,15 @@ class TransientRenderer(nn.Module):
         steady: bool = True,
     ):
         super().__init__()
-        if effects != "auto":
-            raise SceneError(f"effects: only 'auto' is supported so far, got {effects!r}.")
+        if isinstance(effects, Plan):
+            scene = load(scene, variant=effects.variant)
+            if gates is None:
+                time_axis, frequencies = effects.axes(time_axis, frequencies)
+                temporal_filter = effects.filter_unless(temporal_filter)
+            max_depth = effects.max_depth if max_depth is None else max_depth
+            pulse, irf = pulse or effects.pulse, irf or effects.irf
+        elif effects != "auto":
+            raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
@@ -139,9 +131,10 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        spread = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
-        measured = film_choice(time_axis, frequencies, gates)
-        self._options = self._build_options(max_depth, sampler, {**measured, **spread, "steady": bool(steady)})
+        changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        changes |= film_choice(time_axis, frequencies, gates)
+        changes |= {"steady": bool(steady), "integrator": effects.integrator if isinstance(effects, Plan) else None}
+        self._options = self._build_options(max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -152,10 +145,10 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(self, max_depth: int | None, sampler: str | None, film: dict[str, Any]) -> BuildOptions:
+    def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
-        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **film)
+        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -214,7 +207,7 @@ class TransientRenderer(nn.Module):
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
         """The parameters under their Mitsuba keys."""
-        return _Values(self, self._names)
+        return Values(self, self._names)
 
     @property
     def effective_filter(self) -> str:
