@@ -7,7 +7,7 @@ derivatives, stable names), and the list is instantiated. The same edits serve X
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,11 +16,20 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
+from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.pulse_properties import write_pulse
 
-# Steady integrators whose parameters mean the same for `transient_path`.
-_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
 _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+_TRANSIENT_PROPERTIES = (
+    *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
+)  # fmt: skip
 # What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
 _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
@@ -44,7 +53,10 @@ class BuildOptions:
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
     that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``.
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``:
+    shape of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
+    ``integrator``: plugin name of a transient integrator that replaces the scene's, with the parameters that both have;
+    None to keep it.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -55,6 +67,9 @@ class BuildOptions:
     transient: bool = False
     sampler: str | None = None
     frequencies: FrequencyAxis | None = None
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
+    integrator: str | None = None
 
 
 @dataclass
@@ -89,7 +104,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _override_samplers(state, options)
             _substitute_plugins(state, options)
             transforms = _mesh_transforms(state)
-            integrator = _find_child(state, state.root, _is_integrator)
+            integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             _forget_queries(state)
             mi.parser.transform_all(config, state)
@@ -118,41 +133,6 @@ def _check_root(state: Any) -> None:
 # --------------------------------------------------------------------------------------------------------- nodes
 
 
-def _children(state: Any, node: Any) -> list[tuple[str, int]]:
-    """(property, node index) for every child object of a node, references by id included."""
-    import mitsuba as mi
-
-    result, by_id = [], state.id_to_index
-    for key, value in node.props.items():
-        if isinstance(value, mi.Properties.ResolvedReference):
-            result.append((key, value.index()))
-        elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
-            result.append((key, by_id[value.id()]))
-    return result
-
-
-def _find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
-    for _, index in _children(state, node):
-        if matches(state.nodes[index]):
-            return index
-    return None
-
-
-def _is_film(node: Any) -> bool:
-    """In dictionaries Mitsuba does not know the kind of plugins written in Python; those are told by their name."""
-    import mitsuba as mi
-
-    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().endswith("_film")
-    return unknown or node.type == mi.ObjectType.Film
-
-
-def _is_integrator(node: Any) -> bool:
-    import mitsuba as mi
-
-    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().startswith("transient_")
-    return unknown or node.type == mi.ObjectType.Integrator
-
-
 def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, properties: Mapping[str, Any]) -> None:
     import mitsuba as mi
 
@@ -171,9 +151,9 @@ def name_nodes(state: Any) -> None:
     """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``,
     ``shape_1``.
     """
-    children = [state.nodes[index] for _, index in _children(state, state.root)]
-    taken = {node.props.id() for node in children}
-    nameless = [node for node in children if not node.props.id()]
+    direct = [state.nodes[index] for _, index in children(state, state.root)]
+    taken = {node.props.id() for node in direct}
+    nameless = [node for node in direct if not node.props.id()]
     count: dict[str, int] = {}
     for node in nameless:
         kind = str(node.type).rsplit(".", 1)[-1].lower()
@@ -195,7 +175,7 @@ def _name_nested(state: Any) -> None:
     """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
     import mitsuba as mi
 
-    direct = {index for _, index in _children(state, state.root)}
+    direct = {index for _, index in children(state, state.root)}
     taken = {node.props.id() for node in state.nodes}
     for index, node in enumerate(state.nodes):
         if node.type == mi.ObjectType.BSDF and index not in direct:
@@ -230,12 +210,14 @@ def _override_films(state: Any, options: BuildOptions) -> None:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
-        film = _find_child(state, node, _is_film)
+        film = find_child(state, node, is_film)
         if film is None and node.type == mi.ObjectType.Sensor:
             _add_child(state, index, "film", "hdrfilm", mi.ObjectType.Film, {})
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
+            write_pulse(state.nodes[film].props, "pulse", options.pulse)
+            write_pulse(state.nodes[film].props, "irf", options.irf)
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
@@ -268,17 +250,17 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
         props["start_opl"] = options.frequencies.start_opl
 
 
-def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
-    """Turn a node into another plugin; keep the named properties, every child object and every spectrum."""
+def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:
+    """Turn a node into another plugin; keep the named properties and, if ``nested``, child objects and spectra."""
     import mitsuba as mi
 
     old = state.nodes[index].props
-    children = {key for key, _ in _children(state, state.nodes[index])}
-    children |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
+    inner = {key for key, _ in children(state, state.nodes[index])}
+    inner |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
     for key in list(old.keys()):
-        if key in keep or key in children:
+        if key in keep or (nested and key in inner):
             new[key] = old[key]
     state.nodes[index].props = new
 
@@ -286,20 +268,21 @@ def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
 def _override_integrator(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    index = _find_child(state, state.root, _is_integrator)
+    index = find_child(state, state.root, is_integrator)
     if options.transient:
         if index is None:
             _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
-        if plugin in _PATH_INTEGRATORS:
-            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        if options.integrator is not None and plugin != options.integrator:
+            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
+        elif plugin in _COUNTERPARTS:
+            wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
+            _become(state, index, wanted, keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
-                f"stand "
-                "in for: "
-                f"{', '.join(_PATH_INTEGRATORS)}."
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
@@ -315,7 +298,7 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
         node = state.nodes[index]
         if node.type != mi.ObjectType.Sensor:
             continue
-        sampler = _find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
         if sampler is None:
             _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
         else:

@@ -7,6 +7,16 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
+from torchtransient.plugins.integrators.legs import (
+    arrive,
+    carried_on,
+    connect,
+    connectable,
+    first_leg,
+    next_leg,
+    unconnected,
+)
+from torchtransient.plugins.integrators.media.medium_vertex import scatter_in_medium
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
 from torchtransient.plugins.integrators.push import push as forward_push
 from torchtransient.plugins.integrators.sweep import sweep as reverse_sweep
@@ -22,7 +32,6 @@ from torchtransient.plugins.polarized import (
     turn_in,
     turn_out,
 )
-from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 
 
 class TransientPath(TransientIntegrator):
@@ -46,7 +55,7 @@ class TransientPath(TransientIntegrator):
         self.hide_emitters_ = bool(self.hide_emitters)
 
     @dr.syntax
-    def trace(self, scene, sampler, ray, first_opl, lane, facts=None, record=False):
+    def trace(self, scene, sampler, ray, first_opl, lane, facts, record=False):
         """Trace the paths of one pass.
 
         Primal: every event is put on ``lane``; returns the sums (steady radiance, energy before, energy after the
@@ -54,7 +63,6 @@ class TransientPath(TransientIntegrator):
         ``(number of vertices, record)`` comes back.
         """
         primal = not record
-        facts = self.facts(scene) if facts is None else facts
         ctx = mi.BSDFContext()
 
         # ------------------------------------------------------------------- loop state
@@ -70,19 +78,19 @@ class TransientPath(TransientIntegrator):
         prev_pdf = mi.Float(1)
         prev_delta = mi.Bool(True)
         active = mi.Bool(self.max_depth > 0)
-        pi = scene.ray_intersect_preliminary(ray, coherent=True)
-        if dr.hint(self.hide_emitters_, mode="scalar"):
-            pi = behind_area_lights(scene, ray, pi)
+        media = facts.media
+        pi, place = first_leg(scene, media, ray, sampler, self.hide_emitters_)
+        β = carried_on(β, place)
         store = allocate(self.max_depth, facts) if record else {}
         events = {} if record else lane.begin()           # What the film carries along
 
         while dr.hint(active, max_iterations=self.max_depth, label="transient_path"):
             active_next = mi.Bool(active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-            valid = si.is_valid()
+            here = arrive(pi, ray, place)
+            si, at, valid = here.si, here.at, here.valid
 
             # ---------------------------------------------------------- length of the segment
-            length = dr.norm(si.p - prev.p)
+            length = dr.norm(at.p - prev.p)
             if dr.hint(facts.distant is not None, mode="scalar"):
                 length = dr.select(valid, length, facts.distant.length(prev.p, ray.d))
             if dr.hint(self.camera_unwarp, mode="scalar"):
@@ -90,7 +98,7 @@ class TransientPath(TransientIntegrator):
             τ += mi.Float64(length * η)
 
             # ------------------------------------------------------------------ emission found
-            seen = mi.Bool(True)
+            seen = mi.Bool(here.surface)
             if dr.hint(self.hide_emitters_, mode="scalar"):
                 seen &= (depth > 0) | valid
             if dr.hint(self.discard_direct_light, mode="scalar"):
@@ -110,29 +118,34 @@ class TransientPath(TransientIntegrator):
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
             bsdf = si.bsdf(ray)
-            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            active_em = active_next & connectable(media, here, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             u_em = sampler.next_2d()
             u_lobe = sampler.next_1d()
             u_dir = sampler.next_2d()
-            ds, em_weight = scene.sample_emitter_direction(si, u_em, False, active_em)
+            ds, em_weight = scene.sample_emitter_direction(at, u_em, False, active_em)
             active_em &= ds.pdf != 0
             wo = si.to_local(ds.d)
             bsdf_val, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next)
+            bsdf_val, bsdf_pdf, bs, bsdf_weight, out = scatter_in_medium(
+                media, here, ds.d, u_lobe, u_dir, active_next, active_em,
+                (bsdf_val, bsdf_pdf, bs, bsdf_weight, si.to_world(bs.wo)),
+            )  # fmt: skip
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
             turn = turn_out(si, ray.d)
             Lr = transported(β, mis_em, scattered(bsdf_val, turn)) * mi.unpolarized_spectrum(em_weight)
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
                 active_em &= dr.max(dr.abs(intensity(Lr))) > 0
-            occluded = scene.ray_test(si.spawn_ray_to(ds.p), active_em)
-            active_em &= ~occluded
+            visible, T_em = connect(scene, media, here, ds, u_em, sampler, active_em)
+            Lr *= T_em
+            active_em &= visible
             if dr.hint(primal, mode="scalar"):
                 Lr = dr.select(active_em, Lr, 0)
                 L += Lr
                 length_em = ds.dist
                 if dr.hint(facts.distant is not None, mode="scalar"):
                     far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                    length_em = dr.select(far, facts.distant.length(si.p, ds.d), length_em)
+                    length_em = dr.select(far, facts.distant.length(at.p, ds.d), length_em)
                 η_em = facts.index_towards(bsdf, si, wo, η)
                 low, high = lane.put(events, τ + mi.Float64(length_em * η_em), Lr, active_em)
                 before += low
@@ -141,12 +154,12 @@ class TransientPath(TransientIntegrator):
             # ----------------------------------------------------------------- to the next vertex
             β_before, η_before = mi.Spectrum(β), mi.Float(η)
             ray_before, pi_before, is_delta = mi.Ray3f(ray), pi, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            β = product(β, scattering(bsdf_weight, turn, turn_in(si, bs.wo)))
+            β = product(β, scattering(bsdf_weight, turn, turn_in(si, bs.wo, out)))
             η *= bs.eta
-            ray = si.spawn_ray(si.to_world(bs.wo))
-            prev.p, prev.n, prev.time, prev.wavelengths = si.p, si.n, si.time, si.wavelengths
+            ray = at.spawn_ray(out)
+            prev.p, prev.n, prev.time, prev.wavelengths = at.p, at.n, at.time, at.wavelengths
             prev_pdf = bs.pdf
-            prev_delta = is_delta
+            prev_delta = unconnected(media, here, is_delta)
 
             # --------------------------------------------------------------------------- roulette
             β_max = dr.max(mi.unpolarized_spectrum(β))
@@ -172,7 +185,8 @@ class TransientPath(TransientIntegrator):
                     ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
                     active_em, is_delta, active_next,
                 )
-            pi = scene.ray_intersect_preliminary(ray, active=active_next)
+            pi, place = next_leg(scene, media, ray, here, β, sampler, active_next)
+            β = carried_on(β, place)
             depth += 1
             active = active_next
 
@@ -185,10 +199,10 @@ class TransientPath(TransientIntegrator):
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
         return reverse_sweep(self, scene, count, store, lane, facts, ray)
 
-    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
+    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first, t_turn=None):
         """Record the paths of one pass and carry tangents along them, see :mod:`.push`."""
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
-        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first)
+        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first, t_turn)
 
 
 register("integrator", "transient_path", TransientPath)

@@ -26,7 +26,7 @@ def allocate(depth: int, facts) -> dict:
         "prim": dr.alloc_local(mi.UInt32, size),
         "shape": dr.alloc_local(mi.UInt32, size),
         "shape_index": dr.alloc_local(mi.UInt32, size),
-        "beta": dr.alloc_local(mi.UnpolarizedSpectrum, size),
+        "beta": dr.alloc_local(mi.Spectrum, size),
         "tau": dr.alloc_local(mi.Float64, size),
         "mis": dr.alloc_local(mi.Float, size),
         "rr": dr.alloc_local(mi.Float, size),

@@ -14,6 +14,7 @@ import mitsuba as mi
 from torchtransient.plugins.integrators.path_record import read_vertex
 from torchtransient.plugins.integrators.sweep import led_to, next_vertex
 from torchtransient.plugins.integrators.vertex import attach_ray, vertex_terms
+from torchtransient.plugins.polarized import column, light_type, product, turning_throughput
 
 
 def tangents(values):
@@ -65,16 +66,17 @@ def settle_tangents(scene, facts):
 
 
 @dr.syntax
-def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
+def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first, t_turn=None):
     """Write the derivative of the transient to ``lane`` and return that of the steady radiance.
 
-    ``t_o, t_d, d_first`` are the tangents of the primary ray and of the length before it.
+    ``t_o, t_d, d_first, t_turn`` are the tangents of the primary ray, of the length before it, and of twice the angle
+    of its Stokes frame.
     """
     ctx = mi.BSDFContext()
     k = mi.UInt32(0)
     live = k < count
-    dL = mi.UnpolarizedSpectrum(0)
-    dβ = mi.UnpolarizedSpectrum(0)
+    dL = light_type()(0)
+    dβ = turning_throughput(t_turn)
     dτ = mi.Float(d_first)
     dη = mi.Float(0)
     t_o, t_d, t_w = mi.Vector3f(t_o), mi.Vector3f(t_d), mi.Vector3f(t_d)
@@ -94,20 +96,20 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
                 counted = dr.select(k == 0, 0, counted)
             dτ_v += counted * (v.η * t[3] + dη * x.seg)
             dτ_em = dτ_v + v.η * t[4] + dη * length_em
-        d_Le = dβ * Le + v.β * t[0]
-        d_f = dβ * f + v.β * t[1]
+        d_Le = column(dβ) * Le + column(v.β) * t[0]
+        d_f = product(dβ, f) + product(v.β, t[1])
         dL += dr.select(live, d_Le + d_f, 0)
-        lane.put_slope(events, v.τ, d_Le, v.β * Le * dτ_v, x.hit)
-        lane.put_slope(events, v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
+        lane.put_slope(events, v.τ, d_Le, column(v.β) * Le * dτ_v, x.hit)
+        lane.put_slope(events, v.τ + mi.Float64(length_em * v.η), d_f, product(v.β, f) * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
             E = x.E
-            d_E = dβ * E + v.β * t[-2]
+            d_E = product(dβ, E) + product(v.β, t[-2])
             dL += dr.select(live, d_E, 0)
             dτ_E = dτ_v + dη * x.step * x.length_E + follow.η * t[-1]
-            lane.put_slope(events, follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
+            lane.put_slope(events, follow.τ, d_E, product(v.β, E) * dτ_E, x.lit_ahead)
 
         # ------------------------------------------------------------------- to the next vertex
-        dβ = dβ * W + v.β * t[2]
+        dβ = product(dβ, W) + product(v.β, t[2])
         dτ = dτ_v
         if dr.hint(facts.geometry, mode="scalar"):
             dτ += follow.η * t[5]

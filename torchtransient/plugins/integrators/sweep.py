@@ -5,9 +5,10 @@ vertex:
 
     S_i = sum of A f  over the events at and beyond vertex i,      D_i = sum of A' f over the same events,
 
-so that ``dLoss = beta_i (A df + A' f dtau + dW S + W D dtau)`` at every vertex. Nothing is divided by a BSDF value: a
-zero albedo has its right gradient. Where a delta lobe determines the next ray, the adjoint of that ray (origin,
-direction) is handed back to the vertex that sent it.
+so that ``dLoss = beta_i (A df + A' f dtau + dW S + W D dtau)`` at every vertex. In polarized variants the suffixes are
+matrices ``f A^T`` and the loss is the trace of them behind the throughput, see :mod:`torchtransient.plugins.polarized`.
+Nothing is divided by a BSDF value: a zero albedo has its right gradient. Where a delta lobe determines the next ray,
+the adjoint of that ray (origin, direction) is handed back to the vertex that sent it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.integrators.path_record import DELTA, read_vertex
 from torchtransient.plugins.integrators.vertex import Terms, attach_ray, vertex_terms
+from torchtransient.plugins.polarized import matched, product, traced, traced_attached, turning, whole
 
 
 def slope_only(x):
@@ -43,15 +45,15 @@ def led_to(store, k, active, facts):
 
 @dr.syntax
 def sweep(integrator, scene, count, store, lane, facts, ray0):
-    """Accumulate gradients of the recorded paths; returns the adjoint (origin, direction, first length) of the primary
-    ray.
+    """Accumulate gradients of the recorded paths; returns the adjoint (origin, direction, first length, twice the angle
+    of the Stokes frame) of the primary ray.
 
     ``count`` is the number of recorded vertices and ``store`` the record. Must run with gradients suspended.
     """
     ctx = mi.BSDFContext()
     i = mi.Int32(count) - 1                                            # Current vertex
     live = i >= 0
-    S, D = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)        # Suffixes beyond the current vertex
+    S, D = mi.Spectrum(0), mi.Spectrum(0)                              # Suffixes beyond the current vertex
     next_p, next_n, next_d = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
     next_valid, next_η = mi.Bool(False), mi.Float(1)
     a_o, a_d, a_w = mi.Vector3f(0), mi.Vector3f(0), mi.Vector3f(0)     # Adjoint of the next ray; of its end's wi
@@ -67,34 +69,34 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
             τ_em = mi.Float64(dr.detach(x.length_em) * dr.detach(x.index_em) * v.η)
             A_e, A1_e = lane.read(v.τ, x.hit)
             A_n, A1_n = lane.read(v.τ + τ_em, v.lit)
-            objective = dr.sum(v.β * (A_e * x.Le + A_n * x.f + x.W * S))
-            S_new = A_e * Le + A_n * f + W * S
-            D_new = mi.UnpolarizedSpectrum(D)
+            objective = traced_attached(v.β, A_e, x.Le, A_n, x.f, x.W, S)
+            S_new = matched(A_e, Le) + matched(A_n, f) + product(W, S)
+            D_new = mi.Spectrum(D)
             a_η_new = mi.Float(0)
             if dr.hint(facts.geometry, mode="scalar"):
-                D_em, D_out = A1_n * f, W * D
-                D_new = A1_e * Le + D_em + D_out
+                D_em, D_out = matched(A1_n, f), product(W, D)
+                D_new = matched(A1_e, Le) + D_em + D_out
                 if dr.hint(facts.emitter_shape_moves, mode="scalar"):
                     A_E, A1_E = lane.read(nxt.vertex.τ, x.lit_ahead)
                     E = dr.detach(x.E)
-                    objective += dr.sum(v.β * A_E * x.E)
-                    objective += dr.sum(v.β * A1_E * E) * next_η * slope_only(x.length_E)
-                    S_new += A_E * E
-                    D_new += A1_E * E
-                beyond = dr.sum(v.β * D_new)
+                    objective += traced(v.β, matched(A_E, x.E))
+                    objective += traced(v.β, matched(A1_E, E)) * next_η * slope_only(x.length_E)
+                    S_new += matched(A_E, E)
+                    D_new += matched(A1_E, E)
+                beyond = traced(v.β, D_new)
                 seg = x.seg
                 if dr.hint(integrator.camera_unwarp, mode="scalar"):
                     seg = dr.select(k == 0, 0, seg)
                 objective += beyond * v.η * slope_only(seg)
-                objective += dr.sum(v.β * D_em) * v.η * slope_only(x.length_em * x.index_em)
-                objective += dr.sum(v.β * D_out) * next_η * slope_only(x.seg_out)
+                objective += traced(v.β, D_em) * v.η * slope_only(x.length_em * x.index_em)
+                objective += traced(v.β, D_out) * next_η * slope_only(x.seg_out)
                 objective += dr.select(x.ahead, dr.dot(a_w, x.out), 0)
                 if dr.hint(facts.delta, mode="scalar"):
                     objective += dr.select(x.mirrored, dr.dot(a_o, x.p_out) + dr.dot(a_d, x.d_out), 0)
                 if dr.hint(facts.index_moves, mode="scalar"):
                     objective += dr.select(v.goes_on, a_η * v.η * slope_only(x.step), 0)
                     a_η_new = beyond * dr.detach(seg) + dr.select(v.goes_on, a_η * dr.detach(x.step), 0)
-                    a_η_new += dr.sum(v.β * D_em) * dr.detach(x.length_em * x.index_em)
+                    a_η_new += traced(v.β, D_em) * dr.detach(x.length_em * x.index_em)
             if dr.hint(dr.grad_enabled(objective), mode="scalar"):
                 dr.backward_from(dr.select(live, objective, 0))
             if dr.hint(facts.geometry, mode="scalar"):
@@ -110,5 +112,4 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
         next_η = v.η
         i -= 1
         live = i >= 0
-    first = dr.sum(D)
-    return a_o, a_d, first
+    return a_o, a_d, whole(D), turning(S) if mi.is_polarized else None

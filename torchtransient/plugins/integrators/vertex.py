@@ -12,6 +12,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.polarized import scattered, scattering, turn_in, turn_out
+
 
 class Terms:
     """Attached values at one vertex; a plain object that only lives within one iteration."""
@@ -74,7 +76,7 @@ def attach_ray(v, facts, t_ray=None, t_w=None):
     return ray, o, d, w
 
 
-def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
+def emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts):
     """Next-event estimation: ``terms.f`` (per unit throughput), ``terms.length_em`` and index along the shadow ray."""
     with dr.suspend_grad():
         ds, weight = scene.sample_emitter_direction(dr.detach(si), v.u_em, False, v.lit)
@@ -122,7 +124,7 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
     wo = si.to_local(d)
     val, pdf = bsdf.eval_pdf(ctx, si, wo, v.lit)
     mis = dr.select(ds.delta | cone, 1, mis_weight(ds.pdf, dr.detach(pdf)))
-    terms.f = dr.select(v.lit, mi.unpolarized_spectrum(val) * em_weight * mis, 0)
+    terms.f = dr.select(v.lit, scattered(val, turn) * em_weight * mis, 0)
     terms.length_em = length_to(facts, si.p, p, v.lit & ~far, d)
     terms.index_em = facts.index_towards(bsdf, si, wo, mi.Float(1))
 
@@ -155,7 +157,8 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
         hit &= led_here | ~on_surface | ~is_sphere(sid.emitter(scene))
     terms.hit = hit
     terms.Le = dr.select(hit, v.mis * mi.unpolarized_spectrum(sid.emitter(scene).eval(si, hit)), 0)
-    emitter_terms(terms, scene, ctx, si, bsdf, v, facts)
+    turn = turn_out(si, w)
+    emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts)
 
     ahead = onward & nxt.valid
     out, J = mi.Vector3f(nxt.d), mi.Float(1)
@@ -165,25 +168,25 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     wo = si.to_local(out)
     val, pdf = bsdf.eval_pdf(ctx, si, wo, onward)
     inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
-    terms.W = dr.select(onward, mi.unpolarized_spectrum(val) * (inv_pdf * J), 0)
+    terms.W = dr.select(onward, scattering(val, turn, turn_in(si, wo, out, nxt.d)) * (inv_pdf * J), 0)
     terms.out, terms.ahead = out, ahead
     terms.step = dr.select(onward, facts.index_towards(bsdf, si, wo, mi.Float(1)), 1)
     if facts.delta:
         bs, weight = bsdf.sample(ctx, si, v.u_lobe, v.u_dir, terms.mirrored)
-        weight = mi.unpolarized_spectrum(weight) * (facts.unweighted(bsdf, bs) * v.rr)
-        terms.W = dr.select(terms.mirrored, weight, terms.W)
         terms.p_out, terms.d_out = si.p, si.to_world(bs.wo)
+        weight = scattering(weight, turn, turn_in(si, bs.wo, terms.d_out, nxt.d)) * (facts.unweighted(bsdf, bs) * v.rr)
+        terms.W = dr.select(terms.mirrored, weight, terms.W)
         terms.step = dr.select(terms.mirrored, bs.eta, terms.step)
     if facts.geometry:
         terms.seg = length_to(facts, ray.o, si.p, terms.valid, ray.d)
         terms.seg_out = dr.select(onward, length_to(facts, si.p, nxt.p, nxt.valid, nxt.d), 0)
     terms.E = None
     if facts.emitter_shape_moves:
-        emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts)
+        emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts)
     return terms
 
 
-def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
+def emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts):
     """Emission found by BSDF sampling on a shape that moves: ``terms.E`` (per unit throughput), ``terms.length_E``.
 
     The light's point is a material point here, as it is for next-event estimation: both strategies must move their
@@ -200,6 +203,6 @@ def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
     J = dr.relative_grad(solid_angle_over_area(si.p, si_e.p, si_e.n, lit)) * dr.relative_grad(dr.select(lit, area, 1))
     val, _ = bsdf.eval_pdf(ctx, si, si.to_local(out), lit)
     Le = mi.unpolarized_spectrum(dr.detach(si_e).emitter(scene).eval(si_e, lit))
-    terms.E = dr.select(lit, mi.unpolarized_spectrum(val) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
+    terms.E = dr.select(lit, scattered(val, turn) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
     terms.length_E = dr.norm(dr.select(lit, si_e.p - si.p, mi.Vector3f(0, 0, 1)))
     terms.lit_ahead = lit
