@@ -176,7 +176,7 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
         out = direction_to(si.p, nxt.p, ahead, out)
         J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead, nxt.volume))
     wo = si.to_local(out)
-    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward)
+    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward, sampled=True)
     inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
     terms.W = dr.select(onward, scattering(val, turn, turn_in(si, wo, out, nxt.d)) * (inv_pdf * J), 0)
     terms.out, terms.ahead = out, ahead
