@@ -29,14 +29,14 @@ def batch():
 
 
 def meter():
-    """An irradiance meter that faces a wall without an end: rays keep their directions, and meet no edge."""
-    scene = room(depth=2)
+    """An irradiance meter that faces a wall without an end, lit from between: no ray meets an edge or a shadow."""
+    scene = room(depth=2, light={"type": "point", "position": [0.5, 0.0, 1.0], "intensity": 10.0})
     del scene["sensor"], scene["side"]
     scene["wall"]["to_world"] = transform().scale(200.0)
     scene["meter"] = {
         "type": "rectangle",
         "to_world": transform().translate([0.2, 0.1, 2.0]).rotate([0, 1, 0], 180).scale(0.2),
-        "sensor": {"type": "irradiancemeter", "film": film(start=3.0, bins=400, size=1)},
+        "sensor": {"type": "irradiancemeter", "film": film(start=2.5, bins=500, size=1)},
     }
     return scene
 
@@ -61,7 +61,7 @@ CASES = [
         fd_spp=4096,
     ),
     Case(
-        "meter_moves", "shape of an irradiance meter", meter, move("meter.to_world", (0, 0, 1)), 0.0, 5e-3, spp=65536,
-        fd_spp=131072, seeds=8,
+        "meter_moves", "shape of an irradiance meter", meter, move("meter.to_world", (0, 0, 1)), 0.0, 5e-3, spp=262144,
+        fd_spp=262144, seeds=8,
     ),
 ]  # fmt: skip
