@@ -14,7 +14,7 @@ import torchtransient
 
 PACKAGE = Path(torchtransient.__file__).parent
 LEVEL = {
-    "errors": 0, "_llvm": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "errors": 0, "_llvm": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "stokes": 0,
     "plugins": 1, "sensing": 1, "nlos": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
@@ -89,7 +89,7 @@ def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
     # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know the errors.
-    return other == "errors" or (room, other) in {("accuracy", "testing"), ("axes", "units")}
+    return other == "errors" or (room, other) in {("accuracy", "testing"), ("axes", "units"), ("pulses", "units")}
 
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)

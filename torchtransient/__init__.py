@@ -16,6 +16,7 @@ del globals()["render"]
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
+    "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",
@@ -23,8 +24,10 @@ _LAZY = {
     "TransientRenderer": "torchtransient.render.renderer",
     "cost_of_accuracy": "torchtransient.accuracy.cost",
     "load": "torchtransient.render.scene_handle",
+    "losses": "torchtransient.losses",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
+    "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
 }
 
@@ -34,7 +37,7 @@ def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])
-    value = module if name in ("scenes", "stokes") else getattr(module, name)
+    value = module if _LAZY[name] == f"torchtransient.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

@@ -48,6 +48,13 @@ def tilt_spectrum(key):
     return apply
 
 
+def pulsed_room(**properties):
+    """The room with a film that spreads arrivals; the box filter takes its slope from the pulse."""
+    sensor = camera()
+    sensor["film"] = {**film(filter="box"), **properties}
+    return room(sensor=sensor)
+
+
 CASES = [
     Case(
         "banded_albedo_spectrum",
@@ -80,6 +87,28 @@ CASES = [
         2e-3,
         "llvm_ad_spectral",
         2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "wall_under_short_pulse",
+        "shape to_world, pulse of the light",
+        lambda: pulsed_room(pulse="rectangular", pulse_width_opl=0.1),
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "wall_under_long_pulse",
+        "shape to_world, pulse of the light",
+        lambda: pulsed_room(
+            pulse="tabulated", pulse_opl="-0.2, 0, 0.7", pulse_values="0 1 0", irf="gaussian", irf_fwhm_opl=0.3
+        ),
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
         fd_spp=2048,
     ),
 ]

@@ -26,8 +26,9 @@ from torchtransient.cli.options import assignments, frequency_list, load_scene, 
 def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
-    The file holds transient (C, T, H, W), steady (C, H, W), the time axis in metres of optical path, and how it was
-    made; with --frequencies, or for a scene with a phasor film, phasor (C, F, H, W) in place of the transient.
+    The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
+    polarized variant, the time axis in metres of optical path, and how it was made; with --frequencies, or for a scene
+    with a phasor film, phasor (C, F, H, W) in place of the transient.
     torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
@@ -52,19 +53,18 @@ def command(scene: Path, **options: Any) -> None:
     output = _render(described, values, axis, frequencies, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats = output.stats
+    stokes = "Stokes x " if output.polarized else ""
     if output.transient is None:
-        what, how = f"{_sizes(output.phasor)} (C x F x H x W) phasors", ""
+        what, how = f"{_sizes(output.phasor)} ({stokes}C x F x H x W) phasors", ""
     else:
-        what, how = f"{_sizes(output.transient)} (C x T x H x W)", f", {stats.temporal_filter} filter"
+        what, how = f"{_sizes(output.transient)} ({stokes}C x T x H x W)", f", {stats.temporal_filter} filter"
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
     if output.transient is not None:
         _report_energy(output)
     if options["overview"] and output.transient is None:
         raise click.UsageError("--overview shows a histogram over time, and the scene's film keeps phasors.")
     if options["overview"]:
-        plot_overview(
-            output.transient, output.steady, output.axis, options["overview"], pixel=options["pixel"], title=scene.name
-        )
+        plot_overview(*_power(output), output.axis, options["overview"], pixel=options["pixel"], title=scene.name)
         click.echo(f"{options['overview']}: overview")
 
 
@@ -92,10 +92,15 @@ def _render(described: Any, values: dict[str, Any], axis: Any, frequencies: Any,
         )
 
 
+def _power(output: Any) -> tuple[Any, Any]:
+    """Transient and steady image without the components that describe the polarization."""
+    return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
+
+
 def _report_energy(output: Any) -> None:
     """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
     before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
-    inside = _mean_over_channels(output.transient)
+    inside = _mean_over_channels(_power(output)[0])
     total = before + after + inside
     if total > 0 and before + after > 0.001 * total:
         axis = output.axis

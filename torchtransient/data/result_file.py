@@ -2,10 +2,11 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. The numbers of the axis
-(`start_opl`, and for a transient `bin_width_opl`, in metres, `num_bins`), `channels` (JSON: the names
-of the C channels), `format` and `metadata` (JSON) are attributes of the HDF5 file and zero-dimensional arrays of the
-`.npz`. A cube is written in parts, so that no second copy of it is needed.
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. Polarized variants have
+the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
+metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
+the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
+needed.
 """
 
 from __future__ import annotations

@@ -62,8 +62,13 @@ class PluginModule:
 PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
+    PluginModule(
+        "torchtransient.plugins.integrators.volpath",
+        (("integrator", "transient_prbvolpath"), ("integrator", "transient_volpath")),
+    ),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),

@@ -16,10 +16,15 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
+from torchtransient.render.pulse_properties import write_pulse
 
-# Steady integrators whose parameters mean the same for `transient_path`.
-_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
 _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
 # What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
 _STEADY_FILMS = ("hdrfilm", "specfilm")
@@ -44,7 +49,8 @@ class BuildOptions:
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
     that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``.
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``: shape
+    of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -55,6 +61,8 @@ class BuildOptions:
     transient: bool = False
     sampler: str | None = None
     frequencies: FrequencyAxis | None = None
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
 
 
 @dataclass
@@ -236,6 +244,8 @@ def _override_films(state: Any, options: BuildOptions) -> None:
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
+            write_pulse(state.nodes[film].props, "pulse", options.pulse)
+            write_pulse(state.nodes[film].props, "irf", options.irf)
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
@@ -292,14 +302,12 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
             _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
-        if plugin in _PATH_INTEGRATORS:
-            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        if plugin in _COUNTERPARTS:
+            _become(state, index, _COUNTERPARTS[plugin], keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
-                f"stand "
-                "in for: "
-                f"{', '.join(_PATH_INTEGRATORS)}."
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)

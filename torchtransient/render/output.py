@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.render.variant import stokes_components
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ class RenderOutput:
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
     variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
-    their names. ``transient`` and ``phasor`` are views of the film's own memory with the
-    rows first: ``.contiguous()`` makes a copy in torch's order.
+    their names. In polarized variants the Stokes components S0, S1, S2, S3 come before C in all three, as (4, C, T, H,
+    W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. ``transient`` and ``phasor``
+    are views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's order.
     """
 
     transient: torch.Tensor | None
@@ -55,20 +57,32 @@ class RenderOutput:
     frequencies: FrequencyAxis | None = None
     channels: tuple[str, ...] = ()
 
+    @property
+    def polarized(self) -> bool:
+        """Whether the Stokes components come before the channels."""
+        return stokes_components(self.stats.variant) > 1
 
-def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...]) -> torch.Tensor:
-    """From the film's (H, W, C), with or without one dimension of items, to (C, H, W) behind ``leading``."""
+
+def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """From the film's (H, W, C), with or without one dimension of items, to (C, H, W) behind ``leading``.
+
+    ``components``: Stokes components that the film's channels are made of; more than one come before C.
+    """
     steady = steady.reshape(*leading, *steady.shape[-3:])
-    return steady.movedim(-1, -3)
+    return _stokes_first(steady.movedim(-1, -3), -3, components)
 
 
-def transient_channels_first(cube: torch.Tensor, leading: tuple[int, ...]) -> torch.Tensor:
+def transient_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
     """From the film's (H, W, T, C), with or without one dimension of items, to (C, T, H, W) behind ``leading``."""
     cube = cube.reshape(*leading, *cube.shape[-4:])
-    return cube.movedim((-1, -2), (-4, -3))
+    return _stokes_first(cube.movedim((-1, -2), (-4, -3)), -4, components)
 
 
-def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...]) -> torch.Tensor:
+def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
     """From the film's (H, W, F, 2 C) of real and imaginary parts to complex (C, F, H, W) behind ``leading``."""
     pairs = cube.reshape(*leading, *cube.shape[-4:-1], -1, 2)
-    return torch.view_as_complex(pairs).movedim((-1, -2), (-4, -3))
+    return _stokes_first(torch.view_as_complex(pairs).movedim((-1, -2), (-4, -3)), -4, components)
+
+
+def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:
+    return tensor if components == 1 else tensor.unflatten(channel_dim, (components, -1))

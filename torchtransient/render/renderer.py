@@ -12,6 +12,7 @@ from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
+from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
@@ -34,8 +35,10 @@ from torchtransient.render.output import (
     transient_channels_first,
 )
 from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.progress import Bar
+from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.variant import active_variant, device_type
+from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
@@ -80,6 +83,10 @@ class TransientRenderer(nn.Module):
     a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
     are smooth in time and take no filter.
 
+    ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
+    instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
+    and every filter has a slope then. After a render ``sensing.pulse.apply_pulse`` does the same to a transient.
+
     ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
     gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
@@ -105,6 +112,8 @@ class TransientRenderer(nn.Module):
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
+        pulse: Pulse | None = None,
+        irf: Pulse | None = None,
     ):
         super().__init__()
         if effects != "auto":
@@ -122,7 +131,8 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler)
+        spread = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, spread)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -134,7 +144,12 @@ class TransientRenderer(nn.Module):
     # --------------------------------------------------------------------------------------------------- set-up
 
     def _build_options(
-        self, time_axis: TimeAxis | None, frequencies: Any, max_depth: int | None, sampler: str | None
+        self,
+        time_axis: TimeAxis | None,
+        frequencies: Any,
+        max_depth: int | None,
+        sampler: str | None,
+        spread: dict[str, Pulse | None],
     ) -> BuildOptions:
         if time_axis is not None and not isinstance(time_axis, TimeAxis):
             raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
@@ -145,7 +160,7 @@ class TransientRenderer(nn.Module):
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
             frequencies = FrequencyAxis(frequencies)
         axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies)
+        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, **spread)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -166,8 +181,8 @@ class TransientRenderer(nn.Module):
         self._cube_shape = tuple(film.cube_shape())
         self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
-        self._scene_filter = ""
-        if film.response == "phasor":
+        self._scene_filter, self._pulsed = "", False
+        if film.measures == "phasor":
             self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
             if self.temporal_filter != "auto":
                 raise SceneError(
@@ -175,6 +190,7 @@ class TransientRenderer(nn.Module):
                 )
             return
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
+        self._pulsed = bool(getattr(film, "pulses", ()))
         self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
@@ -207,7 +223,7 @@ class TransientRenderer(nn.Module):
         if self.temporal_filter != "auto":
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
-        return "tent" if moves and self._scene_filter == "box" else self._scene_filter
+        return "tent" if moves and self._scene_filter == "box" and not self._pulsed else self._scene_filter
 
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
@@ -226,7 +242,8 @@ class TransientRenderer(nn.Module):
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
         """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
-        return self.effective_filter != "box" or not any(self._infos[key].moves_path_length for key in keys)
+        sloped = self._pulsed or self.effective_filter != "box"
+        return sloped or not any(self._infos[key].moves_path_length for key in keys)
 
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
@@ -263,7 +280,7 @@ class TransientRenderer(nn.Module):
         self._check_slope(temporal_filter, tensors)
         used = samples("spp", spp) or self.spp or self._scene_spp
         items = self._items(seed, batch)
-        bar = _Bar() if progress else None
+        bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
             options=self._options,
@@ -281,11 +298,12 @@ class TransientRenderer(nn.Module):
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, stats = steady_channels_first(steady, leading), self._stats(job)
+        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        steady = steady_channels_first(steady, leading, components)
         if self.frequencies is not None:
-            phasor = phasor_channels_first(response, leading)
+            phasor = phasor_channels_first(response, leading, components)
             return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
-        transient = transient_channels_first(response, leading)
+        transient = transient_channels_first(response, leading, components)
         return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
@@ -320,7 +338,7 @@ class TransientRenderer(nn.Module):
         return tensors, batched, batch
 
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
-        if temporal_filter != "box" or not torch.is_grad_enabled():
+        if temporal_filter != "box" or self._pulsed or not torch.is_grad_enabled():
             return
         moving = [
             k for k, t in zip(self._keys, tensors, strict=True) if t.requires_grad and self._infos[k].moves_path_length
@@ -395,20 +413,3 @@ def render(
     for parameter in renderer.parameters():
         parameter.requires_grad_(False)
     return renderer(values, seed=seed, progress=progress)
-
-
-class _Bar:
-    """A progress bar that takes fractions. Made on demand: tqdm is imported only when asked for."""
-
-    def __init__(self) -> None:
-        from tqdm.auto import tqdm
-
-        self._bar: Any = tqdm(
-            total=1.0, desc="render", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
-        )
-
-    def __call__(self, fraction: float) -> None:
-        self._bar.update(fraction - self._bar.n)
-
-    def close(self) -> None:
-        self._bar.close()

@@ -21,7 +21,7 @@ MAX_SINGLE_PRECISION_SAMPLES = 2**16
 class TimeResolvedFilm(mi.Film):
     """Abstract base of films that keep an array behind every pixel beside the steady image.
 
-    A subclass has ``plugin`` (its name in messages), ``response`` (what its array is: ``transient`` or ``phasor``), the
+    A subclass has ``plugin`` (its name in messages), ``measures`` (what its array is: ``transient`` or ``phasor``), the
     shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
     integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
     handed over as ``opl - start_opl`` in double precision.
@@ -30,7 +30,7 @@ class TimeResolvedFilm(mi.Film):
     """
 
     plugin = "time-resolved film"
-    response = "transient"
+    measures = "transient"
     exhaustive_scan = False
     # Whether the film has a window that light can miss, which is then counted in `outside`.
     has_window = True
@@ -69,9 +69,10 @@ class TimeResolvedFilm(mi.Film):
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
         return None
 
-    def lane(self, job, base, match, tangents: bool = False) -> Lane:
+    def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
         """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of
+        contributions (``put``).
         """
         return Lane(self, self.bands[job.band][2], base, match)
 
@@ -84,8 +85,10 @@ class TimeResolvedFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """The number of :meth:`channel_names`."""
-        return len(self.channel_names())
+        """The number of :meth:`channel_names`, in polarized variants four times that: first all of S0, then S1, S2,
+        S3.
+        """
+        return len(self.channel_names()) * (4 if mi.is_polarized else 1)
 
     def channel_names(self) -> tuple[str, ...]:
         """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
@@ -116,8 +119,6 @@ class TimeResolvedFilm(mi.Film):
         """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
-        if mi.is_polarized:
-            raise SceneError(f"{self.plugin}: polarized variants are not supported; use the unpolarized one.")
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
@@ -166,12 +167,12 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def energy_before(self) -> float:
-        """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
+        """Light that arrived before ``start_opl``: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(0)
 
     @property
     def energy_after(self) -> float:
-        """Light that arrived after the end of the window: sum over pixels, mean over channels."""
+        """Light that arrived after the end of the window: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(1)
 
     def _energy_outside(self, side: int) -> float:

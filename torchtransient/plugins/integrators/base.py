@@ -10,10 +10,12 @@ import mitsuba as mi
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
+from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin
+from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -84,6 +86,9 @@ class TransientIntegrator(mi.CppADIntegrator):
             check_stddev(self.gaussian_stddev)
         self._distant = None
 
+    # Whether paths scatter in participating media; others refuse scenes that have them.
+    walks_through_media = False
+
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
@@ -109,16 +114,17 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
             )
-        if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
+        if not self.walks_through_media and media_facts(scene, sensor) is not None:
             raise SceneError(
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
-                "if they were empty. Remove the interior and exterior media of its shapes."
+                "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
+                "media of the scene's shapes and sensors."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
 
-    def facts(self, scene) -> SceneFacts:
-        """What the loops may leave out for this scene.
+    def facts(self, scene, sensor=None) -> SceneFacts:
+        """What the loops may leave out for this scene, seen by this sensor.
 
         The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the
         clock. The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes
@@ -128,7 +134,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         key = (scene.ptr, *(shape.ptr for shape in shapes))
         if self._distant is None or self._distant[0] != key:
             self._distant = (key, distant_reference(scene), shapes[:1])
-        return scene_facts(scene, self._distant[1])
+        facts = scene_facts(scene, self._distant[1])
+        if self.walks_through_media:
+            facts.media = media_facts(scene, sensor)
+        if facts.media is not None:
+            facts.media.hide_emitters = bool(self.hide_emitters)
+        return facts
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel.
@@ -185,6 +196,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
         return sampler, ray, ray_weight, scale, row, column
 
+    def channel_match(self, sensor, film, ray, ray_weight, scale):
+        """The map from samples of the primary rays to the film's channels, detached."""
+        turn = sensor_turn(sensor, dr.detach(ray)) if mi.is_polarized else None
+        return ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves, turn)
+
     def lane_bases(self, film, job, row, column):
         """Index of a pixel's first bin in its band, and of the pixel in the film."""
         width = int(film.crop_size()[0])
@@ -219,10 +235,12 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _render_pass(self, scene, sensor, film, job):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match)
-        L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
+        lane = film.lane(job, base, match, self.max_depth)
+        first = self._first_opl(sensor, film, ray)
+        facts = self.facts(scene, sensor)
+        L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
         for c, value in enumerate(match.to_channels(L)):
             dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
         if film.outside is not None:
@@ -248,7 +266,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-                facts = self.facts(scene).with_gradients(scene, sensor)
+                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
             self._check_differentiable(film, facts)
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:
@@ -263,7 +281,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -293,7 +311,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():
-                facts = self.facts(scene).with_gradients(scene, sensor)
+                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
                 settle_tangents(scene, facts)
             self._check_differentiable(film, facts)
             jobs, samples = self.passes(sensor, film, int(seed), int(spp))
@@ -306,9 +324,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves)
+        match = self.channel_match(sensor, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, tangents=True)
+        lane = film.lane(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(sensor, film, ray)
         t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
         if facts.sensor_moves:
@@ -341,6 +359,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
                 "'tent' or 'gaussian'."
             )
+        if mi.is_polarized:
+            raise GradientError("Polarized variants have no derivatives yet; use the unpolarized one.")
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "

@@ -17,7 +17,8 @@ class SceneFacts:
     ``bsdfs``: the outermost BSDFs. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups.
     ``distant``: reference sphere of
     infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
-    BSDFs, None when there are none. The remaining ones describe which gradients are asked for: ``geometry`` (path
+    BSDFs, None when there are none. ``media``: the participating media, None when there are none (or the integrator
+    refuses them). The remaining ones describe which gradients are asked for: ``geometry`` (path
     lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
     spherical ones), ``sensor_moves``,
     ``index_moves``.
@@ -31,6 +32,7 @@ class SceneFacts:
         self.instances = instances
         self.distant = distant
         self.refraction = refraction
+        self.media = None
         self.geometry = False
         self.light_moves = False
         self.emitter_shape_moves = False

@@ -1,0 +1,123 @@
+"""The sum over time is what Mitsuba's steady volumetric path tracer renders."""
+
+import numpy as np
+import pytest
+from media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
+
+from torchtransient.errors import SceneError
+from torchtransient.testing.statistics import two_sample_z_test
+
+VARIANT = "llvm_ad_rgb"
+
+
+def coloured():
+    return homogeneous(rgb(0.5, 0.8, 0.2), rgb(0.9, 0.5, 0.7), 0.5, scale=2.0)
+
+
+def blend():
+    parts = {"a": {"type": "hg", "g": 0.7}, "b": {"type": "tabphase", "values": "0.2, 0.5, 1.0, 0.7"}}
+    return homogeneous(1.5, 0.9) | {"phase": {"type": "blendphase", "weight": 0.3, **parts}}
+
+
+CASES = {
+    "colours": lambda: block(coloured()),
+    "grid": lambda: block(clouds()),
+    "coloured grid": lambda: block(clouds((3, 3, 3, 3))),
+    "grid of albedo": lambda: block(clouds(albedo=volume(np.linspace(0, 1, 27).reshape(3, 3, 3)))),
+    "blended phase": lambda: block(blend()),
+    "no emitter sampling": lambda: block(homogeneous(1.0, 0.8, sample_emitters=False)),
+    "smooth glass": lambda: block(coloured(), {"type": "dielectric", "int_ior": 1.33}),
+    "rough glass": lambda: block(coloured(), {"type": "roughdielectric", "alpha": 0.4}),
+    "grid in rough glass": lambda: block(clouds(), {"type": "diff_rough_dielectric", "alpha": 0.4}),
+    "wall inside": lambda: block(clouds()) | {
+        "wall": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": {"type": "diffuse", "reflectance": 0.9}}
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_steady_sum(name):
+    objects = CASES[name]()
+    if "diff_" in str(objects):
+        plain = CASES[name]()
+        plain["block"]["bsdf"]["type"] = "roughdielectric"
+    else:
+        plain = objects
+    steady, _ = runs(load(objects))
+    # `volpath`, since `prbvolpath` refuses no media but ignores that of the sensor.
+    expected = steady_runs(load(plain, integrator="volpath"))
+    result = two_sample_z_test(steady, expected, rounding=1e-5)
+    assert result.passed, str(result)
+    # The whole picture is a sharper test than its pixels.
+    total = two_sample_z_test(steady.mean((1, 2)), expected.mean((1, 2)))
+    assert total.passed, str(total)
+
+
+def test_sensor_inside_a_medium():
+    """A fog around everything, camera included: the sensor and the walls name the medium."""
+    fog = homogeneous(0.5, 0.3, 0.3)
+    room = {
+        "fog": fog,
+        "box": {
+            "type": "cube",
+            "to_world": T().scale(5),
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+            "interior": {"type": "ref", "id": "fog"},
+        },
+        "lamp": {"type": "sphere", "center": [0, 2, 0], "radius": 0.5, "emitter": {"type": "area", "radiance": 5.0}},
+    }
+
+    def scene(integrator):
+        sensor = camera(transient=integrator.startswith("transient"))
+        sensor["medium"] = {"type": "ref", "id": "fog"}
+        return load(room, sensor, integrator)
+
+    steady, _ = runs(scene("transient_prbvolpath"))
+    expected = steady_runs(scene("volpath"))
+    total = two_sample_z_test(steady.mean((1, 2)), expected.mean((1, 2)))
+    assert total.passed, str(total)
+    clear = steady_runs(load(room, integrator="path")).mean()
+    assert expected.mean() < 0.8 * clear, "the fog must matter"
+
+
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_hidden_emitters(hide_emitters):
+    objects = block(clouds())
+    objects["lamp"]["to_world"] = T().translate([0, 0.3, 1.5]).rotate([1, 0, 0], 180).scale(0.5)
+    objects["sky"] = {"type": "constant", "radiance": 0.3}
+    objects["lamp_behind"] = {
+        "type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(0.5),
+        "emitter": {"type": "area", "radiance": 2.0},
+    }  # fmt: skip
+    steady, _ = runs(load(objects, hide_emitters=hide_emitters))
+    expected = steady_runs(load(objects, integrator="volpath", hide_emitters=hide_emitters))
+    result = two_sample_z_test(steady, expected, rounding=1e-5)
+    assert result.passed, str(result)
+
+
+@pytest.mark.parametrize("max_depth", [1, 2, 3])
+def test_depth_counts_real_events(max_depth):
+    objects = block(homogeneous(1.0, 0.8))
+    steady, _ = runs(load(objects, max_depth=max_depth))
+    expected = steady_runs(load(objects, integrator="volpath", max_depth=max_depth))
+    result = two_sample_z_test(steady, expected, rounding=1e-5)
+    assert result.passed, str(result)
+
+
+def test_surface_integrator_names_the_other_one():
+    scene = load(block(clouds()), integrator="transient_path")
+    with pytest.raises(SceneError, match="transient_prbvolpath"):
+        scene.integrator().render(scene, spp=1)
+
+
+def test_without_media_it_is_the_surface_integrator():
+    objects = block(clouds())
+    del objects["block"]
+    results = []
+    for name in ("transient_path", "transient_prbvolpath", "transient_volpath"):
+        scene = load(objects, integrator=name, max_depth=5)
+        results.append(scene.integrator().render(scene, seed=1, spp=32))
+    for steady, transient in results[1:]:
+        assert np.array_equal(np.array(steady), np.array(results[0][0]))
+        # Atomic additions come in any order.
+        np.testing.assert_allclose(np.array(transient), np.array(results[0][1]), rtol=1e-5, atol=1e-7)

@@ -1,0 +1,48 @@
+"""``transient_prbvolpath``: time-resolved path tracing over surfaces and through participating media."""
+
+from __future__ import annotations
+
+from torchtransient.errors import GradientError
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.integrators import path
+
+
+class TransientVolpath(path.TransientPath):
+    r"""Time-resolved volumetric path tracer (:monosp:`transient_prbvolpath`, :monosp:`transient_volpath`).
+
+    The path tracer ``transient_path`` with walks through homogeneous and heterogeneous media between its vertices, see
+    ``media/free_flight.py``: any phase function, colours of extinction, open (``null``) and refractive boundaries,
+    sensors inside a medium. Parameters as in :class:`TransientIntegrator`; ``max_depth`` counts scattering at surfaces
+    and in media, not the passage of an open boundary. A ``mask`` or ``thindielectric`` counts, as in
+    ``transient_path``. In a scene without media it is ``transient_path``, down to the compiled kernel.
+
+    Optical length is geometric length times the index of the medium, whether the walk collides or not. The index
+    changes where a BSDF refracts.
+
+    Not supported: derivatives in scenes with media (``GradientError``), media that emit light, polarization. The
+    length between a sensor and its near clip plane counts in time but is not attenuated, as in Mitsuba.
+    """
+
+    walks_through_media = True
+
+    def sweep(self, scene, sampler, ray, first_opl, lane, facts):
+        """As in ``transient_path``; see :meth:`_refuse`."""
+        self._refuse(facts)
+        return super().sweep(scene, sampler, ray, first_opl, lane, facts)
+
+    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
+        """As in ``transient_path``; see :meth:`_refuse`."""
+        self._refuse(facts)
+        return super().push(scene, sampler, ray, first_opl, lane, facts, t_ray, d_first)
+
+    @staticmethod
+    def _refuse(facts):
+        if facts.media is not None:
+            raise GradientError(
+                "transient_prbvolpath: derivatives are available in scenes without media only, and this one has "
+                f"{len(facts.media.media)}. Remove the media, or render without gradients."
+            )
+
+
+register("integrator", "transient_prbvolpath", TransientVolpath)
+register("integrator", "transient_volpath", TransientVolpath)

@@ -1,0 +1,138 @@
+"""What light is made of along a path: numbers per colour, or Stokes vectors and Mueller matrices in polarized variants.
+
+Every function looks at the active variant while a kernel is traced; in unpolarized variants they reduce to the plain
+products, so that those kernels do not change.
+
+Frames. A Stokes vector belongs to a segment of the path, and light runs against the ray. Mitsuba's BSDFs give their
+matrices between the implicit frames of the two *local* directions. Here every segment has one fixed vector instead,
+computed from the ray's own direction: both of its ends see the same bits, so that no rounding can turn the frame over
+between them (Mitsuba's implicit frame jumps where a direction crosses the plane z = 0). Where directions are attached,
+the frame is the projection of that vector across the direction: a function of the direction alone, so what the two ends
+of a segment lose or gain by its turning cancels as it must.
+
+All rotations come from sines and cosines of twice the angle by products, without the angle: they are cheap, and have
+derivatives everywhere.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def light_type():
+    """Type of what one event contributes: a spectrum, or in polarized variants a Stokes vector of spectra."""
+    return mi.SpectrumEntry if mi.is_polarized else mi.UnpolarizedSpectrum
+
+
+def intensity(light):
+    """The power of light as a spectrum, whatever its polarization."""
+    return light[0] if mi.is_polarized else light
+
+
+def transported(β, weight, x):
+    """``β x`` scaled by ``weight``, where ``x`` is light or a throughput."""
+    if not mi.is_polarized:
+        return β * weight * x
+    return product(β, x) * weight
+
+
+def faded(β, T):
+    """A throughput times a spectrum ``T`` that acts on all of its components alike."""
+    if not mi.is_polarized:
+        return β * T
+    return mi.Spectrum(*[β[i, j] * T for i in range(4) for j in range(4)])
+
+
+def product(a, b):
+    """``a b``: of two spectra, two Mueller matrices, or a Mueller matrix and a Stokes vector."""
+    if not mi.is_polarized:
+        return a * b
+    if isinstance(b, mi.Spectrum):
+        return a @ b
+    return mi.SpectrumEntry(*[sum(a[i, k] * b[k] for k in range(1, 4)) + a[i, 0] * b[0] for i in range(4)])
+
+
+def column(matrix):
+    """What a throughput makes of unpolarized light of power one; Mitsuba's emitters emit no other."""
+    if not mi.is_polarized:
+        return matrix
+    return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
+
+
+# --------------------------------------------------------------------------------------------------------- frames
+
+
+class Turn:
+    """Rotation of a Stokes frame by its cosine and sine of twice the angle, counter-clockwise for the receiver."""
+
+    def __init__(self, c, s):
+        self.c, self.s = c, s
+
+
+def turn_between(forward, current, target):
+    """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
+
+    ``forward`` is the direction in which light travels, ``current`` a unit vector across it. No rotation where
+    ``target`` is parallel to the direction.
+    """
+    c, s = dr.dot(current, target), dr.dot(forward, dr.cross(current, target))
+    n = c * c + s * s
+    there = n > 0
+    scale = dr.rcp(dr.select(there, n, 1))
+    return Turn(dr.select(there, (c - s) * (c + s) * scale, 1), dr.select(there, 2 * c * s * scale, 0))
+
+
+def segment_frame(d):
+    """The vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
+    return mi.coordinate_system(-dr.detach(d))[0]
+
+
+def turn_out(si, d):
+    """From the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in direction ``d`` found.
+
+    None in unpolarized variants, as :func:`turn_in`. Where ``si.wi`` is attached to the direction, ``d`` must be.
+    """
+    if not mi.is_polarized:
+        return None
+    return turn_between(-d, si.to_world(mi.coordinate_system(si.wi)[0]), segment_frame(d))
+
+
+def turn_in(si, wo, out=None):
+    """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
+
+    ``out``: that direction in the world with the bits of the next ray's; computed as the next ray's is if not given.
+    """
+    if not mi.is_polarized:
+        return None
+    out = si.to_world(wo) if out is None else out
+    return turn_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), segment_frame(out))
+
+
+def turned(light, turn):
+    """A Stokes vector in the turned frame."""
+    if not mi.is_polarized:
+        return light
+    c, s = turn.c, turn.s
+    return mi.SpectrumEntry(light[0], light[1] * c + light[2] * s, light[2] * c - light[1] * s, light[3])
+
+
+def scattered(value, turn):
+    """What a BSDF's value makes of unpolarized light, in the frame of the segment towards the sensor."""
+    if not mi.is_polarized:
+        return mi.unpolarized_spectrum(value)
+    return turned(column(value), turn)
+
+
+def scattering(value, out, into):
+    """A BSDF's value between the frames of the two segments: ``out`` towards the sensor, ``into`` towards the light."""
+    if not mi.is_polarized:
+        return mi.unpolarized_spectrum(value)
+    m = [[value[i, j] for j in range(4)] for i in range(4)]
+    for row in m:
+        row[1], row[2] = row[1] * into.c + row[2] * into.s, row[2] * into.c - row[1] * into.s
+    m[1], m[2] = (
+        [a * out.c + b * out.s for a, b in zip(m[1], m[2], strict=True)],
+        [b * out.c - a * out.s for a, b in zip(m[1], m[2], strict=True)],
+    )
+    return mi.Spectrum(*[entry for row in m for entry in row])
