@@ -202,10 +202,8 @@ class PixelElectronics(RandomSensor):
         return (level.clamp(0, 2**self.bits - 1) - self.black_level_dn) * self.gain_e_per_dn
 
     def _map(self, values: Tensor, name: str, x: Tensor) -> Tensor:
-        try:
-            fits = torch.broadcast_shapes(values.shape, x.shape) == x.shape
-        except RuntimeError:
-            fits = False
+        missing = x.ndim - values.ndim
+        fits = missing >= 0 and all(v in (1, n) for v, n in zip(values.shape, x.shape[missing:], strict=True))
         if not fits:
             raise ShapeError(
                 f"{type(self).__name__}: expected {name} to broadcast to {tuple(x.shape)}, got {tuple(values.shape)}."

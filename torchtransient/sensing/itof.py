@@ -81,8 +81,8 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
             f"correlate: expected weights (M, {transient.shape[-3]}) for the transient {tuple(transient.shape)}, got "
             f"{tuple(weights.shape)}. Make them from the transient's own time axis."
         )
-    h, w = transient.shape[-2:]
-    return (weights.to(transient) @ transient.flatten(-2)).unflatten(-1, (h, w))
+    taps = weights.to(transient) @ transient.flatten(-2)
+    return taps.reshape(*taps.shape[:-1], *transient.shape[-2:])
 
 
 def taps_from_phasor(
@@ -124,7 +124,8 @@ def taps_from_phasor(
     for f in check_frequencies(frequencies_hz, me):
         parts = torch.stack([_component(phasor, phasor_axis, h * f, me) for h in kept], dim=-3)
         # exp(+i) of the code against exp(-i) of the phasor: the conjugate of one of them.
-        mixed = (factors.to(parts) @ parts.conj().flatten(-2)).real.unflatten(-1, parts.shape[-2:])
+        mixed = (factors.to(parts) @ parts.conj().flatten(-2)).real
+        mixed = mixed.reshape(*mixed.shape[:-1], *parts.shape[-2:])
         base = (1 + contrast * offset).to(total).reshape(-1, 1, 1) * total.unsqueeze(-3)
         taps.append((base + mixed) / code.num_taps)
     return torch.cat(taps, dim=-3)

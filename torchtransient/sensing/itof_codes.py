@@ -71,7 +71,7 @@ class FourierCode(CorrelationCode):
 
     def evaluate(self, turns: Tensor) -> Tensor:
         x = turns - _along_first(self.shifts, turns)
-        return self._sum(x, {h: 1.0 for h in self.parts})
+        return self._sum(x, dict.fromkeys(self.parts, 1.0))
 
     def bin_means(self, edges_turns: Tensor) -> Tensor:
         edges = _check_edges(edges_turns)
@@ -283,5 +283,5 @@ def _along_first(shifts: Tensor | None, turns: Tensor) -> Tensor:
 
 def _not_none(value: Tensor | None) -> Tensor:
     if value is None:
-        raise ShapeError("CorrelationCode: expected taps that are one function moved along; this code has no common shape of its taps.")
+        raise ShapeError("CorrelationCode: expected taps of one shape, moved along.")
     return value

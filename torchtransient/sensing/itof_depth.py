@@ -50,6 +50,8 @@ def tap_phasor(taps: Tensor, num_taps: int) -> Tensor:
     Raises ShapeError when the tap dimension is no multiple of ``num_taps``.
     """
     split = _split(taps, num_taps, "tap_phasor")
+    # The mean has no part in the sum; without it, equal taps give exactly zero and float32 keeps its digits.
+    split = split - split.mean(-3, keepdim=True)
     angles = _TURN * torch.arange(num_taps, dtype=torch.float64) / num_taps
     weight = (2 / num_taps) * torch.exp(1j * angles)
     real = torch.einsum("...fnhw,n->...fhw", split, weight.real.to(split))
@@ -123,7 +125,8 @@ def phase_noise_rad(amplitude: Tensor, offset: Tensor, num_taps: int, read_noise
     """Standard deviation of the phase from amplitude and offset per tap, in electrons, shot and read noise.
 
     ``sqrt(2 (offset + read^2) / N) / amplitude``, which is ``sqrt(2 B) / A`` of the totals without read noise: first
-    order in the noise, right for deviations below about 0.2 rad. Infinite at amplitude zero.
+    order in the noise, right for deviations below about 0.2 rad. Infinite at amplitude zero. With three taps the
+    variance also swings with the phase, ``(2 B - A cos 3 phi) / A^2``; this is its root mean square.
     """
     check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
     return (2 * (offset + read_noise_e**2) / num_taps).sqrt() / amplitude
@@ -141,7 +144,7 @@ def unwrap_depth(
 
     For every number of turns of the highest frequency within [min_depth_m, max_depth_m] the other frequencies take
     their nearest number of turns, and the weighted least-squares depth with the least residual wins. ``max_depth_m``:
-    None for the range after which everything repeats. ``weights``: one over the variance of each *phase*; equal by
+    None for one range after which everything repeats. ``weights``: one over the variance of each *phase*; equal by
     default. With noise around zero depth give a ``min_depth_m`` a little below zero.
 
     The whole turns are detached; the gradient is that of the least-squares depth in the phases. Memory does not grow
@@ -151,7 +154,7 @@ def unwrap_depth(
     values = check_frequencies(frequencies_hz, me)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
-    longest = unambiguous_range_m(values) if max_depth_m is None else float(max_depth_m)
+    longest = float(min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m)
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
     weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
@@ -167,7 +170,8 @@ def unwrap_depth(
     best, whole = _search(turns.detach(), periods, share, weight, reference, (float(min_depth_m), longest))
     del best
     metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
-    return ((turns + whole) * metres).sum(-3)
+    depth: Tensor = ((turns + whole) * metres).sum(-3)
+    return depth
 
 
 def _search(
@@ -232,7 +236,8 @@ def _unit_shapes(code: CorrelationCode, turns: Tensor) -> Tensor:
     """(P, N): the taps of a code at the given phases without their mean and at length one."""
     shape = code.evaluate(turns).T
     shape = shape - shape.mean(-1, keepdim=True)
-    return shape / torch.linalg.vector_norm(shape, dim=-1, keepdim=True).clamp_min(1e-12)
+    unit: Tensor = shape / torch.linalg.vector_norm(shape, dim=-1, keepdim=True).clamp_min(1e-12)
+    return unit
 
 
 def _best_match(unit: Tensor, table: Tensor, chunk: int = 1 << 14) -> Tensor:
@@ -280,4 +285,4 @@ def _split(taps: Tensor, num_taps: int, where: str) -> Tensor:
         raise ShapeError(
             f"{where}: expected taps (..., C, F x N, H, W) with N = {num_taps} >= 3, got {tuple(taps.shape)}."
         )
-    return taps.unflatten(-3, (-1, num_taps))
+    return taps.reshape(*taps.shape[:-3], -1, num_taps, *taps.shape[-2:])
