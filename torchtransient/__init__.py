@@ -16,6 +16,7 @@ del globals()["render"]
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
+    "Gate": "torchtransient.gates",
     "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
@@ -23,12 +24,15 @@ _LAZY = {
     "TimeAxis": "torchtransient.axes",
     "TransientRenderer": "torchtransient.render.renderer",
     "cost_of_accuracy": "torchtransient.accuracy.cost",
+    "Plan": "torchtransient.render.plan",
     "load": "torchtransient.render.scene_handle",
+    "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
+    "vis": "torchtransient.vis",
 }
 
 

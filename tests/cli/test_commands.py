@@ -119,6 +119,8 @@ def test_list_of_parameters(folder):
         (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),
         (("box.xml", "--overview", "nowhere/out.png"), "'nowhere' does not exist"),
         (("box.xml", "--overview", "out.docx"), ".png"),
+        (("box.xml", "--rainbow", "nowhere/out.png"), "'nowhere' does not exist"),
+        (("box.xml", "--video", "out.avi"), ".mp4 or .gif"),
         (("box.xml", "--start-opl", "0", "--bin-width-opl", "-1", "--num-bins", "3"), "bin_width_opl > 0"),
     ],
 )

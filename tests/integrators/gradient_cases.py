@@ -714,15 +714,17 @@ CASES = [
 def weights(scene_film):
     """Loss weights, of the shape that lies behind a pixel.
 
-    Of a histogram the sine of three times the optical path length at each bin's centre; of phasors a pattern in which
-    no two real or imaginary parts weigh the same.
+    Of a histogram the sine of three times the optical path length at each bin's centre, in polarized variants with
+    factors that differ between the Stokes components and let the polarization count; of phasors and gates a
+    pattern in which no two entries weigh the same.
     """
-    if scene_film.measures == "phasor":
+    if scene_film.measures != "transient":
         shape = scene_film.cube_shape()[2:]
         number = np.arange(int(np.prod(shape)))
         return (np.cos(1.7 * number + 0.4) / (1 + 0.3 * number)).reshape(shape)
     centers = scene_film.start_opl + (np.arange(scene_film.temporal_bins) + 0.5) * scene_film.bin_width_opl
-    return np.sin(3 * centers)[:, None]
+    components = np.repeat([0.2, 1.0, -0.7, 1.3], scene_film.channel_count() // 4) if mi.is_polarized else np.ones(1)
+    return np.sin(3 * centers)[:, None] * components
 
 
 class Changes(dict):

@@ -9,12 +9,13 @@ from typing import Any
 import click
 
 from torchtransient.cli.options import assignments, frequency_list, load_scene, scene_options, scene_values, time_axis
+from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
 
 
 @click.command()
 @scene_options
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Result, .h5 or .npz.  [default: SCENE.h5]")
-@click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png).")
+@picture_options
 @click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
 @click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
@@ -32,7 +33,6 @@ def command(scene: Path, **options: Any) -> None:
     torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
-    from torchtransient.vis.overview import check_picture, plot_overview
 
     assignments(options["params"], "--param")
     axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
@@ -42,10 +42,7 @@ def command(scene: Path, **options: Any) -> None:
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
-    if options["overview"]:
-        check_picture(options["overview"])
-        if options["frequencies"]:
-            raise click.UsageError("--overview shows a histogram over time; leave it out with --frequencies.")
+    check_pictures(options, phasors=frequencies is not None)
     described = load_scene(scene, options["variant"], options["params"])
     if options["list_parameters"]:
         click.echo(described.parameters())
@@ -61,11 +58,8 @@ def command(scene: Path, **options: Any) -> None:
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
     if output.transient is not None:
         _report_energy(output)
-    if options["overview"] and output.transient is None:
-        raise click.UsageError("--overview shows a histogram over time, and the scene's film keeps phasors.")
-    if options["overview"]:
-        plot_overview(*_power(output), output.axis, options["overview"], pixel=options["pixel"], title=scene.name)
-        click.echo(f"{options['overview']}: overview")
+    check_pictures(options, phasors=output.transient is None)
+    write_pictures(output, options, scene.name)
 
 
 def _sizes(tensor: Any) -> str:

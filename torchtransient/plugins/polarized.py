@@ -60,6 +60,73 @@ def column(matrix):
     return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
 
 
+# ------------------------------------------------------------------------------------------------------- adjoints
+#
+# Every event of a path has its own adjoint A, a vector in polarized variants, and the throughput stands between it and
+# the light f: A^T β f. What lies beyond a vertex is therefore kept as the matrix f A^T per unit throughput, so that the
+# number is trace(β f A^T); no matrix is ever inverted.
+
+
+def matched(A, light):
+    """``f A^T``: an event and its adjoint without the throughput. ``light`` may be a spectrum: unpolarized emission."""
+    if not mi.is_polarized:
+        return A * light
+    if isinstance(light, mi.SpectrumEntry):
+        return mi.Spectrum(*[light[i] * A[j] for i in range(4) for j in range(4)])
+    none = mi.UnpolarizedSpectrum(0)
+    return mi.Spectrum(*[light * A[j] for j in range(4)], *[none] * 12)
+
+
+def traced(β, beyond):
+    """The number that events contribute: ``trace(β S)`` over the matrices of :func:`matched`, summed over colours."""
+    return dr.sum(traced_colours(β, beyond))
+
+
+def traced_colours(β, beyond):
+    """``traced`` for each colour."""
+    if not mi.is_polarized:
+        return β * beyond
+    return sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4))
+
+
+def traced_attached(β, A_e, Le, A_n, f, W, S):
+    """``traced`` of emission, next-event estimation and scattering ``W`` into ``S``, attached to ``Le``, ``f``, ``W``.
+
+    What stands before an attached factor is multiplied out first: that keeps the derivatives' graph small.
+    """
+    if not mi.is_polarized:
+        return dr.sum(β * (A_e * Le + A_n * f + W * S))
+    before_e = sum(β[i, 0] * A_e[i] for i in range(4))
+    before_n = [sum(β[i, k] * A_n[i] for i in range(4)) for k in range(4)]
+    before_w = S @ β
+    total = before_e * Le
+    for k in range(4):
+        total += before_n[k] * f[k]
+        for j in range(4):
+            total += before_w[j, k] * W[k, j]
+    return dr.sum(total)
+
+
+def whole(beyond):
+    """``traced`` for a throughput of one."""
+    if not mi.is_polarized:
+        return dr.sum(beyond)
+    return dr.sum(sum(beyond[i, i] for i in range(4)))
+
+
+def turning(beyond):
+    """Derivative of :func:`traced` by twice the angle by which the frame in front of it turns, at no turn."""
+    return dr.sum(beyond[2, 1] - beyond[1, 2])
+
+
+def turning_throughput(t_turn):
+    """Tangent of a throughput of one whose frame turns by half of ``t_turn``; None leaves it as it is."""
+    if t_turn is None:
+        return mi.Spectrum(0)
+    zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_turn)
+    return mi.Spectrum(*[zero] * 6, t, *[zero] * 2, -t, *[zero] * 6)
+
+
 # --------------------------------------------------------------------------------------------------------- frames
 
 
@@ -68,6 +135,10 @@ class Turn:
 
     def __init__(self, c, s):
         self.c, self.s = c, s
+
+    def angle(self):
+        """Zero with the derivative of twice the angle."""
+        return dr.detach(self.c) * self.s - dr.detach(self.s) * self.c
 
 
 def turn_between(forward, current, target):
@@ -98,15 +169,16 @@ def turn_out(si, d):
     return turn_between(-d, si.to_world(mi.coordinate_system(si.wi)[0]), segment_frame(d))
 
 
-def turn_in(si, wo, out=None):
+def turn_in(si, wo, out=None, d=None):
     """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
 
-    ``out``: that direction in the world with the bits of the next ray's; computed as the next ray's is if not given.
+    ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
+    them both are computed as the next ray's is.
     """
     if not mi.is_polarized:
         return None
     out = si.to_world(wo) if out is None else out
-    return turn_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), segment_frame(out))
+    return turn_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), segment_frame(out if d is None else d))
 
 
 def turned(light, turn):

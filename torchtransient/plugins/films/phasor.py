@@ -16,6 +16,58 @@ from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 MAX_EVENT_BYTES = 2**28
 
 
+class Table:
+    """Phasors (or their adjoint) and their frequencies. A plain object: its arrays must not become loop state."""
+
+    def __init__(self, flat, frequencies, count, channels):
+        self.flat, self.frequencies, self.count, self.channels = flat, frequencies, count, channels
+
+    def add(self, value, index, active):
+        """Add single-precision values, also to an array of doubles."""
+        dr.scatter_reduce(dr.ReduceOp.Add, self.flat, type(self.flat)(value), index, active)
+
+
+@dr.syntax
+def add_event(table, base, opl, value, slope, active):
+    """Add one event to every frequency; ``slope`` is None or the contribution times the derivative of its length."""
+    f = mi.UInt32(0)
+    live = mi.Bool(active)
+    while dr.hint(live & (f < table.count), label="phasor put"):
+        ν = dr.gather(mi.Float64, table.frequencies, f, live)
+        cos, sin = rotation(ν * opl)
+        for c in range(table.channels):
+            re, im = value[c] * cos, -value[c] * sin
+            if dr.hint(slope is not None, mode="scalar"):
+                ω = mi.Float(2 * math.pi * ν)
+                re -= slope[c] * ω * sin
+                im -= slope[c] * ω * cos
+            index = base + (f * table.channels + c) * 2
+            table.add(re, index, live)
+            table.add(im, index + 1, live)
+        f += 1
+
+
+@dr.syntax
+def read_event(table, base, stride, entry, opl, active):
+    """``A`` and its slope for one event, over all frequencies."""
+    A = [mi.Float(0) for _ in range(table.channels)]
+    slope = [mi.Float(0) for _ in range(table.channels)]
+    f = mi.UInt32(0)
+    live = mi.Bool(active)
+    while dr.hint(live & (f < table.count), label="phasor read"):
+        ν = dr.gather(mi.Float64, table.frequencies, f, live)
+        cos, sin = rotation(ν * opl)
+        ω = mi.Float(2 * math.pi * ν)
+        for c in range(table.channels):
+            index = base + f * stride + 2 * c * entry
+            a = dr.gather(mi.Float, table.flat, index, live)
+            b = dr.gather(mi.Float, table.flat, index + entry, live)
+            A[c] += a * cos - b * sin
+            slope[c] -= ω * (a * sin + b * cos)
+        f += 1
+    return A, slope
+
+
 class PhasorHDRFilm(TimeResolvedFilm):
     r"""Phasor film (:monosp:`phasor_hdr_film`): ``P(nu) = sum of radiance * exp(-2 pi i nu (opl - start_opl))``.
 
@@ -97,42 +149,21 @@ class PhasorHDRFilm(TimeResolvedFilm):
     def lane(self, job, base, match, depth, tangents=False):
         return EventLane(self, self.bands[job.band], base, match, job, depth, tangents)
 
-    def turns(self, frequency, opl_from_start):
-        """Cosine and sine of ``2 pi frequency opl`` for doubles; whole turns are taken off before the cast."""
-        return rotation(frequency * opl_from_start)
+    def _table(self, flat):
+        return Table(flat, self.frequency_array, self.frequency_total, self.channel_count())
 
     def put(self, cube, base, opl_from_start, value, active):
         """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the phasors that begin at ``base``.
 
         One event, frequency by frequency: the plain form of what :class:`EventLane` does for many events at once.
         """
-        self._add(cube, base, opl_from_start, value, None, active)
+        add_event(self._table(cube), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active):
         """Forward mode: add ``k df + f k' dtau`` to the derivative of the phasors; arguments as for :meth:`put`."""
-        self._add(cube, base, opl_from_start, d_value, value_d_opl, active)
+        add_event(self._table(cube), base, opl_from_start, d_value, value_d_opl, active)
 
-    @dr.syntax
-    def _add(self, cube, base, opl_from_start, value, slope, active):
-        frequencies, count = self.frequency_array, self.frequency_total
-        f = mi.UInt32(0)
-        live = mi.Bool(active)
-        while dr.hint(live & (f < count), label="phasor put"):
-            ν = dr.gather(mi.Float64, frequencies, f, live)
-            cos, sin = self.turns(ν, opl_from_start)
-            for c in range(len(value)):
-                re, im = value[c] * cos, -value[c] * sin
-                if dr.hint(slope is not None, mode="scalar"):
-                    ω = mi.Float(2 * math.pi * ν)
-                    re -= slope[c] * ω * sin
-                    im -= slope[c] * ω * cos
-                index = base + (f * (2 * len(value)) + 2 * c)
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(re), index, live)
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(im), index + 1, live)
-            f += 1
-
-    @dr.syntax
     def read(self, adjoint, base, opl_from_start, active):
         """``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
@@ -140,24 +171,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         value in it.
         """
         flat, stride, entry = adjoint
-        channels = self.channel_count()
-        A, slope = [mi.Float(0) for _ in range(channels)], [mi.Float(0) for _ in range(channels)]
-        frequencies, count = self.frequency_array, self.frequency_total
-        f = mi.UInt32(0)
-        live = mi.Bool(active)
-        opl = mi.Float64(opl_from_start)
-        while dr.hint(live & (f < count), label="phasor read"):
-            ν = dr.gather(mi.Float64, frequencies, f, live)
-            cos, sin = self.turns(ν, opl)
-            ω = mi.Float(2 * math.pi * ν)
-            for c in range(channels):
-                index = base + f * stride + 2 * c * entry
-                a = dr.gather(mi.Float, flat, index, live)
-                b = dr.gather(mi.Float, flat, index + entry, live)
-                A[c] += a * cos - b * sin
-                slope[c] -= ω * (a * sin + b * cos)
-            f += 1
-        return A, slope
+        return read_event(self._table(flat), base, stride, entry, opl_from_start, active)
 
     def to_string(self):
         return (

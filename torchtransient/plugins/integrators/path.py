@@ -16,6 +16,7 @@ from torchtransient.plugins.integrators.legs import (
     next_leg,
     unconnected,
 )
+from torchtransient.plugins.integrators.media.leg_record import write_leg
 from torchtransient.plugins.integrators.media.medium_vertex import scatter_in_medium
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
 from torchtransient.plugins.integrators.push import push as forward_push
@@ -117,6 +118,7 @@ class TransientPath(TransientIntegrator):
 
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
+            active_next = facts.in_time(active_next, τ)
             bsdf = si.bsdf(ray)
             active_em = active_next & connectable(media, here, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             u_em = sampler.next_2d()
@@ -136,18 +138,15 @@ class TransientPath(TransientIntegrator):
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
                 active_em &= dr.max(dr.abs(intensity(Lr))) > 0
+            τ_em = τ + mi.Float64(facts.length_to_light(at.p, ds) * facts.index_towards(bsdf, si, wo, η))
+            active_em = facts.counted(active_em, τ_em)
             visible, T_em = connect(scene, media, here, ds, u_em, sampler, active_em)
             Lr *= T_em
             active_em &= visible
             if dr.hint(primal, mode="scalar"):
                 Lr = dr.select(active_em, Lr, 0)
                 L += Lr
-                length_em = ds.dist
-                if dr.hint(facts.distant is not None, mode="scalar"):
-                    far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                    length_em = dr.select(far, facts.distant.length(at.p, ds.d), length_em)
-                η_em = facts.index_towards(bsdf, si, wo, η)
-                low, high = lane.put(events, τ + mi.Float64(length_em * η_em), Lr, active_em)
+                low, high = lane.put(events, τ_em, Lr, active_em)
                 before += low
                 after += high
 
@@ -185,6 +184,7 @@ class TransientPath(TransientIntegrator):
                     ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
                     active_em, is_delta, active_next,
                 )
+                write_leg(store, depth, active, place, T_em)
             pi, place = next_leg(scene, media, ray, here, β, sampler, active_next)
             β = carried_on(β, place)
             depth += 1
@@ -199,10 +199,10 @@ class TransientPath(TransientIntegrator):
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
         return reverse_sweep(self, scene, count, store, lane, facts, ray)
 
-    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
+    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first, t_turn=None):
         """Record the paths of one pass and carry tangents along them, see :mod:`.push`."""
         count, store = self.trace(scene, sampler, ray, first_opl, None, facts, record=True)
-        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first)
+        return forward_push(self, scene, count, store, lane, facts, ray, *t_ray, d_first, t_turn)
 
 
 register("integrator", "transient_path", TransientPath)
