@@ -92,3 +92,36 @@ def across_plane(matrix: Any, normal: Any, wi: Any, wo: Any) -> Any:
     out = turn_between(wi, s_out, mi.coordinate_system(wi)[0])
     into = turn_between(-wo, s_in, mi.coordinate_system(-wo)[0])
     return scattering(matrix, out, into)
+
+
+def metal_reflection(cos_theta_i: Any, eta: Any, k: Any) -> Any:
+    """Reflection from the outside of a medium of complex index ``eta - i k`` (spectra, ``k >= 0``).
+
+    The Mueller matrix in the frames perpendicular to the plane of incidence; in unpolarized variants the reflectance.
+    Born and Wolf, 14.2, with the cosine of refraction times the index, ``p = sqrt(n^2 - sin^2)``.
+    """
+    c = cos_theta_i
+    n2_re, n2_im = (eta - k) * (eta + k), -2 * eta * k
+    a, b = n2_re - (1 - c * c), n2_im
+    modulus = dr.sqrt(dr.maximum(a * a + b * b, 1e-36))
+    p_re = sqrt_with_bounded_slope(dr.maximum(0.5 * (modulus + a), 0))
+    p_im = -sqrt_with_bounded_slope(dr.maximum(0.5 * (modulus - a), 0))
+    p2 = p_re * p_re + p_im * p_im
+    u_re, u_im = n2_re * c, n2_im * c
+
+    over_s = _reciprocal(dr.square(c + p_re) + p_im * p_im)
+    s_re, s_im = (c * c - p2) * over_s, -2 * c * p_im * over_s
+    over_p = _reciprocal(dr.square(u_re + p_re) + dr.square(u_im + p_im))
+    r_re, r_im = (u_re * u_re + u_im * u_im - p2) * over_p, 2 * (u_im * p_re - u_re * p_im) * over_p
+
+    power_s, power_p = s_re * s_re + s_im * s_im, r_re * r_re + r_im * r_im
+    mean = 0.5 * (power_s + power_p)
+    if not mi.is_polarized:
+        return mean
+    return two_by_two(mean, 0.5 * (power_s - power_p), r_re * s_re + r_im * s_im, r_im * s_re - r_re * s_im)
+
+
+def _reciprocal(x: Any) -> Any:
+    """One over ``x``, zero where it is zero: a grazing direction on a medium that is not there."""
+    there = x > 1e-36
+    return dr.select(there, dr.rcp(dr.select(there, x, 1.0)), 0.0)
