@@ -8,7 +8,67 @@ from contract import Entry
 from torchtransient import sensing
 from torchtransient.errors import GradientError, ShapeError, UnitError
 
+PS = 1e-12
+ALL = (torch.bfloat16, torch.float32, torch.float64)
+
+
+def impulse(response, **keywords):
+    return lambda: sensing.ImpulseResponse(response(), bin_width_s=20 * PS, **keywords)
+
+
+def tails():
+    return sensing.TailedResponse(50 * PS, [30 * PS, 80 * PS], [0.3, 0.1], learnable=True)
+
+
+def measured():
+    counts = torch.tensor([3.0, 2, 3, 40, 90, 50, 30, 12, 3, 2, 3, 3, 2, 3, 2, 3, 3])
+    return sensing.MeasuredResponse(counts, 13 * PS, learnable=True)
+
+
+def composed():
+    return sensing.ComposedResponse(
+        [sensing.GaussianResponse(30 * PS, learnable=True), sensing.emg_response(20 * PS, 40 * PS)]
+    )
+
+
 ENTRIES = [
+    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True)), dtypes=ALL),
+    Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
+    Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
+    Entry(
+        "ImpulseResponse-composed",
+        impulse(composed, boundary="periodic", method="fft"),
+        conserves=lambda y: y.sum(-3),
+        errors=(
+            (lambda: sensing.ImpulseResponse(tails(), bin_width_s=20.0), UnitError),
+            (lambda: sensing.TailedResponse(50 * PS, [30 * PS], [1.2]), UnitError),
+            (lambda: sensing.MeasuredResponse(torch.ones(4), 1 * PS), UnitError),
+            (lambda: sensing.ComposedResponse([]), ShapeError),
+        ),
+    ),
+    Entry(
+        "LensBlur",
+        lambda: sensing.LensBlur(0.8, "circular", size=3, learnable=True),
+        shape=(2, 1, 3, 4, 5),
+        conserves=lambda y: y.sum((-1, -2)),
+        dtypes=ALL,
+    ),
+    Entry(
+        "SpatialPSF", lambda: sensing.SpatialPSF(torch.arange(9.0).view(3, 3), learnable=True), shape=(2, 1, 3, 4, 5)
+    ),
+    Entry(
+        "PhotonBudget",
+        lambda: sensing.PhotonBudget(
+            sensing.Optics(f_number=2.0),
+            pulse_energy_j=1e-9,
+            wavelength_m=532e-9,
+            repetition_rate_hz=1e7,
+            cycles=1000,
+            ambient_rate_hz=1e6,
+            bin_width_s=20 * PS,
+        ),
+        dtypes=ALL,
+    ),
     Entry(
         "ShotNoise",
         sensing.ShotNoise,

@@ -1,11 +1,36 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.impulse_response import ComposedResponse as ComposedResponse
+from torchtransient.sensing.impulse_response import GaussianResponse as GaussianResponse
+from torchtransient.sensing.impulse_response import ImpulseResponse as ImpulseResponse
+from torchtransient.sensing.impulse_response import MeasuredResponse as MeasuredResponse
+from torchtransient.sensing.impulse_response import Response as Response
+from torchtransient.sensing.impulse_response import TailedResponse as TailedResponse
+from torchtransient.sensing.impulse_response import UniformResponse as UniformResponse
+from torchtransient.sensing.impulse_response import emg_response as emg_response
+from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
+from torchtransient.sensing.photon_budget import Optics as Optics
+from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
+from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.policies import GRAD_POLICIES as GRAD_POLICIES
 from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
+from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.pulse import apply_pulse as apply_pulse
+from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
+from torchtransient.sensing.response_shapes import emg_cdf as emg_cdf
+from torchtransient.sensing.response_shapes import emg_density as emg_density
+from torchtransient.sensing.response_shapes import emg_survival as emg_survival
+from torchtransient.sensing.response_shapes import resample_counts as resample_counts
 from torchtransient.sensing.sensor import RandomSensor as RandomSensor
 from torchtransient.sensing.sensor import Sensor as Sensor
 from torchtransient.sensing.shot_noise import ShotNoise as ShotNoise
 from torchtransient.sensing.shot_noise import poisson as poisson
 from torchtransient.sensing.shot_noise import poisson_log_prob as poisson_log_prob
+from torchtransient.sensing.spatial_psf import LensBlur as LensBlur
+from torchtransient.sensing.spatial_psf import SpatialPSF as SpatialPSF
+from torchtransient.sensing.spatial_psf import blur_image as blur_image
+from torchtransient.sensing.spatial_psf import defocus_psf as defocus_psf
+from torchtransient.sensing.spatial_psf import gaussian_psf as gaussian_psf
+from torchtransient.sensing.time_convolution import convolve_time as convolve_time

@@ -14,7 +14,7 @@ from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.sensors.origin import length_to_sensor_origin
+from torchtransient.plugins.sensors.origin import length_to_sensor_origin, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
@@ -106,8 +106,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not hasattr(film, "transient_bands"):
             raise SceneError(
-                f"transient integrators need a film of type transient_hdr_film or phasor_hdr_film, the sensor has "
-                f"{film.class_name()}; change the film's type in the scene."
+                "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
+                f"sensor has {film.class_name()}; change the film's type in the scene."
             )
         if film.exhaustive_scan:
             raise SceneError(
@@ -130,16 +130,22 @@ class TransientIntegrator(mi.CppADIntegrator):
         clock. The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes
         is, so that no later scene can be taken for this one because it got the same addresses.
         """
-        shapes = scene.shapes()
-        key = (scene.ptr, *(shape.ptr for shape in shapes))
-        if self._distant is None or self._distant[0] != key:
-            self._distant = (key, distant_reference(scene), shapes[:1])
-        facts = scene_facts(scene, self._distant[1])
+        facts = scene_facts(scene, self.reference(scene))
+        if sensor is not None:
+            facts.window = sensor.film().arrivals()
         if self.walks_through_media:
             facts.media = media_facts(scene, sensor)
         if facts.media is not None:
             facts.media.hide_emitters = bool(self.hide_emitters)
         return facts
+
+    def reference(self, scene):
+        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
+        shapes = scene.shapes()
+        key = (scene.ptr, *(shape.ptr for shape in shapes))
+        if self._distant is None or self._distant[0] != key:
+            self._distant = (key, distant_reference(scene), shapes[:1])
+        return self._distant[1]
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel.
@@ -165,8 +171,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             p.seed = seed if len(result) == 1 else int(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0][0])
         return result, max(p.total for p in result)
 
-    def start(self, sensor, film, job: Pass):
-        """Seeded sampler, primary rays (attached to the sensor), ray weight and pixel indices of one pass."""
+    def start(self, scene, sensor, film, job: Pass):
+        """Seeded sampler, primary rays (attached to the sensor), ray weight, pixel indices and sensors of one pass."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -194,11 +200,12 @@ class TransientIntegrator(mi.CppADIntegrator):
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
-        return sampler, ray, ray_weight, scale, row, column
+        seen = views(sensor, position, lambda: self.reference(scene))
+        return sampler, ray, ray_weight, scale, row, column, seen
 
-    def channel_match(self, sensor, film, ray, ray_weight, scale):
+    def channel_match(self, seen, film, ray, ray_weight, scale):
         """The map from samples of the primary rays to the film's channels, detached."""
-        turn = sensor_turn(sensor, dr.detach(ray)) if mi.is_polarized else None
+        turn = sensor_turn(seen, dr.detach(ray)) if mi.is_polarized else None
         return ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves, turn)
 
     def lane_bases(self, film, job, row, column):
@@ -234,23 +241,30 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _render_pass(self, scene, sensor, film, job):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = self.channel_match(sensor, film, ray, ray_weight, scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
         lane = film.lane(job, base, match, self.max_depth)
-        first = self._first_opl(sensor, film, ray)
+        first = self._first_opl(seen, film, ray)
         facts = self.facts(scene, sensor)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
-        for c, value in enumerate(match.to_channels(L)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        self._add_steady(film, match.to_channels(L), pixel)
         if film.outside is not None:
             for side, value in enumerate((before, after)):
                 dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
         lane.finish()
 
-    def _first_opl(self, sensor, film, ray):
+    @staticmethod
+    def _add_steady(film, channels, pixel):
+        """Add to the steady image, unless the film makes it of its array."""
+        if film.keeps_steady:
+            for c, value in enumerate(channels):
+                index = pixel * film.channel_count() + c
+                dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index)
+
+    def _first_opl(self, seen, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
-        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(sensor, ray))
+        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(seen, ray))
         return mi.Float64(length) - film.start_opl
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -280,8 +294,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                     dr.eval()
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = self.channel_match(sensor, film, ray, ray_weight, scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -293,15 +307,15 @@ class TransientIntegrator(mi.CppADIntegrator):
             base = row * strides[0] + column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
         lane = film.adjoint_lane(transient, base, steady, match)
-        first = self._first_opl(sensor, film, ray)
+        first = self._first_opl(seen, film, ray)
         a_o, a_d, a_first, a_turn = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
             with dr.resume_grad():
                 objective = dr.dot(a_o, ray.o) + dr.dot(a_d, ray.d)
                 if not self.camera_unwarp:
-                    objective += a_first * length_to_sensor_origin(sensor, ray)
+                    objective += a_first * length_to_sensor_origin(seen, ray)
                 if mi.is_polarized:
-                    objective += a_turn * sensor_turn(sensor, ray).angle()
+                    objective += a_turn * sensor_turn(seen, ray).angle()
                 dr.backward_from(objective)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -325,25 +339,24 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _forward_pass(self, scene, sensor, film, job, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = self.channel_match(sensor, film, ray, ray_weight, scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
         lane = film.lane(job, base, match, self.max_depth, tangents=True)
-        first = self._first_opl(sensor, film, ray)
+        first = self._first_opl(seen, film, ray)
         t_ray, d_first, t_turn = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0), None
         if facts.sensor_moves:
             with dr.resume_grad():
-                length = length_to_sensor_origin(sensor, ray)
+                length = length_to_sensor_origin(seen, ray)
                 attached = [ray.o, ray.d, length]
                 if mi.is_polarized:
-                    attached.append(sensor_turn(sensor, ray).angle())
+                    attached.append(sensor_turn(seen, ray).angle())
                 t_o, t_d, t_first, *t_angle = tangents(attached)
                 t_turn = t_angle[0] if mi.is_polarized else None
                 t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
                 d_first = mi.Float(0) if self.camera_unwarp else t_first
         dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first, t_turn)
-        for c, value in enumerate(match.to_channels(dL)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        self._add_steady(film, match.to_channels(dL), pixel)
         lane.finish()
 
     @staticmethod

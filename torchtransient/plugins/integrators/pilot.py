@@ -148,11 +148,11 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[_Pi
     spp = sampler.sample_count()
     with dr.suspend_grad():
         job = Pass(band=0, first_row=0, rows=size[1], spp=spp, total=spp, seed=seed)
-        sampler, ray, ray_weight, scale, _, _ = integrator.start(sensor, film, job)
+        sampler, ray, ray_weight, scale, _, _, seen = integrator.start(scene, sensor, film, job)
         ray = dr.detach(ray)
         match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale / (size[0] * size[1]), film.curves)
         lane = _PilotLane(match, film.curves is not None, size[0] * size[1] * spp, slots, spp)
-        first = integrator._first_opl(sensor, film, ray)
+        first = integrator._first_opl(seen, film, ray)
         integrator.trace(scene, sampler, ray, first, lane, integrator.facts(scene, sensor))
         most = dr.max(lane.used)
         dr.eval(most, lane.opl, lane.energy, lane.depth)
