@@ -306,3 +306,27 @@ def test_command(tmp_path):
     assert (found["variant"], found["film"], found["pilot"]) == ("llvm_ad_mono_polarized", "steady", None)
     result = CliRunner().invoke(main, ["plan", str(file), "--outputs", "video"])
     assert result.exit_code == 2
+
+
+# -------------------------------------------------------------------------------------------------------- not slower
+
+
+def operations(renderer) -> list[int]:
+    """Number of operations of every kernel that a render launches."""
+    import drjit as dr
+
+    with torch.no_grad(), active_variant(renderer.scene.variant), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        renderer(seed=0, spp=4)
+        return [entry["operation_count"] for entry in dr.kernel_history([dr.KernelType.JIT])]
+
+
+def test_a_planned_render_runs_the_plain_integrator_s_kernels():
+    """Nothing is added to a scene without effects, not even by the integrator for media. What is there is added."""
+    scene = tt.load(tt.scenes.cornell_box(8), variant="llvm_ad_rgb")
+    settings = {"max_depth": 7, "time_axis": "scene", "pilot": False}
+    plain = operations(tt.TransientRenderer(scene, max_depth=7))
+    assert len(plain) >= 1
+    assert operations(tt.plan(scene, **settings).renderer()) == plain
+    assert operations(tt.plan(scene, integrator="transient_prbvolpath", **settings).renderer()) == plain
+    assert operations(tt.plan(scene, variant="llvm_ad_spectral", **settings).renderer()) > plain
