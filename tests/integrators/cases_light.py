@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-from gradient_cases import Case, camera, film, move, room
+from gradient_cases import Case, camera, film, move, room, set_color
 
 BANDS = {
     "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},
@@ -54,6 +54,21 @@ def pulsed_room(**properties):
     sensor["film"] = {**film(filter="box"), **properties}
     return room(sensor=sensor)
 
+
+def gated_room(**properties):
+    """The room seen through three gates with slopes."""
+    sensor = camera()
+    sensor["film"] = {**GATED_FILM, **properties}
+    return room(sensor=sensor)
+
+
+GATED_FILM = {
+    "type": "gated_hdr_film",
+    "gates": "gaussian 8.0 0.15; tabulated 7.9:0 8.2:1 8.8:0; gaussian 8.9 0.3",
+    "width": 4,
+    "height": 4,
+    "rfilter": {"type": "box"},
+}
 
 CASES = [
     Case(
@@ -105,6 +120,36 @@ CASES = [
         lambda: pulsed_room(
             pulse="tabulated", pulse_opl="-0.2, 0, 0.7", pulse_values="0 1 0", irf="gaussian", irf_fwhm_opl=0.3
         ),
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "gated_wall",
+        "shape to_world, time gates",
+        gated_room,
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        5e-4,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "gated_side_albedo",
+        "diffuse albedo, time gates",
+        lambda: gated_room(pulse="rectangular", pulse_width_opl=0.2),
+        set_color("side.bsdf.reflectance.value"),
+        0.8,
+        0.02,
+        spp=2048,
+        fd_spp=2048,
+    ),
+    Case(
+        "wall_without_steady_image",
+        "shape to_world",
+        lambda: pulsed_room(steady=False, temporal_filter="tent", temporal_bins=140),
         move("wall.to_world", (0, 0, 1)),
         0.0,
         2e-3,

@@ -17,6 +17,8 @@ from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.pulse import apply_pulse as apply_pulse
+from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
 from torchtransient.sensing.response_shapes import emg_cdf as emg_cdf
 from torchtransient.sensing.response_shapes import emg_density as emg_density
 from torchtransient.sensing.response_shapes import emg_survival as emg_survival

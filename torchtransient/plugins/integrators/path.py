@@ -117,6 +117,7 @@ class TransientPath(TransientIntegrator):
 
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
+            active_next = facts.in_time(active_next, τ)
             bsdf = si.bsdf(ray)
             active_em = active_next & connectable(media, here, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             u_em = sampler.next_2d()
@@ -136,18 +137,15 @@ class TransientPath(TransientIntegrator):
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
                 active_em &= dr.max(dr.abs(intensity(Lr))) > 0
+            τ_em = τ + mi.Float64(facts.length_to_light(at.p, ds) * facts.index_towards(bsdf, si, wo, η))
+            active_em = facts.counted(active_em, τ_em)
             visible, T_em = connect(scene, media, here, ds, u_em, sampler, active_em)
             Lr *= T_em
             active_em &= visible
             if dr.hint(primal, mode="scalar"):
                 Lr = dr.select(active_em, Lr, 0)
                 L += Lr
-                length_em = ds.dist
-                if dr.hint(facts.distant is not None, mode="scalar"):
-                    far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-                    length_em = dr.select(far, facts.distant.length(at.p, ds.d), length_em)
-                η_em = facts.index_towards(bsdf, si, wo, η)
-                low, high = lane.put(events, τ + mi.Float64(length_em * η_em), Lr, active_em)
+                low, high = lane.put(events, τ_em, Lr, active_em)
                 before += low
                 after += high
 

@@ -18,7 +18,8 @@ class SceneFacts:
     ``distant``: reference sphere of
     infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
     BSDFs, None when there are none. ``media``: the participating media, None when there are none (or the integrator
-    refuses them). The remaining ones describe which gradients are asked for: ``geometry`` (path
+    refuses them). ``window``: which arrivals the film counts, None where its steady image counts them all. The
+    remaining ones describe which gradients are asked for: ``geometry`` (path
     lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
     spherical ones), ``sensor_moves``,
     ``index_moves``.
@@ -33,6 +34,7 @@ class SceneFacts:
         self.distant = distant
         self.refraction = refraction
         self.media = None
+        self.window = None
         self.geometry = False
         self.light_moves = False
         self.emitter_shape_moves = False
@@ -59,6 +61,21 @@ class SceneFacts:
         if self.refraction is None:
             return η
         return η * self.refraction.relative_index(bsdf, si, wo)
+
+    def length_to_light(self, p, ds):
+        """Length of the connection from ``p`` to a sampled point or direction of a light."""
+        if self.distant is None:
+            return ds.dist
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        return dr.select(far, self.distant.length(p, ds.d), ds.dist)
+
+    def in_time(self, active, τ):
+        """Which paths of length ``τ`` can still have an event that the film counts."""
+        return active if self.window is None else active & ~self.window.over(τ)
+
+    def counted(self, active, τ):
+        """Which arrivals at ``τ`` the film counts."""
+        return active if self.window is None else active & self.window.counts(τ)
 
     @property
     def ray_adjoint(self) -> bool:
