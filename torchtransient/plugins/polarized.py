@@ -79,9 +79,14 @@ def matched(A, light):
 
 def traced(β, beyond):
     """The number that events contribute: ``trace(β S)`` over the matrices of :func:`matched`, summed over colours."""
+    return dr.sum(traced_colours(β, beyond))
+
+
+def traced_colours(β, beyond):
+    """``traced`` for each colour."""
     if not mi.is_polarized:
-        return dr.sum(β * beyond)
-    return dr.sum(sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4)))
+        return β * beyond
+    return sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4))
 
 
 def traced_attached(β, A_e, Le, A_n, f, W, S):

@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.integrators.media.leg_record import allocate_legs, read_leg
+
 LIT, DELTA, CONTINUES = 1, 2, 4
 
 
@@ -39,6 +41,7 @@ def allocate(depth: int, facts) -> dict:
         store["u_lobe"] = dr.alloc_local(mi.Float, size)
     if facts.instances:
         store["instance"] = dr.alloc_local(mi.UInt32, size)
+    allocate_legs(store, size, facts)
     return store
 
 
@@ -68,7 +71,7 @@ def write_vertex(store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_
 
 @dataclass
 class Vertex:
-    """One vertex read back from the record."""
+    """One vertex read back from the record. ``medium`` is None in scenes without media."""
 
     ray: Any
     pi: Any
@@ -83,6 +86,8 @@ class Vertex:
     lit: Any
     is_delta: Any
     goes_on: Any
+    scatter: Any
+    medium: Any
 
 
 def read_vertex(store, k, active, time, wavelengths) -> Vertex:
@@ -101,6 +106,7 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
     if "instance" in store:
         pi.instance = dr.reinterpret_array(mi.ShapePtr, store["instance"].read(k, active))
     flags = store["flags"].read(k, active)
+    medium = read_leg(store, k, active)
     return Vertex(
         ray=ray,
         pi=pi,
@@ -115,4 +121,6 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
         lit=active & ((flags & LIT) != 0),
         is_delta=active & ((flags & DELTA) != 0),
         goes_on=active & ((flags & CONTINUES) != 0),
+        scatter=mi.Bool(False) if medium is None else active & (medium.t >= 0),
+        medium=medium,
     )

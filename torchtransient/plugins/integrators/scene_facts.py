@@ -105,6 +105,8 @@ class SceneFacts:
         facts.sphere_lights = facts.geometry and spheres
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
+        if facts.media is not None:
+            facts.media = facts.media.with_gradients(facts.geometry)
         facts.lobe_probability = lobe_probability_table(self.bsdfs) if facts.delta else None
         return facts
 
