@@ -16,6 +16,7 @@ from torchtransient.plugins.integrators.legs import (
     next_leg,
     unconnected,
 )
+from torchtransient.plugins.integrators.media.leg_record import write_leg
 from torchtransient.plugins.integrators.media.medium_vertex import scatter_in_medium
 from torchtransient.plugins.integrators.path_record import allocate, write_vertex
 from torchtransient.plugins.integrators.push import push as forward_push
@@ -186,6 +187,7 @@ class TransientPath(TransientIntegrator):
                     ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
                     active_em, is_delta, active_next, u_late,
                 )
+                write_leg(store, depth, active, place, T_em)
             τ = late.after(τ)
             pi, place = next_leg(scene, media, ray, here, β, sampler, active_next)
             β = carried_on(β, place)

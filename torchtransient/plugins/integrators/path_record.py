@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.integrators.media.leg_record import allocate_legs, read_leg
+
 LIT, DELTA, CONTINUES = 1, 2, 4
 
 
@@ -43,6 +45,7 @@ def allocate(depth: int, facts) -> dict:
             store["wavelengths"] = dr.alloc_local(mi.UnpolarizedSpectrum, size)
     if facts.instances:
         store["instance"] = dr.alloc_local(mi.UInt32, size)
+    allocate_legs(store, size, facts)
     return store
 
 
@@ -78,7 +81,7 @@ def write_vertex(
 
 @dataclass
 class Vertex:
-    """One vertex read back from the record."""
+    """One vertex read back from the record. ``medium`` is None in scenes without media."""
 
     ray: Any
     pi: Any
@@ -93,6 +96,8 @@ class Vertex:
     lit: Any
     is_delta: Any
     goes_on: Any
+    scatter: Any
+    medium: Any
     u_late: Any = None
 
 
@@ -114,6 +119,7 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
     if "instance" in store:
         pi.instance = dr.reinterpret_array(mi.ShapePtr, store["instance"].read(k, active))
     flags = store["flags"].read(k, active)
+    medium = read_leg(store, k, active)
     return Vertex(
         ray=ray,
         pi=pi,
@@ -128,5 +134,7 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
         lit=active & ((flags & LIT) != 0),
         is_delta=active & ((flags & DELTA) != 0),
         goes_on=active & ((flags & CONTINUES) != 0),
+        scatter=mi.Bool(False) if medium is None else active & (medium.t >= 0),
+        medium=medium,
         u_late=store["u_late"].read(k, active) if "u_late" in store else None,
     )

@@ -10,6 +10,17 @@ import mitsuba as mi
 from torchtransient.plugins.bsdfs.delay_table import Answer, delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sensors.origin import shapes_of_sensors
+
+# What moves the rays of a sensor.
+SENSOR_KEYS = (
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+)
 
 
 class SceneFacts:
@@ -101,7 +112,9 @@ class SceneFacts:
         for emitter in scene.emitters():
             if emitter.get_shape() is None:
                 light |= _attached(emitter, ("position", "to_world"))
-        sensor_moves = _attached(sensor, ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"))
+        sensor_moves = _attached(sensor, SENSOR_KEYS) or any(
+            shape is not None and shape.parameters_grad_enabled() for shape in shapes_of_sensors(sensor)
+        )
         for bsdf in self.bsdfs:
             index |= _attached(bsdf, ("eta",))
         if self.refraction is not None:
@@ -115,6 +128,8 @@ class SceneFacts:
         facts.sphere_lights = facts.geometry and spheres
         facts.sensor_moves = sensor_moves
         facts.index_moves = index
+        if facts.media is not None:
+            facts.media = facts.media.with_gradients(facts.geometry)
         facts.lobe_probability = lobe_probability_table(self.bsdfs) if facts.delta else None
         return facts
 
