@@ -144,10 +144,14 @@ class Turn:
 def turn_between(forward, current, target):
     """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
 
-    ``forward`` is the direction in which light travels, ``current`` a unit vector across it. No rotation where
+    ``forward`` is the direction in which light travels, ``current`` a vector across it of any length. No rotation where
     ``target`` is parallel to the direction.
     """
-    c, s = dr.dot(current, target), dr.dot(forward, dr.cross(current, target))
+    return turn_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
+
+
+def turn_along(c, s):
+    """The rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
     n = c * c + s * s
     there = n > 0
     scale = dr.rcp(dr.select(there, n, 1))

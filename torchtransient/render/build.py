@@ -43,6 +43,12 @@ _PEER_FREQUENCIES = (
     "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# In polarized variants these stand in for Mitsuba's always: derivatives of theirs are NaN where frames coincide, their
+# rough dielectric depolarises and their wave plate jumps at oblique incidence.
+POLARIZED_PLUGINS = {
+    **DIFFERENTIABLE_PLUGINS,
+    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+}
 
 
 @dataclass(frozen=True)
@@ -326,9 +332,13 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
 
 def _substitute_plugins(state: Any, options: BuildOptions) -> None:
     """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
+    import mitsuba as mi
+
     for node in state.nodes:
         plugin = node.props.plugin_name()
-        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
+        if mi.is_polarized and plugin in POLARIZED_PLUGINS:
+            node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
+        elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"
