@@ -206,6 +206,7 @@ def test_a_dark_scene_says_so():
     plan = tt.plan(scene)
     assert plan.time_axis == tt.TimeAxis(7.0, 0.05, 64)
     assert any("no light" in line for line in plan.reasons)
+    assert json.loads(json.dumps(plan.to_dict(), allow_nan=False))["pilot"]["relative_error"] is None
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4}
     with pytest.raises(SceneError, match="no light"):
         tt.plan(scene)

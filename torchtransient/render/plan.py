@@ -87,7 +87,9 @@ class Plan:
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
         plain["gates"] = None if self.gates is None else [asdict(gate) for gate in self.gates]
-        plain["pilot"] = None if self.pilot is None else asdict(self.pilot)
+        found = {} if self.pilot is None else asdict(self.pilot)
+        # A dark scene has no relative error, and JSON no number for that.
+        plain["pilot"] = {key: None if value != value else value for key, value in found.items()} or None
         return plain
 
     def __str__(self) -> str:
