@@ -101,8 +101,8 @@ CASES = [
         set_color("slab.bsdf.eta"),
         1.5,
         4e-3,
-        spp=8192,
-        fd_spp=8192,
+        spp=16384,
+        fd_spp=16384,
     ),
     polar("polar_metal_alpha", ROUGHNESS, metal_room, set_color("wall.bsdf.alpha.value"), 0.3, 0.005),
     polar(

@@ -715,10 +715,10 @@ def weights(scene_film):
     """Loss weights, of the shape that lies behind a pixel.
 
     Of a histogram the sine of three times the optical path length at each bin's centre, in polarized variants with
-    factors that differ between the Stokes components and let the polarization count; of phasors a pattern in which no
-    two real or imaginary parts weigh the same.
+    factors that differ between the Stokes components and let the polarization count; of phasors and gates a
+    pattern in which no two entries weigh the same.
     """
-    if scene_film.measures == "phasor":
+    if scene_film.measures != "transient":
         shape = scene_film.cube_shape()[2:]
         number = np.arange(int(np.prod(shape)))
         return (np.cos(1.7 * number + 0.4) / (1 + 0.3 * number)).reshape(shape)

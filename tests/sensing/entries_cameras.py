@@ -2,6 +2,42 @@
 
 from __future__ import annotations
 
+import torch
 from contract import Entry
 
-ENTRIES: list[Entry] = []
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing import electronics, itof, itof_codes
+
+AXIS = TimeAxis(0.5, 0.2, 12)
+
+
+def itof_correlation():
+    return itof.ItofCorrelation(itof_codes.square_code(4), (20e6, 60e6), AXIS, contrast=0.8)
+
+
+def pixel_electronics(grad="expected"):
+    return electronics.PixelElectronics(
+        full_well_e=1e4, read_noise_e=3.0, ktc_noise_e=2.0, excess_noise=1.2, gain_e_per_dn=0.5, bits=14,
+        black_level_dn=100.0, offset_map_e=torch.tensor(0.25), gain_map=torch.tensor(1.1), grad=grad,
+    )  # fmt: skip
+
+
+ENTRIES: list[Entry] = [
+    Entry(
+        "ItofCorrelation",
+        itof_correlation,
+        conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
+        errors=(
+            (lambda: itof_correlation()(torch.ones(1, 7, 1, 1)), ShapeError),
+            (lambda: itof_correlation()(torch.ones(3)), ShapeError),
+            (lambda: itof.ItofCorrelation(itof_codes.sine_code(4), 20.0, AXIS), UnitError),
+        ),
+    ),
+    Entry(
+        "PixelElectronics",
+        pixel_electronics,
+        random=True,
+        errors=((lambda: electronics.PixelElectronics(read_noise_e=-1.0), UnitError),),
+    ),
+]

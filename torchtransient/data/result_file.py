@@ -2,7 +2,8 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. Polarized variants have
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. A gated film's images are
+a `transient` (..., C, G, H, W) with `gates` (the text of scene files) instead of an axis. Polarized variants have
 the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
 metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
 the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.gates import Gate, gates_from_text, gates_to_text
 from torchtransient.render.output import RenderOutput
 
 FORMAT = "torchtransient result 1"
@@ -39,7 +41,7 @@ _PART_BYTES = 2**26
 class Result:
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    Either `transient` and `axis`, or `phasor` and `frequencies`; the others are None.
+    Either `transient` with `axis` or `gates`, or `phasor` and `frequencies`; the others are None.
     """
 
     transient: torch.Tensor | None
@@ -49,6 +51,7 @@ class Result:
     phasor: torch.Tensor | None = None
     frequencies: FrequencyAxis | None = None
     channels: tuple[str, ...] = ()
+    gates: tuple[Gate, ...] | None = None
 
 
 def check_target(path: str | Path) -> Path:
@@ -109,6 +112,8 @@ def _measured(output: RenderOutput) -> tuple[dict[str, NDArray[Any]], dict[str, 
             "bin_width_opl": axis.bin_width_opl,
             "num_bins": axis.num_bins,
         }
+    if output.transient is not None and output.gates is not None:
+        return {"transient": output.transient.detach().cpu().numpy()}, {"gates": gates_to_text(output.gates)}
     if output.phasor is not None and output.frequencies is not None:
         phasor = output.phasor.detach().resolve_conj().cpu().numpy()
         arrays = {"phasor": phasor, "frequencies_per_metre": output.frequencies.per_metre.numpy()}
@@ -138,14 +143,14 @@ def read_result(path: str | Path) -> Result:
         raise StorageError(
             f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
         ) from error
-    name, cube, count = (
-        ("transient", result.transient, result.axis.num_bins)
-        if result.axis is not None
-        else ("phasor", result.phasor, 0 if result.frequencies is None else result.frequencies.num_frequencies)
-    )
+    name, letter, cube = "transient", "T", result.transient
+    count = 0 if result.axis is None else result.axis.num_bins
+    if result.frequencies is not None:
+        name, letter, cube, count = "phasor", "F", result.phasor, result.frequencies.num_frequencies
+    elif result.gates is not None:
+        letter, count = "G", len(result.gates)
     if cube is None or cube.ndim < 4 or cube.shape[-3] != count:
         shape = None if cube is None else tuple(cube.shape)
-        letter = "T" if name == "transient" else "F"
         raise StorageError(
             f"result file: '{source}' holds a {name} of shape {shape}; expected "
             f"(..., C, {letter}, H, W) with {letter} = {count}."
@@ -155,9 +160,12 @@ def read_result(path: str | Path) -> Result:
 
 def _result(values: Mapping[str, Any]) -> Result:
     metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
-    start = float(values["start_opl"])
     # Files of earlier versions have no names of channels.
     channels = tuple(json.loads(str(values.get("channels", "[]"))))
+    if "gates" in values:
+        transient, gates = torch.from_numpy(values["transient"]), gates_from_text(str(values["gates"]))
+        return Result(transient, steady, None, metadata, channels=channels, gates=gates)
+    start = float(values["start_opl"])
     if "phasor" in values:
         frequencies = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), start)
         phasor = torch.from_numpy(values["phasor"])

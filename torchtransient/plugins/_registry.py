@@ -63,6 +63,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.gated", (("film", "gated_hdr_film"),)),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
     PluginModule(
@@ -71,7 +72,13 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     ),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
+    PluginModule(
+        "torchtransient.plugins.bsdfs.thin_elements",
+        (("bsdf", "diff_polarizer"), ("bsdf", "diff_retarder"), ("bsdf", "diff_circular")),
+    ),
 )
 
 

@@ -79,9 +79,14 @@ def matched(A, light):
 
 def traced(β, beyond):
     """The number that events contribute: ``trace(β S)`` over the matrices of :func:`matched`, summed over colours."""
+    return dr.sum(traced_colours(β, beyond))
+
+
+def traced_colours(β, beyond):
+    """``traced`` for each colour."""
     if not mi.is_polarized:
-        return dr.sum(β * beyond)
-    return dr.sum(sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4)))
+        return β * beyond
+    return sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4))
 
 
 def traced_attached(β, A_e, Le, A_n, f, W, S):
@@ -139,10 +144,14 @@ class Turn:
 def turn_between(forward, current, target):
     """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
 
-    ``forward`` is the direction in which light travels, ``current`` a unit vector across it. No rotation where
+    ``forward`` is the direction in which light travels, ``current`` a vector across it of any length. No rotation where
     ``target`` is parallel to the direction.
     """
-    c, s = dr.dot(current, target), dr.dot(forward, dr.cross(current, target))
+    return turn_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
+
+
+def turn_along(c, s):
+    """The rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
     n = c * c + s * s
     there = n > 0
     scale = dr.rcp(dr.select(there, n, 1))

@@ -16,10 +16,12 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.gates import Gate, gates_to_text
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
-from torchtransient.render.pulse_properties import write_pulse
+from torchtransient.render.pulse_properties import FILMS as PULSED_FILMS
+from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
 _COUNTERPARTS = {
@@ -35,12 +37,18 @@ _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
 )  # fmt: skip
-_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film")
+_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film", "gated_hdr_film")
 # Properties of a phasor film that say which frequencies it keeps; explicit frequencies replace them.
 _PEER_FREQUENCIES = (
     "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# In polarized variants these stand in for Mitsuba's always: derivatives of theirs are NaN where frames coincide, their
+# rough dielectric depolarises and their wave plate jumps at oblique incidence.
+POLARIZED_PLUGINS = {
+    **DIFFERENTIABLE_PLUGINS,
+    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+}
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class BuildOptions:
     shape of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
     ``integrator``: plugin name of a transient integrator that replaces the scene's, with the parameters that both have;
     None to keep it.
+    ``gates``: every film becomes a gated film with these. ``steady``: False takes the steady image from the histograms.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -69,6 +78,8 @@ class BuildOptions:
     frequencies: FrequencyAxis | None = None
     pulse: Pulse | None = None
     irf: Pulse | None = None
+    gates: tuple[Gate, ...] | None = None
+    steady: bool = True
     integrator: str | None = None
 
 
@@ -206,7 +217,7 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
 def _override_films(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    if options.time_axis is None and options.frequencies is None and not options.transient:
+    if options.time_axis is None and options.frequencies is None and options.gates is None and not options.transient:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
@@ -216,14 +227,22 @@ def _override_films(state: Any, options: BuildOptions) -> None:
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
-            write_pulse(state.nodes[film].props, "pulse", options.pulse)
-            write_pulse(state.nodes[film].props, "irf", options.irf)
+            props = state.nodes[film].props
+            for prefix in PREFIXES:
+                write_pulse(props, prefix, getattr(options, prefix))
+            if not options.steady:
+                if props.plugin_name() != "transient_hdr_film":
+                    raise SceneError(
+                        f"steady=False spares a histogram the light outside of its window; the film is a "
+                        f"{props.plugin_name()!r}. Leave it out."
+                    )
+                props["steady"] = False
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     props = state.nodes[index].props
     plugin = props.plugin_name()
-    if options.time_axis is None and options.frequencies is None:
+    if options.time_axis is None and options.frequencies is None and options.gates is None:
         if options.transient and plugin in _STEADY_FILMS:
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., "
@@ -231,18 +250,24 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
                 "frequencies=tt.FrequencyAxis(...)), or make the film a transient_hdr_film or a phasor_hdr_film."
             )
         return
-    wanted = "transient_hdr_film" if options.time_axis is not None else "phasor_hdr_film"
+    wanted = "gated_hdr_film" if options.gates is not None else "phasor_hdr_film"
+    wanted = "transient_hdr_film" if options.time_axis is not None else wanted
     if plugin in _STEADY_FILMS and not options.transient:
         return
     if plugin in (*_STEADY_FILMS, *_TIME_FILMS) and plugin != wanted:
-        _become(state, index, wanted, keep=_FILM_PROPERTIES)
+        if wanted not in PULSED_FILMS and any(prefix in props for prefix in PREFIXES):
+            raise SceneError(f"the film {plugin!r} has a pulse or an irf, which a {wanted} would lose; take it out.")
+        _become(state, index, wanted, keep=_FILM_PROPERTIES + PROPERTIES)
         props = state.nodes[index].props
     if options.time_axis is not None:
         start, width, bins = options.time_axis
         props["start_opl"], props["bin_width_opl"], props["temporal_bins"] = float(start), float(width), int(bins)
+        return
+    if props.plugin_name() != wanted:
+        raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
+    if options.gates is not None:
+        props["gates"] = gates_to_text(options.gates)
     elif options.frequencies is not None:
-        if props.plugin_name() != wanted:
-            raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
         for name in _PEER_FREQUENCIES:
             if name in props:
                 del props[name]
@@ -307,9 +332,13 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
 
 def _substitute_plugins(state: Any, options: BuildOptions) -> None:
     """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
+    import mitsuba as mi
+
     for node in state.nodes:
         plugin = node.props.plugin_name()
-        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
+        if mi.is_polarized and plugin in POLARIZED_PLUGINS:
+            node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
+        elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.gates import Gate
 from torchtransient.render.variant import stokes_components
 
 
@@ -35,12 +36,14 @@ class RenderStats:
 class RenderOutput:
     """A rendered scene.
 
-    ``steady``: float32 (C, H, W). Beside it, what the film measures, the other one None:
+    ``steady``: float32 (C, H, W). Beside it, what the film measures:
 
     - ``transient``: float32 (C, T, H, W), radiance integrated over each bin of ``axis``, so that its sum over T is
       ``steady`` as far as the axis reaches;
     - ``phasor``: complex64 (C, F, H, W), radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of
-      ``frequencies``, so that its value at zero frequency is ``steady``.
+      ``frequencies``, so that its value at zero frequency is ``steady``;
+    - of a gated film, ``transient``: float32 (C, G, H, W), the light as each of ``gates`` sees it, and ``axis`` None;
+      ``steady`` is the sum over the gates then.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
     variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
@@ -56,6 +59,7 @@ class RenderOutput:
     stats: RenderStats
     frequencies: FrequencyAxis | None = None
     channels: tuple[str, ...] = ()
+    gates: tuple[Gate, ...] | None = None
 
     @property
     def polarized(self) -> bool:

@@ -8,7 +8,10 @@ from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
 
 _NAMES = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
-FILMS = ("transient_hdr_film",)
+FILMS = ("transient_hdr_film", "gated_hdr_film")
+PREFIXES = ("pulse", "irf")
+# Every property that a pulse can have in a film.
+PROPERTIES = tuple(prefix + suffix for prefix in PREFIXES for suffix in ("", *(f"_{name}" for name in _NAMES)))
 
 
 def checked_pulse(name: str, value: Any) -> Pulse | None:

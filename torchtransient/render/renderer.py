@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +12,15 @@ from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
+from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
+    Values,
     as_float,
     checked_grad_seed,
+    film_choice,
     fit_shape,
     mangle,
     mix_seed,
@@ -44,25 +47,6 @@ from torchtransient.render.variant import active_variant, device_type, stokes_co
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
-class _Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys."""
-
-    def __init__(self, module: nn.Module, names: Mapping[str, str]):
-        self._module, self._names = module, names
-
-    def __getitem__(self, key: str) -> nn.Parameter:
-        return getattr(self._module, self._names[key])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
-
-
 class TransientRenderer(nn.Module):
     """A scene as a differentiable layer.
 
@@ -76,13 +60,17 @@ class TransientRenderer(nn.Module):
 
     ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
-    place of ``out.transient``. At most one of the two. ``max_depth``: replaces the integrator's. ``spp``,
+    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films. At most one of the
+    three. ``max_depth``: replaces the integrator's. ``spp``,
     ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
     soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
     a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
     are smooth in time and take no filter.
+
+    ``steady``: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
+    is the sum over the bins.
 
     ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
     instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
@@ -117,14 +105,17 @@ class TransientRenderer(nn.Module):
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
         pulse: Pulse | None = None,
         irf: Pulse | None = None,
+        gates: Sequence[Gate] | None = None,
+        steady: bool = True,
     ):
         super().__init__()
         if isinstance(effects, Plan):
             scene = load(scene, variant=effects.variant)
-            time_axis, frequencies = effects.axes(time_axis, frequencies)
+            time_axis, frequencies, gates, temporal_filter = effects.film_settings(
+                time_axis, frequencies, gates, temporal_filter
+            )
             max_depth = effects.max_depth if max_depth is None else max_depth
             pulse, irf = pulse or effects.pulse, irf or effects.irf
-            temporal_filter = effects.filter_unless(temporal_filter)
         elif effects != "auto":
             raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
@@ -140,9 +131,10 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        changes = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
-        changes["integrator"] = effects.integrator if isinstance(effects, Plan) else None
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler, changes)
+        changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        changes |= film_choice(time_axis, frequencies, gates)
+        changes |= {"steady": bool(steady), "integrator": effects.integrator if isinstance(effects, Plan) else None}
+        self._options = self._build_options(max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -153,24 +145,10 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(
-        self,
-        time_axis: TimeAxis | None,
-        frequencies: Any,
-        max_depth: int | None,
-        sampler: str | None,
-        changes: dict[str, Any],
-    ) -> BuildOptions:
-        if time_axis is not None and not isinstance(time_axis, TimeAxis):
-            raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
+    def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
-        if time_axis is not None and frequencies is not None:
-            raise SceneError("time_axis and frequencies: a film is a histogram or a phasor film, give one of them.")
-        if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-            frequencies = FrequencyAxis(frequencies)
-        axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies, **changes)
+        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -188,19 +166,23 @@ class TransientRenderer(nn.Module):
         film = found[self._sensors[0]].film()
         self.axis: TimeAxis | None = None
         self.frequencies: FrequencyAxis | None = None
+        self.gates: tuple[Gate, ...] | None = None
         self._cube_shape = tuple(film.cube_shape())
         self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._scene_filter, self._pulsed = "", False
-        if film.measures == "phasor":
-            self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+        self._pulsed = bool(getattr(film, "pulses", ()))
+        if film.measures != "transient":
+            if film.measures == "phasor":
+                self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+            else:
+                self.gates = film.gates
             if self.temporal_filter != "auto":
                 raise SceneError(
-                    f"temporal_filter: a phasor film has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {film.measures} film has none, expected 'auto', got {self.temporal_filter!r}."
                 )
             return
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
-        self._pulsed = bool(getattr(film, "pulses", ()))
         self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
@@ -225,7 +207,7 @@ class TransientRenderer(nn.Module):
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
         """The parameters under their Mitsuba keys."""
-        return _Values(self, self._names)
+        return Values(self, self._names)
 
     @property
     def effective_filter(self) -> str:
@@ -314,7 +296,7 @@ class TransientRenderer(nn.Module):
             phasor = phasor_channels_first(response, leading, components)
             return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
         transient = transient_channels_first(response, leading, components)
-        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels)
+        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels, gates=self.gates)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
@@ -401,6 +383,8 @@ class TransientRenderer(nn.Module):
         """Shown by ``print(renderer)``."""
         keys, used = list(self._keys), self.effective_filter
         measured = f"axis={self.axis}, temporal_filter={used!r}" if self.axis else f"frequencies={self.frequencies}"
+        if self.gates is not None:
+            measured = f"gates={len(self.gates)}"
         return f"{self.scene!r}, parameters={keys}, {measured}"
 
 

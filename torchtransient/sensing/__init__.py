@@ -1,5 +1,8 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics
+from torchtransient.sensing.electronics import fixed_pattern as fixed_pattern
+from torchtransient.sensing.electronics import ktc_noise as ktc_noise
 from torchtransient.sensing.free_running import FreeRunningSPAD as FreeRunningSPAD
 from torchtransient.sensing.free_running import free_running_rate as free_running_rate
 from torchtransient.sensing.free_running import nonparalyzable_histogram as nonparalyzable_histogram
@@ -12,6 +15,31 @@ from torchtransient.sensing.impulse_response import Response as Response
 from torchtransient.sensing.impulse_response import TailedResponse as TailedResponse
 from torchtransient.sensing.impulse_response import UniformResponse as UniformResponse
 from torchtransient.sensing.impulse_response import emg_response as emg_response
+from torchtransient.sensing.itof import ItofCorrelation as ItofCorrelation
+from torchtransient.sensing.itof import correlate as correlate
+from torchtransient.sensing.itof import tap_weights as tap_weights
+from torchtransient.sensing.itof import taps_from_phasor as taps_from_phasor
+from torchtransient.sensing.itof_codes import CorrelationCode as CorrelationCode
+from torchtransient.sensing.itof_codes import FourierCode as FourierCode
+from torchtransient.sensing.itof_codes import PiecewiseLinearCode as PiecewiseLinearCode
+from torchtransient.sensing.itof_codes import binary_code as binary_code
+from torchtransient.sensing.itof_codes import hamiltonian_code as hamiltonian_code
+from torchtransient.sensing.itof_codes import measured_code as measured_code
+from torchtransient.sensing.itof_codes import sine_code as sine_code
+from torchtransient.sensing.itof_codes import square_code as square_code
+from torchtransient.sensing.itof_depth import ItofReading as ItofReading
+from torchtransient.sensing.itof_depth import amplitude_of as amplitude_of
+from torchtransient.sensing.itof_depth import decode_code as decode_code
+from torchtransient.sensing.itof_depth import depth_of_phase as depth_of_phase
+from torchtransient.sensing.itof_depth import offset_of as offset_of
+from torchtransient.sensing.itof_depth import phase_noise_rad as phase_noise_rad
+from torchtransient.sensing.itof_depth import phase_of as phase_of
+from torchtransient.sensing.itof_depth import phasor_loss as phasor_loss
+from torchtransient.sensing.itof_depth import read_itof as read_itof
+from torchtransient.sensing.itof_depth import tap_phasor as tap_phasor
+from torchtransient.sensing.itof_depth import unambiguous_range_m as unambiguous_range_m
+from torchtransient.sensing.itof_depth import unwrap_depth as unwrap_depth
+from torchtransient.sensing.itof_depth import wrapped_difference as wrapped_difference
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
@@ -21,6 +49,8 @@ from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.pulse import apply_pulse as apply_pulse
+from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
 from torchtransient.sensing.response_shapes import emg_cdf as emg_cdf
 from torchtransient.sensing.response_shapes import emg_density as emg_density
 from torchtransient.sensing.response_shapes import emg_survival as emg_survival

@@ -90,12 +90,13 @@ def _convolve(rows: Tensor, kernel: Tensor) -> Tensor:
         transform = torch.fft.fft if rows.is_complex() else torch.fft.rfft
         inverse = torch.fft.ifft if rows.is_complex() else torch.fft.irfft
         wide = rows.to(torch.promote_types(rows.dtype, torch.float64))
-        spread: Tensor = inverse(transform(wide, n=length) * transform(kernel.to(wide.dtype), n=length), n=length)
-        return spread.to(rows.dtype)
+        product = transform(wide, n=length) * transform(kernel.to(wide.dtype), n=length)
+        back: Tensor = inverse(product, n=length)
+        return back.to(rows.dtype)
     flat = rows.reshape(-1, 1, rows.shape[-1])
     weights = kernel.flip(0).to(rows.dtype).view(1, 1, -1)
-    full: Tensor = torch.nn.functional.conv1d(flat, weights, padding=kernel.numel() - 1)
-    return full.view(*rows.shape[:-1], length)
+    spread: Tensor = torch.nn.functional.conv1d(flat, weights, padding=kernel.numel() - 1)
+    return spread.view(*rows.shape[:-1], length)
 
 
 def _bins_of(axis: TimeAxis, keep: TimeAxis) -> tuple[int, int]:

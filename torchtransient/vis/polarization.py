@@ -48,7 +48,7 @@ def polarization_picture(
     Quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow), "aolp" (-90 to 90 degrees, cyclic,
     the more colourful the more linearly polarized), "docp" (-1 to 1, blue is left and red right circular), "s1", "s2",
     "s3" (blue to red around zero). Channels are added up before; noise can make degrees exceed one, which are shown as
-    one. Pixels with an intensity below `floor` (None: a thousandth of the 99th percentile) are grey.
+    one. Pixels with an intensity below `floor` (None: a hundredth of the median of what is lit) are grey.
 
     `source`: Stokes vectors (4, C, T, H, W) or (4, C, H, W), or a RenderOutput or file with such; `frame` picks a bin,
     None shows the light of all times. `angle_map` "even" has hues of equal lightness, "hsv" the hue circle of many
@@ -65,8 +65,9 @@ def polarization_picture(
     vectors = torch.nan_to_num(vectors, posinf=0.0, neginf=0.0)
     total = vectors.sum(1)
     if floor is None:
-        bright = torch.quantile(_some(total[0].clamp(min=0)), 0.99).item()
-        floor = 1e-3 * bright
+        # Of the median, which lamps in the picture do not decide.
+        lit = total[0][total[0] > 0]
+        floor = 0.01 * lit.median().item() if lit.numel() else 0.0
     elif not floor >= 0:
         raise UnitError(f"polarization_picture: expected floor >= 0, got {floor!r}.")
     dark = ((total[0] <= floor) | broken).numpy()
@@ -131,12 +132,6 @@ def _draw_scalar(figure: Any, panel: Any, name: str, total: Tensor, dark: NDArra
     shown = np.where(dark, np.nan, values) if name in ("dop", "dolp", "docp") else values
     image = panel.imshow(shown, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
     figure.colorbar(image, ax=panel, shrink=0.8)
-
-
-def _some(values: Tensor, most: int = 2**20) -> Tensor:
-    """At most that many of the values, evenly chosen: torch's quantile takes no more than 2^24."""
-    flat = values.flatten()
-    return flat[:: max(1, flat.numel() // most)]
 
 
 def _shown_intensity(intensity: Tensor, broken: Tensor) -> Tensor:

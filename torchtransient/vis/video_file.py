@@ -17,7 +17,9 @@ from torchtransient.vis.stamps import DIM, GROUND, INK
 ENDINGS = (".mp4", ".gif")
 _PALETTE_FRAMES = 24
 _PALETTE_PIXELS = 2**18
-_KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255))  # mixed with neighbours, these would look tinted
+# Mixed with neighbours, these would look tinted: the strip with the time, the greys of its letters, black and white.
+_GREYS = [(level, level, level) for level in range(GROUND[0] + 24, INK[0], 24)]
+_KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
 
 
 def check_video(path: str | Path) -> Path:

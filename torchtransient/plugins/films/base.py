@@ -32,6 +32,8 @@ class TimeResolvedFilm(mi.Film):
     plugin = "time-resolved film"
     measures = "transient"
     exhaustive_scan = False
+    # Whether there is a steady image beside the array, of light at any time; otherwise it is the sum over the array.
+    keeps_steady = True
     # Whether the film has a window that light can miss, which is then counted in `outside`.
     has_window = True
 
@@ -64,6 +66,9 @@ class TimeResolvedFilm(mi.Film):
 
     def take_filter(self, name: str, stddev: float | None):
         """Take over an integrator's settings of the temporal filter; empty name and None leave the film's own."""
+
+    def arrivals(self):
+        """Which arrivals count (:class:`.window.ArrivalWindow`), None for all: for a film without a steady image."""
 
     def lanes_at_most(self, depth: int) -> int | None:
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
@@ -129,13 +134,24 @@ class TimeResolvedFilm(mi.Film):
         return self.channel_count()
 
     def settle(self):
-        """End of a render: sums kept in double precision become single precision."""
+        """End of a render: sums kept in double precision become single precision, and a film without a steady image
+        sums one up.
+        """
         if dr.type_v(self.steady) != dr.type_v(mi.Float):
             self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
             self.steady = mi.Float(self.steady)
             if self.outside is not None:
                 self.outside = mi.Float(self.outside)
             dr.eval(self.steady, self.outside, *(band[2] for band in self.bands))
+        if not self.keeps_steady:
+            self._sum_up()
+
+    def _sum_up(self):
+        width, channels = int(self.crop_size()[0]), self.channel_count()
+        for first, rows, flat in self.bands:
+            total = dr.sum(mi.TensorXf(flat, (rows * width, self.entries_per_pixel() // channels, channels)), axis=1)
+            index = dr.arange(mi.UInt32, rows * width * channels) + first * width * channels
+            dr.scatter(self.steady, total.array, index)
 
     def clear(self):
         """Drop the storage; tensors developed before keep their memory."""

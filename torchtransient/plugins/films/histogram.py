@@ -13,6 +13,7 @@ from torchtransient.plugins.films.long_kernel import put as put_long
 from torchtransient.plugins.films.long_kernel import read as read_long
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev, make_temporal_filter
+from torchtransient.plugins.films.window import ArrivalWindow
 
 # Kernels of more bins are looped over instead of written out.
 MAX_UNROLLED = 9
@@ -35,6 +36,10 @@ class TransientHDRFilm(TimeResolvedFilm):
         is spread by both. ``pulse_fwhm_opl``; ``pulse_width_opl``; ``pulse_opl`` and ``pulse_values`` (numbers between
         spaces or commas) give the shape, ``pulse_center_opl`` (0) shifts it; the same for ``irf``. See
         :mod:`.pulsed_filter`. With one of them every temporal filter has a slope.
+    ``steady`` (bool, true)
+        False: no steady image is asked for. Paths end where they are longer than the window, no shadow ray is traced
+        for light that would arrive outside of it, and ``steady`` is the sum over the bins. No bin's expected value
+        changes; light outside the window is not counted then.
     nested spectra (spectral variants)
         Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
         which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
@@ -69,6 +74,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
         self.laser_scan_width = int(props.get("laser_scan_width", 0))
         self.laser_scan_height = int(props.get("laser_scan_height", 0))
+        self.keeps_steady = self.has_window = bool(props.get("steady", True))
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
         self._make_filter()
@@ -134,6 +140,12 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Whether the temporal filter has a slope."""
         return self.filter.has_slope
 
+    def arrivals(self):
+        if self.keeps_steady:
+            return None
+        early, late = self.filter.reach
+        return ArrivalWindow(-late * self.bin_width_opl, (self.temporal_bins - early) * self.bin_width_opl)
+
     def end_opl(self) -> float:
         """End of the last bin in metres."""
         return self.start_opl + self.bin_width_opl * self.temporal_bins
@@ -196,18 +208,18 @@ class TransientHDRFilm(TimeResolvedFilm):
                 dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
         return before, after
 
-    def read(self, adjoint, base, opl_from_start, active):
+    def read(self, adjoint, base, opl_from_start, active, steady=None):
         """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, bin stride, channel stride)`` and ``base`` the index of the histogram's first
-        value in it.
+        ``adjoint`` is ``(flat array, bin stride, channel stride)`` or None, and ``base`` the index of the histogram's
+        first value in it; ``steady`` is the adjoint of the sum over the bins.
         """
-        flat, bin_stride, channel_stride = adjoint
+        flat, bin_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
         if self._long:
             spot = Spot(flat, base, bin_stride, channel_stride, self.temporal_bins, channels)
-            A, slope = read_long(spot, self.filter, x, active)
+            A, slope = read_long(spot, self.filter, x, active, steady)
             return A, [s * (1 / self.bin_width_opl) for s in slope]
         A, slope = [mi.Float(0)] * channels, [mi.Float(0)] * channels
         first, taps = self.filter.weights(x)
@@ -216,7 +228,9 @@ class TransientHDRFilm(TimeResolvedFilm):
             inside = active & (k >= 0) & (k < self.temporal_bins)
             index = dr.fma(mi.UInt32(k), bin_stride, base)
             for c in range(channels):
-                a = dr.gather(mi.Float, flat, index + c * channel_stride, inside)
+                a = mi.Float(0) if steady is None else dr.select(inside, steady[c], 0)
+                if flat is not None:
+                    a += dr.gather(mi.Float, flat, index + c * channel_stride, inside)
                 A[c] = dr.fma(a, weight, A[c])
                 if self.filter.has_slope:
                     slope[c] = dr.fma(a, dweight * (1 / self.bin_width_opl), slope[c])

@@ -53,6 +53,9 @@ class AdjointLane:
 
     def read(self, opl, active):
         """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
+        if not self.film.keeps_steady:
+            A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
+            return self.match.to_spectrum(A), self.match.to_spectrum(slope)
         if self.response is None:
             return self.match.to_spectrum(self.steady), light_type()(0)
         A, slope = self.film.read(self.response, self.base, opl, active)

@@ -54,8 +54,10 @@ def scatter(spot, inside, k, weight, dweight, value, slope_value):
 
 
 @dr.syntax
-def read(spot, kernel, x, active):
-    """Weighted sum of a cube's entries and its slope per bin, as two arrays with one component per channel."""
+def read(spot, kernel, x, active, steady=None):
+    """Weighted sum of a cube's entries and its slope per bin: two lists over channels. ``steady``: list that is added
+    to every entry.
+    """
     k, node, share = kernel.begin(x)
     end = k + kernel.count
     low, low_pdf = kernel.edge(node, share)
@@ -64,18 +66,23 @@ def read(spot, kernel, x, active):
     while dr.hint(going, label="long temporal kernel, adjoint"):
         node += kernel.nodes_per_bin
         high, high_pdf = kernel.edge(node, share)
-        A, slope = gathered(spot, going, k, high - low, low_pdf - high_pdf, A, slope)
+        A, slope = gathered(spot, going, k, high - low, low_pdf - high_pdf, steady, A, slope)
         low, low_pdf = mi.Float(high), mi.Float(high_pdf)
         k += 1
         going = going & (k < end)
     return A, slope
 
 
-def gathered(spot, going, k, weight, dweight, A, slope):
+def gathered(spot, going, k, weight, dweight, steady, A, slope):
     """The sums with one more bin."""
     inside = going & (k >= 0) & (k < spot.bins)
     index = dr.fma(mi.UInt32(k), spot.bin_stride, spot.base)
-    values = [dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, inside) for c in range(spot.channels)]
+    values = []
+    for c in range(spot.channels):
+        a = mi.Float(0) if steady is None else dr.select(inside, steady[c], 0)
+        if spot.flat is not None:
+            a += dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, inside)
+        values.append(a)
     return (
         [dr.fma(a, weight, s) for a, s in zip(values, A, strict=True)],
         [dr.fma(a, dweight, s) for a, s in zip(values, slope, strict=True)],

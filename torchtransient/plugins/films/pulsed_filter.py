@@ -54,6 +54,7 @@ class PulsedFilter:
         self.first = math.floor(first / self.nodes_per_bin)
         last = math.ceil((first + values.size - 1) / self.nodes_per_bin) + 1
         self.count = last - self.first
+        self.reach = (float(self.first), float(self.first + self.count))
         table = np.interp(
             np.arange((self.first - 1) * self.nodes_per_bin, last * self.nodes_per_bin + 2),
             first + np.arange(values.size),

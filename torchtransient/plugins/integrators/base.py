@@ -14,7 +14,7 @@ from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.sensors.origin import length_to_sensor_origin, views
+from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
@@ -106,8 +106,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not hasattr(film, "transient_bands"):
             raise SceneError(
-                f"transient integrators need a film of type transient_hdr_film or phasor_hdr_film, the sensor has "
-                f"{film.class_name()}; change the film's type in the scene."
+                "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
+                f"sensor has {film.class_name()}; change the film's type in the scene."
             )
         if film.exhaustive_scan:
             raise SceneError(
@@ -131,6 +131,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         is, so that no later scene can be taken for this one because it got the same addresses.
         """
         facts = scene_facts(scene, self.reference(scene))
+        if sensor is not None:
+            facts.window = sensor.film().arrivals()
         if self.walks_through_media:
             facts.media = media_facts(scene, sensor)
         if facts.media is not None:
@@ -191,14 +193,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         if sensor.shutter_open_time() > 0:
             time += sampler.next_1d() * sensor.shutter_open_time()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        seen = views(sensor, position, lambda: self.reference(scene))
         with dr.resume_grad():
-            ray, ray_weight = sensor.sample_ray_differential(
-                time=time, sample1=wavelength, sample2=position, sample3=aperture
-            )
+            ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
-        seen = views(sensor, position, lambda: self.reference(scene))
         return sampler, ray, ray_weight, scale, row, column, seen
 
     def channel_match(self, seen, film, ray, ray_weight, scale):
@@ -246,12 +246,19 @@ class TransientIntegrator(mi.CppADIntegrator):
         first = self._first_opl(seen, film, ray)
         facts = self.facts(scene, sensor)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
-        for c, value in enumerate(match.to_channels(L)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        self._add_steady(film, match.to_channels(L), pixel)
         if film.outside is not None:
             for side, value in enumerate((before, after)):
                 dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
         lane.finish()
+
+    @staticmethod
+    def _add_steady(film, channels, pixel):
+        """Add to the steady image, unless the film makes it of its array."""
+        if film.keeps_steady:
+            for c, value in enumerate(channels):
+                index = pixel * film.channel_count() + c
+                dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index)
 
     def _first_opl(self, seen, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
@@ -347,8 +354,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
                 d_first = mi.Float(0) if self.camera_unwarp else t_first
         dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first, t_turn)
-        for c, value in enumerate(match.to_channels(dL)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        self._add_steady(film, match.to_channels(dL), pixel)
         lane.finish()
 
     @staticmethod

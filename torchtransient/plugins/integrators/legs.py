@@ -2,7 +2,8 @@
 
 ``place`` is what a path with media knows of the vertex it has reached, as loop state: whether it lies in a medium
 (``scatter``) at distance ``t`` from the ray's origin, the ``medium`` that the leg ended in, and the weight ``walk`` of
-the leg (see :class:`~.media.free_flight.Walk`). It is empty in scenes without media.
+the leg (see :class:`~.media.free_flight.Walk`); for derivatives also the medium at its ``begin`` and the boundary
+``entry`` that it passed last. It is empty in scenes without media.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def first_leg(scene, media, ray, sampler, hide_emitters):
     if media.at_sensor is not None:
         medium = mi.MediumPtr(media.at_sensor)
     u, lanes, carried = sampler.next_1d(), lane_numbers(sampler), mi.UnpolarizedSpectrum(1)
-    return place_of(walk(scene, media, ray, medium, carried, u, lanes, mi.Bool(True), first=True))
+    return place_of(walk(scene, media, ray, medium, carried, u, lanes, mi.Bool(True), first=True), media, medium)
 
 
 def next_leg(scene, media, ray, here, carried, sampler, active):
@@ -46,12 +47,18 @@ def next_leg(scene, media, ray, here, carried, sampler, active):
         return scene.ray_intersect_preliminary(ray, active=active), {}
     medium = medium_behind(here.si, ray.d, here.medium, ~here.scatter)
     carried = mi.unpolarized_spectrum(carried)
-    return place_of(walk(scene, media, ray, medium, carried, sampler.next_1d(), lane_numbers(sampler), active))
+    end = walk(scene, media, ray, medium, carried, sampler.next_1d(), lane_numbers(sampler), active)
+    return place_of(end, media, medium)
 
 
-def place_of(end):
-    """The end of a walk as (next surface, place)."""
-    return end.pi, {"scatter": end.scatter, "t": end.t, "medium": end.medium, "walk": end.weight}
+def place_of(end, media, begin):
+    """The end of a walk as (next surface, place); ``begin`` is the medium at its start."""
+    place = {"scatter": end.scatter, "t": end.t, "medium": end.medium, "walk": end.weight}
+    if media.recorded:
+        place["begin"] = begin
+    if media.keeps_entry:
+        place["entry"] = end.entry
+    return end.pi, place
 
 
 def carried_on(β, place):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchtransient.errors import GradientError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators import path
 
@@ -24,24 +23,6 @@ class TransientVolpath(path.TransientPath):
     """
 
     walks_through_media = True
-
-    def sweep(self, scene, sampler, ray, first_opl, lane, facts):
-        """As in ``transient_path``; see :meth:`_refuse`."""
-        self._refuse(facts)
-        return super().sweep(scene, sampler, ray, first_opl, lane, facts)
-
-    def push(self, scene, sampler, ray, first_opl, lane, facts, t_ray, d_first):
-        """As in ``transient_path``; see :meth:`_refuse`."""
-        self._refuse(facts)
-        return super().push(scene, sampler, ray, first_opl, lane, facts, t_ray, d_first)
-
-    @staticmethod
-    def _refuse(facts):
-        if facts.media is not None:
-            raise GradientError(
-                "transient_prbvolpath: derivatives are available in scenes without media only, and this one has "
-                f"{len(facts.media.media)}. Remove the media, or render without gradients."
-            )
 
 
 register("integrator", "transient_prbvolpath", TransientVolpath)

@@ -26,11 +26,11 @@ class Walk:
     ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
     that is not valid. ``pi`` is the next surface in both cases, counted from the ray's origin. ``medium`` is the one
     that the walk ended in. ``weight``: transmittance over the probability density of what was sampled, without the
-    scattering coefficient.
+    scattering coefficient. ``entry``: the last boundary that was passed, if ``media.keeps_entry``.
     """
 
-    def __init__(self, pi, scatter, t, medium, weight):
-        self.pi, self.scatter, self.t, self.medium, self.weight = pi, scatter, t, medium, weight
+    def __init__(self, pi, scatter, t, medium, weight, entry):
+        self.pi, self.scatter, self.t, self.medium, self.weight, self.entry = pi, scatter, t, medium, weight, entry
 
 
 def generator(numbers, lanes, stream):
@@ -149,6 +149,18 @@ def across(scene, ray, pi, medium, passes):
     return dr.select(passes, found, pi), medium
 
 
+@dr.syntax
+def closed_surface(scene, media, ray, active):
+    """The next surface along ``ray`` that is not an open boundary."""
+    pi = scene.ray_intersect_preliminary(ray, active=active)
+    if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
+        passes = active & passable(pi, False)
+        while dr.hint(passes, label="open boundaries"):
+            pi, _ = across(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
+            passes &= passable(pi, False)
+    return pi
+
+
 def passable(pi, hide):
     """Whether the surface at ``pi`` is an open boundary; with ``hide`` emitting surfaces count as such."""
     opens = pi.is_valid() & is_open(pi.shape)
@@ -172,6 +184,8 @@ def walk(scene, media, ray, medium, carried, u, lanes, active, first=False):
     weight = mi.UnpolarizedSpectrum(1)
     scatter = mi.Bool(False)
     hide = first and media.hide_emitters
+    entry = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lanes))
+    entry.t = dr.full(mi.Float, dr.inf, dr.width(lanes))
     pi = scene.ray_intersect_preliminary(ray, coherent=first, active=active)
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         inside = active & (medium != None)  # noqa: E711 (a Dr.Jit comparison)
@@ -185,10 +199,12 @@ def walk(scene, media, ray, medium, carried, u, lanes, active, first=False):
             scatter = collides & real
             passes = going & ~collides & passable(pi, hide)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
+            if dr.hint(media.keeps_entry, mode="scalar"):
+                entry = dr.select(passes, pi, entry)
             pi, medium = across(scene, ray, pi, medium, passes)
             going = (collides & ~real) | passes
             u = rng.next_float32()
-    return Walk(pi, scatter, t, medium, weight)
+    return Walk(pi, scatter, t, medium, weight, entry)
 
 
 @dr.syntax

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import drjit as dr
@@ -14,6 +15,9 @@ class MediaFacts:
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
     lines go through several media. ``emitter_sampling``: every medium allows connections to emitters.
+
+    For derivatives: ``recorded`` (the path is kept), ``legs_change`` (a transmittance can change), ``keeps_entry`` (the
+    boundary before a vertex is kept, since the vertex may move with it).
 
     ``rate_floor`` (1 / m, 0 when no extinction is differentiated) is the smallest rate at which collisions are sampled:
     where the density is zero, its derivative is not, and is found by collisions alone.
@@ -30,7 +34,22 @@ class MediaFacts:
         self.open_boundaries = open_boundaries
         self.extent = extent
         self.rate_floor = 0.0
+        self.recorded = False
+        self.legs_change = False
+        self.keeps_entry = False
         self.hide_emitters = False
+
+    def with_gradients(self, geometry: bool) -> MediaFacts:
+        """The same facts with the gradients that the media's attached parameters ask for; ``geometry``: path lengths
+        change.
+        """
+        media = copy.copy(self)
+        density = any(_density_attached(medium) for medium in self.media)
+        media.recorded = True
+        media.legs_change = geometry or density
+        media.keeps_entry = geometry and self.open_boundaries
+        media.rate_floor = 0.5 / self.extent if density else 0.0
+        return media
 
     @property
     def one_stretch(self) -> bool:
@@ -51,6 +70,12 @@ def media_facts(scene: Any, sensor: Any) -> MediaFacts | None:
     box = scene.bbox()
     extent = float(dr.norm(box.extents())) if box.valid() else 1.0
     return MediaFacts(list(media.values()), found[0], any(is_open(shape) for shape in shapes), max(extent, 1e-6))
+
+
+def _density_attached(medium: Any) -> bool:
+    """Whether a parameter that changes the extinction carries gradients: all but those of albedo and phase function."""
+    others = ("albedo", "phase_function")
+    return any(key.split(".")[0] not in others and dr.grad_enabled(value) for key, value in mi.traverse(medium))
 
 
 def shapes_of_scene(scene: Any) -> list[Any]:
