@@ -268,6 +268,26 @@ def test_phasor_outputs():
     assert torch.allclose(output.phasor[:, 0].real, output.steady, rtol=1e-4)
 
 
+def test_gated_outputs():
+    """Light outside of the gates asks for no depth."""
+    scene = tt.scenes.integrating_sphere(reflectance=0.8)
+    gates = [tt.Gate.rectangular(3.0, 5.0), tt.Gate.gaussian(7.0, 0.5)]
+    early = tt.plan(scene, ("gates",), gates=gates, tail=1e-2)
+    late = tt.plan(scene, ("gates",), gates=[gate.shifted(20.0) for gate in gates], tail=1e-2)
+    assert (early.film, early.time_axis, early.temporal_filter) == ("gated", None, "")
+    assert early.max_depth < late.max_depth
+    output = early.renderer()(seed=0, spp=4)
+    assert output.gates == tuple(gates)
+    assert output.transient.shape[1] == 2
+    deep = tt.plan(scene, ("gates",), gates=gates, max_depth=60)
+    found, full = means(early.renderer(), spp=512), means(deep.renderer(), spp=512)
+    # The steady image of a gated film is the sum over its gates; a hundredth of it was given up.
+    assert two_sample_z_test(found, full, rounding=1e-2 * full.mean()).passed
+    own = tt.load(scene, variant=VARIANT)
+    assert tt.TransientRenderer(own, effects=early, time_axis=tt.TimeAxis(0.0, 1.0, 9)).gates is None
+    assert tt.TransientRenderer(own, effects=early, gates=gates[:1]).gates == (gates[0],)
+
+
 def test_stokes_outputs():
     plan = tt.plan(tt.scenes.glass_slab_before_wall(resolution=2), ("transient", "stokes"))
     assert plan.variant == "llvm_ad_mono_polarized"
@@ -306,3 +326,27 @@ def test_command(tmp_path):
     assert (found["variant"], found["film"], found["pilot"]) == ("llvm_ad_mono_polarized", "steady", None)
     result = CliRunner().invoke(main, ["plan", str(file), "--outputs", "video"])
     assert result.exit_code == 2
+
+
+# -------------------------------------------------------------------------------------------------------- not slower
+
+
+def operations(renderer) -> list[int]:
+    """Number of operations of every kernel that a render launches."""
+    import drjit as dr
+
+    with torch.no_grad(), active_variant(renderer.scene.variant), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        renderer(seed=0, spp=4)
+        return [entry["operation_count"] for entry in dr.kernel_history([dr.KernelType.JIT])]
+
+
+def test_a_planned_render_runs_the_plain_integrator_s_kernels():
+    """Nothing is added to a scene without effects, not even by the integrator for media. What is there is added."""
+    scene = tt.load(tt.scenes.cornell_box(8), variant="llvm_ad_rgb")
+    settings = {"max_depth": 7, "time_axis": "scene", "pilot": False}
+    plain = operations(tt.TransientRenderer(scene, max_depth=7))
+    assert len(plain) >= 1
+    assert operations(tt.plan(scene, **settings).renderer()) == plain
+    assert operations(tt.plan(scene, integrator="transient_prbvolpath", **settings).renderer()) == plain
+    assert max(operations(tt.plan(scene, variant="llvm_ad_spectral", **settings).renderer())) > max(plain)

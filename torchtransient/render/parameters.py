@@ -33,7 +33,14 @@ _BIASED = {
     ("Principled", "specular"): _PRINCIPLED,
 }
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
-_SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
+_SENSOR_KEYS = (
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+)
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
 
 

@@ -13,8 +13,10 @@ from typing import Any
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, TorchTransientError, UnitError
+from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
+from torchtransient.render.arguments import film_choice
 from torchtransient.render.census import Census, take_census
 from torchtransient.render.plan_finder import Finder
 from torchtransient.render.plan_pilot import PilotReport
@@ -28,8 +30,9 @@ class Plan:
     """What :func:`plan` decided. Use it with :meth:`renderer` or ``tt.TransientRenderer(scene, effects=plan)``.
 
     ``film`` is "transient", "steady" (one bin), "phasor" or "gated". ``max_depth`` None keeps the scene's; so do
-    ``time_axis``, ``frequencies`` and ``gates``. ``temporal_filter`` is empty for a phasor film. ``reasons``: one
-    line per decision. ``pilot``: what the pilot run found, None without one. ``str(plan)`` prints the reasons.
+    ``time_axis``, ``frequencies`` and ``gates``. ``temporal_filter`` is empty for phasor and gated films.
+    ``reasons``: one line per decision. ``pilot``: what the pilot run found, None without one. ``str(plan)`` prints
+    the reasons.
     """
 
     scene: Scene = field(repr=False)
@@ -40,7 +43,7 @@ class Plan:
     max_depth: int | None
     time_axis: TimeAxis | None
     frequencies: FrequencyAxis | None
-    gates: Any
+    gates: tuple[Gate, ...] | None
     pulse: Pulse | None
     irf: Pulse | None
     temporal_filter: str
@@ -57,16 +60,18 @@ class Plan:
         settings.setdefault("parameters", self.parameters)
         return TransientRenderer(self.scene, effects=self, **settings)
 
-    def axes(self, time_axis: TimeAxis | None, frequencies: Any) -> tuple[TimeAxis | None, Any]:
-        """The time axis and the frequencies of a render that may have been given one of them."""
-        given = time_axis is not None or frequencies is not None
-        return (time_axis, frequencies) if given else (self.time_axis, self.frequencies)
-
-    def filter_unless(self, given: str) -> str:
-        """``given``, or the plan's for "auto". A planned box stays "auto": parameters that were not planned for may
-        call for a slope.
-        """
-        return given if given != "auto" or self.temporal_filter in ("box", "") else self.temporal_filter
+    def film_settings(
+        self, time_axis: TimeAxis | None, frequencies: Any, gates: Any, temporal_filter: str
+    ) -> tuple[TimeAxis | None, Any, Any, str]:
+        """What a renderer's film measures: its own arguments where it has some, else the plan's."""
+        if frequencies is not None or gates is not None:
+            return time_axis, frequencies, gates, temporal_filter
+        if time_axis is None:
+            time_axis, frequencies, gates = self.time_axis, self.frequencies, self.gates
+        # A planned box stays "auto": parameters that were not planned for may call for a slope.
+        if temporal_filter == "auto" and self.temporal_filter not in ("box", ""):
+            temporal_filter = self.temporal_filter
+        return time_axis, frequencies, gates, temporal_filter
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, as plain data for JSON."""
@@ -79,7 +84,7 @@ class Plan:
         plain["frequencies"] = None if frequencies is None else list(frequencies.frequencies)
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
-        plain["gates"] = None if self.gates is None else repr(self.gates)
+        plain["gates"] = None if self.gates is None else [asdict(gate) for gate in self.gates]
         plain["pilot"] = None if self.pilot is None else asdict(self.pilot)
         return plain
 
@@ -94,7 +99,7 @@ def plan(
     parameters: Sequence[str] = (),
     time_axis: TimeAxis | str | None = None,
     frequencies: FrequencyAxis | Sequence[float] | None = None,
-    gates: Any = None,
+    gates: Gate | Sequence[Gate] | None = None,
     pulse: Pulse | None = None,
     irf: Pulse | None = None,
     num_bins: int | None = None,
@@ -156,7 +161,7 @@ def plan(
         max_depth=None,
         time_axis=None,
         frequencies=_frequencies(frequencies, film.value, census),
-        gates=gates,
+        gates=film_choice(None, None, gates)["gates"],
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         temporal_filter="",

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, SceneError
+from torchtransient.gates import Gate
+from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.census import Census
@@ -27,6 +30,14 @@ _ALL_TIMES = 1e9
 
 def _share(part: float, error: float) -> str:
     return f"{part:.2g} +- {error:.1g} of the light" if part > 0 else "no light of the pilot run"
+
+
+def _seen(gates: Sequence[Gate], pulses: Sequence[Pulse]) -> tuple[Gate, ...]:
+    """Gates as light sees them that pulses spread."""
+    seen = tuple(gates)
+    for pulse in pulses:
+        seen = tuple(gate.spread(pulse) for gate in seen)
+    return seen
 
 
 class Finder:
@@ -71,25 +82,31 @@ class Finder:
         started = time.perf_counter()
         variant = self.draft.variant.removesuffix("_polarized")
         scene = load(self.draft.scene, variant=variant)
+        gated = self.draft.film == "gated"
         options = BuildOptions(
-            time_axis=(0.0, 1.0, 1),
+            time_axis=None if gated else (0.0, 1.0, 1),
+            gates=self.draft.gates,
             merge=True,
             transient=True,
             integrator=self.draft.integrator,
             pulse=self.draft.pulse,
             irf=self.draft.irf,
-        )  # fmt: skip
+        )
         with active_variant(variant):
             from torchtransient.plugins.integrators.pilot import pilot_events
 
             built = scene.built(options).scene
-            pulses = getattr(built.sensors()[self.sensor].film(), "pulses", [])
+            film = built.sensors()[self.sensor].film()
+            pulses = getattr(film, "pulses", [])
             self.spread = tuple(sum(p.support_opl[side] for p in pulses) for side in (0, 1))
             events = pilot_events(
                 built, built.integrator(), self.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
             )
             scene.drop(options)
-        self.arrivals = found = Arrivals(events)
+        found = Arrivals(events)
+        if gated:
+            found = found.through(_seen(film.gates, pulses))
+        self.arrivals = found
         dark = found.dark
         self.report = PilotReport(
             variant=variant,
@@ -107,7 +124,8 @@ class Finder:
         report = self.report
         if report is None:
             raise SceneError("tt.plan: no pilot run was made.")
-        error = "no light at all" if report.events == 0 else f"image mean within {report.relative_error:.1%}"
+        dark = self.arrivals is None or self.arrivals.dark
+        error = "no light at all" if dark else f"image mean within {report.relative_error:.1%}"
         return (
             f"pilot: {report.paths} paths in {report.variant}, {report.events} arrivals, {error}; light that fewer "
             f"than one path in {max(report.paths // 3, 1)} meets may have been overlooked"
@@ -215,9 +233,9 @@ class Finder:
     # --------------------------------------------------------------------------------------------- temporal filter
 
     def _filter(self, given: str | None) -> str:
-        if self.draft.film == "phasor":
+        if self.draft.film in ("phasor", "gated"):
             if given is not None:
-                raise SceneError("tt.plan: a phasor film takes no temporal filter; leave it out.")
+                raise SceneError(f"tt.plan: a {self.draft.film} film takes no temporal filter; leave it out.")
             return ""
         table = self.draft.scene.parameters() if self.draft.parameters else {}
         for key in self.draft.parameters:

@@ -6,13 +6,16 @@ image as a whole and for its blocks, since light that matters to a corner of the
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from torchtransient.axes import TimeAxis
+from torchtransient.gates import Gate
 
 # The image is divided into so many blocks along each side; a block may lose so many times the image's share.
 BLOCKS = 8
@@ -58,6 +61,14 @@ class Arrivals:
         self.block = (y * down // height) * across + x * across // width
         self.blocks = across * down
         self.block_total = np.bincount(self.block, self.energy, self.blocks)
+
+    def through(self, gates: Sequence[Gate]) -> Arrivals:
+        """The same arrivals as some gates see them: energy times the sum of their sensitivities."""
+        seen = copy.copy(self)
+        seen.energy = self.energy * sum(gate.value(self.opl) for gate in gates)
+        seen.total = float(seen.energy.sum())
+        seen.block_total = np.bincount(self.block, seen.energy, self.blocks)
+        return seen
 
     @property
     def dark(self) -> bool:

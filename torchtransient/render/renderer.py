@@ -111,9 +111,9 @@ class TransientRenderer(nn.Module):
         super().__init__()
         if isinstance(effects, Plan):
             scene = load(scene, variant=effects.variant)
-            if gates is None:
-                time_axis, frequencies = effects.axes(time_axis, frequencies)
-                temporal_filter = effects.filter_unless(temporal_filter)
+            time_axis, frequencies, gates, temporal_filter = effects.film_settings(
+                time_axis, frequencies, gates, temporal_filter
+            )
             max_depth = effects.max_depth if max_depth is None else max_depth
             pulse, irf = pulse or effects.pulse, irf or effects.irf
         elif effects != "auto":

@@ -14,7 +14,7 @@ from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.sensors.origin import length_to_sensor_origin, views
+from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
@@ -193,14 +193,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         if sensor.shutter_open_time() > 0:
             time += sampler.next_1d() * sensor.shutter_open_time()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        seen = views(sensor, position, lambda: self.reference(scene))
         with dr.resume_grad():
-            ray, ray_weight = sensor.sample_ray_differential(
-                time=time, sample1=wavelength, sample2=position, sample3=aperture
-            )
+            ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
-        seen = views(sensor, position, lambda: self.reference(scene))
         return sampler, ray, ray_weight, scale, row, column, seen
 
     def channel_match(self, seen, film, ray, ray_weight, scale):

@@ -153,7 +153,10 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[_Pi
         match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale / (size[0] * size[1]), film.curves)
         lane = _PilotLane(match, film.curves is not None, size[0] * size[1] * spp, slots, spp)
         first = integrator._first_opl(seen, film, ray)
-        integrator.trace(scene, sampler, ray, first, lane, integrator.facts(scene, sensor))
+        facts = integrator.facts(scene, sensor)
+        # What the sensor's film would not count is asked for too: the answers are about all arrivals.
+        facts.window = None
+        integrator.trace(scene, sampler, ray, first, lane, facts)
         most = dr.max(lane.used)
         dr.eval(most, lane.opl, lane.energy, lane.depth)
         dr.sync_thread()

@@ -9,6 +9,17 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sensors.origin import shapes_of_sensors
+
+# What moves the rays of a sensor.
+SENSOR_KEYS = (
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+)
 
 
 class SceneFacts:
@@ -92,7 +103,9 @@ class SceneFacts:
         for emitter in scene.emitters():
             if emitter.get_shape() is None:
                 light |= _attached(emitter, ("position", "to_world"))
-        sensor_moves = _attached(sensor, ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y"))
+        sensor_moves = _attached(sensor, SENSOR_KEYS) or any(
+            shape is not None and shape.parameters_grad_enabled() for shape in shapes_of_sensors(sensor)
+        )
         for bsdf in self.bsdfs:
             index |= _attached(bsdf, ("eta",))
         if self.refraction is not None:

@@ -49,16 +49,18 @@ def views(sensor: Any, position: Any, reference: Any) -> list[View]:
     def view(one, active):
         return View(one, active, reference() if is_distant(one) else None)
 
-    if sensor.class_name() != "BatchSensor":
-        return [view(sensor, True)]
     children = sensors_of(sensor)
+    if len(children) == 1:
+        return [view(children[0], True)]
     # The same rounding as in the plugin, so that a ray at the border gets the length of the sensor that made it.
     index = dr.minimum(mi.UInt32(position.x * len(children)), len(children) - 1)
     return [view(child, index == n) for n, child in enumerate(children)]
 
 
-def sensors_of(batch: Any) -> list[Any]:
-    """The children of a ``batch`` in their order on the film."""
+def sensors_of(sensor: Any) -> list[Any]:
+    """The children of a ``batch`` in their order on the film, or the sensor itself."""
+    if sensor.class_name() != "BatchSensor":
+        return [sensor]
     found = []
 
     class Callback(mi.TraversalCallback):
@@ -69,8 +71,33 @@ def sensors_of(batch: Any) -> list[Any]:
         put_object = put
         put_value = put
 
-    batch.traverse(Callback())
+    sensor.traverse(Callback())
     return found
+
+
+def shapes_of_sensors(sensor: Any) -> list[Any]:
+    """The shape that each sensor sits on, None for those that stand alone."""
+    return [one.get_shape() for one in sensors_of(sensor)]
+
+
+def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, position: Any, aperture: Any) -> Any:
+    """Primary rays and their weights, attached to the sensor.
+
+    The children of a batch are asked one by one once one of them is attached: derivatives through the virtual call
+    that the plugin makes end the process in forward mode (Dr.Jit 1.5).
+    """
+    if len(seen) == 1 or not any(dr.grad_enabled(value) for _, value in mi.traverse(sensor)):
+        return sensor.sample_ray_differential(time=time, sample1=wavelength, sample2=position, sample3=aperture)
+    place = position.x * len(seen)
+    inner = mi.Point2f(place - mi.Float(mi.UInt32(place)), position.y)
+    rays, weights = None, None
+    for view in seen:
+        ray, weight = view.sensor.sample_ray_differential(
+            time=time, sample1=wavelength, sample2=inner, sample3=aperture, active=view.active
+        )
+        rays = ray if rays is None else dr.select(view.active, ray, rays)
+        weights = weight if weights is None else dr.select(view.active, weight, weights)
+    return rays, weights
 
 
 def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
