@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-from gradient_cases import Case, camera, film, move, room, set_color
+from gradient_cases import Case, area_light, camera, film, move, room, set_color
 
 BANDS = {
     "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},
@@ -60,6 +60,27 @@ def gated_room(**properties):
     sensor = camera()
     sensor["film"] = {**GATED_FILM, **properties}
     return room(sensor=sensor)
+
+
+DIFFUSE = {"type": "diffuse", "reflectance": 0.5}
+LATE = {"type": "delayed", "lifetime": 0.4, "quantum_yield": 0.7, "nested": DIFFUSE}
+LATE_SIDE = {**LATE, "lifetime": 0.3, "nested": {"type": "diffuse", "reflectance": 0.8}}
+
+
+def late_room(bsdf, **arguments):
+    """The room with a delayed wall and a delayed panel, long enough for the delays."""
+    scene = room(bsdf=bsdf, sensor=camera(bins=400), **arguments)
+    scene["side"]["bsdf"] = LATE_SIDE
+    return scene
+
+
+def fluorescent_room():
+    """A wall that turns blue light to green, seen by a film with response curves."""
+    shift = {"excitation": spectrum("0.9, 0.5, 0, 0"), "emission": spectrum("0, 1, 1, 0.2")}
+    scene = banded_room()
+    scene["wall"]["bsdf"] = {**LATE, **shift, "elastic": {"type": "diffuse", "reflectance": 0.3}}
+    scene["sensor"]["film"]["temporal_bins"] = 400
+    return scene
 
 
 GATED_FILM = {
@@ -155,5 +176,128 @@ CASES = [
         2e-3,
         spp=2048,
         fd_spp=2048,
+    ),
+    Case(
+        "lifetime",
+        "lifetime of a delayed BSDF",
+        lambda: late_room(LATE),
+        set_color("wall.bsdf.lifetime"),
+        0.4,
+        5e-3,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "lifetime_of_a_measured_decay",
+        "lifetime of a delayed BSDF",
+        lambda: late_room({**LATE, "decay_opl": "0 0.1 1", "decay_values": "0 1 0", "elastic_fraction": 0.3}),
+        set_color("wall.bsdf.lifetime"),
+        0.4,
+        5e-3,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "quantum_yield",
+        "quantum yield of a delayed BSDF",
+        lambda: late_room({**LATE, "elastic": {"type": "roughconductor", "alpha": 0.3}}),
+        set_color("side.bsdf.quantum_yield"),
+        0.7,
+        0.05,
+        spp=8192,
+        fd_spp=8192,
+    ),
+    Case(
+        "no_quantum_yield",
+        "quantum yield of a delayed BSDF",
+        lambda: late_room({**LATE, "quantum_yield": 0.0, "elastic": DIFFUSE}),
+        set_color("wall.bsdf.quantum_yield"),
+        0.0,
+        0.05,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "elastic_fraction",
+        "elastic fraction of a delayed BSDF",
+        lambda: late_room({**LATE, "elastic_fraction": 0.4}),
+        set_color("wall.bsdf.elastic_fraction"),
+        0.4,
+        0.02,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "albedo_inside_a_delay",
+        "diffuse albedo",
+        lambda: late_room({**LATE, "elastic_fraction": 0.4}),
+        set_color("wall.bsdf.nested.reflectance.value"),
+        0.5,
+        0.02,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "delayed_wall_moves",
+        "shape to_world",
+        lambda: late_room({**LATE, "elastic_fraction": 0.4}),
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        4e-3,
+        spp=8192,
+        fd_spp=8192,
+    ),
+    Case(
+        "lifetime_under_an_area_light",
+        "lifetime of a delayed BSDF",
+        lambda: late_room(LATE, light=area_light()),
+        set_color("wall.bsdf.lifetime"),
+        0.4,
+        5e-3,
+        spp=4096,
+        fd_spp=4096,
+    ),
+    Case(
+        "fluorescent_lifetime",
+        "lifetime of a delayed BSDF",
+        fluorescent_room,
+        set_color("wall.bsdf.lifetime"),
+        0.4,
+        5e-3,
+        "llvm_ad_spectral",
+        8192,
+        fd_spp=8192,
+    ),
+    Case(
+        "fluorescent_yield",
+        "quantum yield of a delayed BSDF",
+        fluorescent_room,
+        set_color("wall.bsdf.quantum_yield"),
+        0.7,
+        0.05,
+        "llvm_ad_spectral",
+        8192,
+        fd_spp=8192,
+    ),
+    Case(
+        "area_light_over_a_delayed_wall_moves",
+        "area light shape",
+        lambda: late_room({**LATE, "elastic_fraction": 0.4}, light=area_light()),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=32768,
+        fd_spp=32768,
+    ),
+    Case(
+        "polarized_lifetime",
+        "lifetime of a delayed BSDF",
+        lambda: late_room({**LATE, "elastic": {"type": "roughconductor", "alpha": 0.3}}, light=area_light()),
+        set_color("wall.bsdf.lifetime"),
+        0.4,
+        5e-3,
+        "llvm_ad_mono_polarized",
+        8192,
+        fd_spp=8192,
     ),
 ]

@@ -15,10 +15,11 @@ from torchtransient.render.nodes import children, find_child, is_film, is_integr
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
 POLARIZING_ELEMENTS = ("polarizer", "retarder", "circular", "pplastic", "measured_polarized")
 # Surfaces and phase functions that polarize what they reflect or scatter: one of them in a row leaves the intensity of
-# unpolarized light right, two do not. The other BSDFs of Mitsuba 3.9 depolarize.
-POLARIZING_INTERFACES = (
-    "dielectric", "conductor", "roughconductor", "rayleigh", "diff_dielectric", "diff_rough_dielectric",
-)  # fmt: skip
+# unpolarized light right, two do not. The other BSDFs depolarize. Mitsuba's rough dielectric does too, but is replaced
+# by one that does not in polarized variants.
+POLARIZING_INTERFACES = ("dielectric", "conductor", "roughconductor", "roughdielectric", "rayleigh")
+# Plugins of this library that stand in for Mitsuba's of the same name and follow derivatives further.
+_TWIN = "diff_"
 # A single one of these shapes cannot be met twice in a row.
 _FLAT_SHAPES = ("rectangle", "disk")
 
@@ -82,6 +83,12 @@ def take_census(state: Any, folder_lookup: Any) -> Census:
     return census
 
 
+def like_mitsuba(plugin: str) -> str:
+    """The plugin of Mitsuba that one of this library stands in for, ``dielectric`` for ``diff_dielectric``."""
+    name = plugin.removeprefix(_TWIN)
+    return {"rough_dielectric": "roughdielectric"}.get(name, name)
+
+
 def name_of(state: Any, index: int) -> str:
     """How a message calls a node."""
     import mitsuba as mi
@@ -98,7 +105,9 @@ def name_of(state: Any, index: int) -> str:
 def _note_unused(census: Census, state: Any, used: set[int]) -> None:
     for _, index in children(state, state.root):
         node = state.nodes[index]
-        if index not in used and (kind_of_node(node) == "Medium" or node.props.plugin_name() in POLARIZING_ELEMENTS):
+        if index not in used and (
+            kind_of_node(node) == "Medium" or like_mitsuba(node.props.plugin_name()) in POLARIZING_ELEMENTS
+        ):
             census.declared_only.append(Finding(node.props.plugin_name(), name_of(state, index)))
 
 
@@ -110,9 +119,9 @@ def _note_physics(census: Census, state: Any, index: int, interfaces: list[int])
     plugin = node.props.plugin_name()
     if kind_of_node(node) == "Medium":
         census.media.append(Finding("participating medium", name_of(state, index)))
-    if plugin in POLARIZING_ELEMENTS:
+    if like_mitsuba(plugin) in POLARIZING_ELEMENTS:
         census.elements.append(Finding(plugin, name_of(state, index)))
-    elif plugin in POLARIZING_INTERFACES:
+    elif like_mitsuba(plugin) in POLARIZING_INTERFACES:
         census.interfaces.append(Finding(plugin, name_of(state, index)))
         interfaces.append(index)
 

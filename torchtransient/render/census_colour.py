@@ -29,15 +29,16 @@ _PIXELS_WORTH_READING = 1 << 18
 _TRANSPARENT = frozenset((
     "scene", "area", "angulararea", "directionalarea", "point", "spot", "directional", "constant", "projector",
     "diffuse", "dielectric", "thindielectric", "roughdielectric", "diff_dielectric", "diff_rough_dielectric",
-    "conductor", "roughconductor", "plastic", "roughplastic", "pplastic", "principled", "principledthin",
-    "blendbsdf", "mask", "twosided", "bumpmap", "normalmap", "null", "polarizer", "retarder", "circular", "delayed",
-    "homogeneous", "heterogeneous", "isotropic", "hg", "rayleigh", "tabphase", "blendphase", "sggx", "constvolume",
-    "checkerboard", "srgb", "uniform", "rawconstant", "d65", "volume", "cube", "sphere", "rectangle", "disk",
-    "cylinder", "obj", "ply", "serialized", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve",
-    "sdfgrid", "ellipsoids", "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens",
-    "radiancemeter", "irradiancemeter", "distant", "batch", "hdrfilm", "specfilm", "transient_hdr_film",
-    "phasor_hdr_film", "gated_hdr_film", "independent", "stratified", "multijitter", "orthogonal", "ldsampler",
-    "box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos",
+    "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular", "conductor", "roughconductor", "plastic",
+    "roughplastic", "pplastic", "principled", "principledthin", "blendbsdf", "mask", "twosided", "bumpmap",
+    "normalmap", "null", "polarizer", "retarder", "circular", "delayed", "homogeneous", "heterogeneous",
+    "isotropic", "hg", "rayleigh", "tabphase", "blendphase", "sggx", "constvolume", "checkerboard", "srgb",
+    "uniform", "rawconstant", "d65", "volume", "cube", "sphere", "rectangle", "disk", "cylinder", "obj", "ply",
+    "serialized", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids",
+    "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens", "radiancemeter", "irradiancemeter",
+    "distant", "batch", "hdrfilm", "specfilm", "transient_hdr_film", "phasor_hdr_film", "gated_hdr_film",
+    "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent", "gaussian", "mitchell",
+    "catmullrom", "lanczos",
 ))  # fmt: skip
 _MEASURED_PLUGINS = {
     "regular": "spectrum given over wavelength",
@@ -95,7 +96,7 @@ def colour_of_node(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
         return Verdict(MEASURED, _MEASURED_PLUGINS[plugin])
     if plugin in _COLOURED_PLUGINS:
         return Verdict(COLOUR, _COLOURED_PLUGINS[plugin])
-    if plugin in ("conductor", "roughconductor"):
+    if plugin in ("conductor", "roughconductor", "diff_conductor"):
         material = str(props.get("material", "none"))
         return None if material.lower() == "none" else Verdict(MEASURED, f"indices of {material!r} over wavelength")
     if plugin == "delayed" and any(key in props for key in ("emission", "excitation")):

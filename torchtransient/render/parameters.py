@@ -166,6 +166,8 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
         return True, True, CORRECT
     if (node.class_name(), name) in _BIASED:
         return True, name in ("eta", "specular"), _BIASED[node.class_name(), name]
+    if type(node).__name__ == "DelayedBSDF":
+        return True, name == "lifetime", CORRECT
     if name == "eta" and type(node).__name__.startswith("Diff"):
         return True, True, CORRECT
     if name == "eta" and isinstance(node, mi.BSDF):

@@ -119,7 +119,10 @@ class TransientPath(TransientIntegrator):
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
             active_next = facts.in_time(active_next, τ)
-            bsdf = si.bsdf(ray)
+            u_late = facts.numbers_for_delays(sampler)
+            late = facts.answer(si.bsdf(ray), u_late, ray.wavelengths)
+            bsdf = late.bsdf
+            late.move(si, at)
             active_em = active_next & connectable(media, here, mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             u_em = sampler.next_2d()
             u_lobe = sampler.next_1d()
@@ -127,10 +130,10 @@ class TransientPath(TransientIntegrator):
             ds, em_weight = scene.sample_emitter_direction(at, u_em, False, active_em)
             active_em &= ds.pdf != 0
             wo = si.to_local(ds.d)
-            bsdf_val, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next)
+            sampled = late.scaled_both(bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next))
             bsdf_val, bsdf_pdf, bs, bsdf_weight, out = scatter_in_medium(
                 media, here, ds.d, u_lobe, u_dir, active_next, active_em,
-                (bsdf_val, bsdf_pdf, bs, bsdf_weight, si.to_world(bs.wo)),
+                (*sampled, si.to_world(sampled[2].wo)),
             )  # fmt: skip
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
             turn = turn_out(si, ray.d)
@@ -138,7 +141,7 @@ class TransientPath(TransientIntegrator):
             # Shadow rays only where they can matter; the derivative of a zero may matter.
             if dr.hint(primal, mode="scalar"):
                 active_em &= dr.max(dr.abs(intensity(Lr))) > 0
-            τ_em = τ + mi.Float64(facts.length_to_light(at.p, ds) * facts.index_towards(bsdf, si, wo, η))
+            τ_em = late.after(τ) + mi.Float64(facts.length_to_light(at.p, ds) * facts.index_towards(bsdf, si, wo, η))
             active_em = facts.counted(active_em, τ_em)
             visible, T_em = connect(scene, media, here, ds, u_em, sampler, active_em)
             Lr *= T_em
@@ -182,9 +185,10 @@ class TransientPath(TransientIntegrator):
                 write_vertex(
                     store, depth, active, facts,
                     ray_before, pi_before, β_before, τ, η_before, mis, rr, u_em, u_lobe, u_dir,
-                    active_em, is_delta, active_next,
+                    active_em, is_delta, active_next, u_late,
                 )
                 write_leg(store, depth, active, place, T_em)
+            τ = late.after(τ)
             pi, place = next_leg(scene, media, ray, here, β, sampler, active_next)
             β = carried_on(β, place)
             depth += 1

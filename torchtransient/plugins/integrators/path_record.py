@@ -39,13 +39,19 @@ def allocate(depth: int, facts) -> dict:
     if facts.delta or facts.refracts:
         store["eta"] = dr.alloc_local(mi.Float, size)
         store["u_lobe"] = dr.alloc_local(mi.Float, size)
+    if facts.delays is not None:
+        store["u_late"] = dr.alloc_local(mi.Point2f, size)
+        if facts.delays.shifts:
+            store["wavelengths"] = dr.alloc_local(mi.UnpolarizedSpectrum, size)
     if facts.instances:
         store["instance"] = dr.alloc_local(mi.UInt32, size)
     allocate_legs(store, size, facts)
     return store
 
 
-def write_vertex(store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_lobe, u_dir, lit, is_delta, goes_on):
+def write_vertex(
+    store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_lobe, u_dir, lit, is_delta, goes_on, u_late=None
+):
     """Write vertex ``k``."""
     store["o"].write(ray.o, k, active)
     store["d"].write(ray.d, k, active)
@@ -65,6 +71,10 @@ def write_vertex(store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_
     if "eta" in store:
         store["eta"].write(η, k, active)
         store["u_lobe"].write(u_lobe, k, active)
+    if "u_late" in store:
+        store["u_late"].write(u_late, k, active)
+    if "wavelengths" in store:
+        store["wavelengths"].write(ray.wavelengths, k, active)
     if "instance" in store:
         store["instance"].write(dr.reinterpret_array(mi.UInt32, pi.instance), k, active)
 
@@ -88,10 +98,13 @@ class Vertex:
     goes_on: Any
     scatter: Any
     medium: Any
+    u_late: Any = None
 
 
 def read_vertex(store, k, active, time, wavelengths) -> Vertex:
     """Read vertex ``k``."""
+    if "wavelengths" in store:
+        wavelengths = store["wavelengths"].read(k, active)
     ray = mi.Ray3f(store["o"].read(k, active), store["d"].read(k, active), time, wavelengths)
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.t = store["t"].read(k, active)
@@ -123,4 +136,5 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
         goes_on=active & ((flags & CONTINUES) != 0),
         scatter=mi.Bool(False) if medium is None else active & (medium.t >= 0),
         medium=medium,
+        u_late=store["u_late"].read(k, active) if "u_late" in store else None,
     )

@@ -43,6 +43,8 @@ def vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, t_ray, t_w):
             values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
             if facts.delta:
                 values += [x.p_out, x.d_out]
+            if x.delay is not None:
+                values += [x.delay]
             if facts.emitter_shape_moves:
                 values += [x.E, x.length_E]
         points = moving_points(x, facts)
@@ -61,6 +63,8 @@ def settle_tangents(scene, facts):
     attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
     if facts.refracts and dr.grad_enabled(facts.refraction.table):
         attached.append(facts.refraction.table)
+    if facts.delays is not None:
+        attached += facts.delays.attached()
     if not attached:
         return
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
@@ -78,6 +82,7 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first, 
     of its Stokes frame.
     """
     ctx = mi.BSDFContext()
+    delay_index = 10 if facts.delta else 8
     k = mi.UInt32(0)
     live = k < count
     dL = light_type()(0)
@@ -97,27 +102,32 @@ def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first, 
         legs = push_legs(scene, facts, v, x, nxt, x.t_points, t_x)
         dβ = after_leg(v, dβ, legs)
         dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), x.length_em * x.index_em
+        τ_em, d_delay = v.τ + mi.Float64(length_em * v.η), mi.Float(0)
+        if dr.hint(x.delay is not None, mode="scalar"):
+            τ_em += mi.Float64(x.delay)
+            if dr.hint(facts.geometry, mode="scalar"):
+                d_delay = mi.Float(t[delay_index])
         if dr.hint(facts.geometry, mode="scalar"):
             counted = mi.Float(1)
             if dr.hint(integrator.camera_unwarp, mode="scalar"):
                 counted = dr.select(k == 0, 0, counted)
             dτ_v += counted * (v.η * t[3] + dη * x.seg)
-            dτ_em = dτ_v + v.η * t[4] + dη * length_em
+            dτ_em = dτ_v + v.η * t[4] + dη * length_em + d_delay
         d_Le = column(dβ) * Le + column(v.β) * t[0]
         d_f = product(dβ, f) + product(v.β, t[1] + f * legs.connecting)
         dL += dr.select(live, d_Le + d_f, 0)
         lane.put_slope(events, v.τ, d_Le, column(v.β) * Le * dτ_v, x.hit)
-        lane.put_slope(events, v.τ + mi.Float64(length_em * v.η), d_f, product(v.β, f) * dτ_em, v.lit)
+        lane.put_slope(events, τ_em, d_f, product(v.β, f) * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
             E = x.E
             d_E = product(dβ, E) + product(v.β, t[-2] + E * legs.emitting)
             dL += dr.select(live, d_E, 0)
-            dτ_E = dτ_v + dη * x.step * x.length_E + follow.η * t[-1]
+            dτ_E = dτ_v + d_delay + dη * x.step * x.length_E + follow.η * t[-1]
             lane.put_slope(events, follow.τ, d_E, product(v.β, E) * dτ_E, x.lit_ahead)
 
         # ------------------------------------------------------------------- to the next vertex
         dβ = product(dβ, W) + product(v.β, t[2])
-        dτ = dτ_v
+        dτ = dτ_v + d_delay
         t_x = mi.Vector3f(legs.t_x)
         if dr.hint(facts.geometry, mode="scalar"):
             dτ += follow.η * t[5]

@@ -7,6 +7,7 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.bsdfs.delay_table import Answer, delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sensors.origin import shapes_of_sensors
@@ -25,14 +26,13 @@ SENSOR_KEYS = (
 class SceneFacts:
     """Static choices of the kernels.
 
-    ``bsdfs``: the outermost BSDFs. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape groups.
-    ``distant``: reference sphere of
-    infinitely distant emitters, None when there are none. ``refraction``: table of the indices of transmissive rough
-    BSDFs, None when there are none. ``media``: the participating media, None when there are none (or the integrator
-    refuses them). ``window``: which arrivals the film counts, None where its steady image counts them all. The
-    remaining ones describe which gradients are asked for: ``geometry`` (path
-    lengths change), ``light_moves``, ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are
-    spherical ones), ``sensor_moves``,
+    ``bsdfs``: the outermost BSDFs. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
+    groups. ``distant``: reference sphere of infinitely distant emitters, None when there are none. ``refraction``:
+    table of the indices of transmissive rough BSDFs, None when there are none. ``media``: the participating media,
+    None when there are none (or the integrator refuses them). ``delays``: table of the BSDFs that answer late, None
+    when there are none. ``window``: which arrivals the film counts, None where its steady image counts them all.
+    The remaining ones describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``,
+    ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are spherical ones), ``sensor_moves``,
     ``index_moves``.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
@@ -46,6 +46,7 @@ class SceneFacts:
         self.refraction = refraction
         self.media = None
         self.window = None
+        self.delays = None
         self.geometry = False
         self.light_moves = False
         self.emitter_shape_moves = False
@@ -80,6 +81,14 @@ class SceneFacts:
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         return dr.select(far, self.distant.length(p, ds.d), ds.dist)
 
+    def numbers_for_delays(self, sampler):
+        """The uniform numbers that :meth:`answer` needs at a vertex."""
+        return None if self.delays is None else sampler.next_2d()
+
+    def answer(self, bsdf, u, wavelengths) -> Answer:
+        """How a surface answers a path: which BSDF takes its place, when, and with which weight."""
+        return Answer(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
+
     def in_time(self, active, τ):
         """Which paths of length ``τ`` can still have an event that the film counts."""
         return active if self.window is None else active & ~self.window.over(τ)
@@ -111,7 +120,8 @@ class SceneFacts:
         if self.refraction is not None:
             index |= dr.grad_enabled(self.refraction.table)
         facts = copy.copy(self)
-        facts.geometry = shapes or light or sensor_moves or index
+        late = self.delays is not None and dr.grad_enabled(self.delays.lifetimes)
+        facts.geometry = shapes or light or sensor_moves or index or late
         facts.light_moves = light
         facts.emitter_shape_moves = emitter_shape
         spheres = any(s.is_emitter() and s.class_name() == "Sphere" for s in scene.shapes())
@@ -157,14 +167,16 @@ def _attached(plugin, names) -> bool:
 
 def scene_facts(scene, reference: DistantReference) -> SceneFacts:
     """Read the facts of a scene that do not depend on which gradients are asked for."""
-    bsdfs = bsdfs_of_scene(scene)
+    bsdfs, delays = delays_of(bsdfs_of_scene(scene))
     delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in bsdfs)
     infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
     instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
-    return SceneFacts(
+    facts = SceneFacts(
         bsdfs=bsdfs,
         delta=delta,
         instances=instances,
         distant=reference if infinite else None,
         refraction=RefractionTable.of(scene, bsdfs),
     )
+    facts.delays = delays
+    return facts

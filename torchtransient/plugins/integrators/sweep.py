@@ -71,6 +71,8 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
             x = vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_to(store, k, live, facts))
             f, Le, W = dr.detach(x.f), dr.detach(x.Le), dr.detach(x.W)
             τ_em = mi.Float64(dr.detach(x.length_em) * dr.detach(x.index_em) * v.η)
+            if dr.hint(x.delay is not None, mode="scalar"):
+                τ_em += mi.Float64(dr.detach(x.delay))
             A_e, A1_e = lane.read(v.τ, x.hit)
             A_n, A1_n = lane.read(v.τ + τ_em, v.lit)
             objective = traced_attached(v.β, A_e, x.Le, A_n, x.f, x.W, S)
@@ -94,6 +96,8 @@ def sweep(integrator, scene, count, store, lane, facts, ray0):
                 objective += beyond * v.η * slope_only(seg)
                 objective += traced(v.β, D_em) * v.η * slope_only(x.length_em * x.index_em)
                 objective += traced(v.β, D_out) * next_η * slope_only(x.seg_out)
+                if dr.hint(x.delay is not None, mode="scalar"):
+                    objective += (beyond - traced(v.β, matched(A1_e, Le))) * slope_only(x.delay)
                 objective += dr.select(x.ahead, dr.dot(a_w, x.out), 0)
                 if dr.hint(facts.delta, mode="scalar"):
                     objective += dr.select(x.mirrored, dr.dot(a_o, x.p_out) + dr.dot(a_d, x.d_out), 0)

@@ -168,7 +168,12 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     terms.hit = hit
     terms.Le = dr.select(hit, v.mis * mi.unpolarized_spectrum(sid.emitter(scene).eval(si, hit)), 0)
     turn = turn_out(si, w)
+    late = facts.answer(bsdf, v.u_late, v.ray.wavelengths)
+    bsdf, terms.delay = late.bsdf, late.delay
+    late.move(si)
     emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts)
+
+    terms.f = late.scaled_light(terms.f)
 
     ahead = onward & nxt.valid
     out, J = mi.Vector3f(nxt.d), mi.Float(1)
@@ -176,7 +181,7 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
         out = direction_to(si.p, nxt.p, ahead, out)
         J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead, nxt.volume))
     wo = si.to_local(out)
-    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward)
+    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward, sampled=True)
     inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
     terms.W = dr.select(onward, scattering(val, turn, turn_in(si, wo, out, nxt.d)) * (inv_pdf * J), 0)
     terms.out, terms.ahead = out, ahead
@@ -190,9 +195,11 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     if facts.geometry:
         terms.seg = length_to(facts, ray.o, si.p, terms.valid, ray.d)
         terms.seg_out = dr.select(onward, length_to(facts, si.p, nxt.p, nxt.valid, nxt.d), 0)
+    terms.W = late.scaled(terms.W)
     terms.E = None
     if facts.emitter_shape_moves:
         emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts)
+        terms.E = late.scaled_light(terms.E)
     return terms
 
 

@@ -64,12 +64,18 @@ def surface_or_medium(v, ray, w, facts, live):
     return si, InMedium(v.scatter, mei, σ_s, phase, stretch)
 
 
-def evaluate(inside, ctx, bsdf, si, wo, d, active):
-    """Scattering and its density towards ``d`` (``wo`` in the frame of ``si``) of a surface or a medium."""
+def evaluate(inside, ctx, bsdf, si, wo, d, active, sampled=False):
+    """Scattering and its density towards ``d`` (``wo`` in the frame of ``si``) of a surface or a medium.
+
+    A phase function too narrow for single precision has no light towards a given point, and its own samples
+    (``sampled``) have the ratio of value and density that they were drawn with.
+    """
     val, pdf = bsdf.eval_pdf(ctx, si, wo, active)
     if inside is None:
         return val, pdf
     value, density = inside.phase.eval_pdf(mi.PhaseFunctionContext(None), inside.mei, d, active & inside.scatter)
-    usable = dr.isfinite(dr.detach(density)) & inside.scatter
-    value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value) * inside.σ_s, 0))
-    return dr.select(inside.scatter, value, val), dr.select(usable, density, pdf)
+    usable = dr.isfinite(dr.detach(density)) & (dr.detach(density) > 0)
+    other = 1 if sampled else 0
+    value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value), other) * inside.σ_s)
+    density = dr.select(usable, density, other)
+    return dr.select(inside.scatter, value, val), dr.select(inside.scatter, density, pdf)

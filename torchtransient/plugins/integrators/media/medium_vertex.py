@@ -18,9 +18,13 @@ def reference(si, mei, scatter):
     return at
 
 
-def finite(value):
-    """Zero where a phase function is so narrow that single precision has no value for it."""
-    return dr.select(dr.isfinite(value), value, 0)
+# Stands for the density of a phase function so narrow that single precision has none; its square is still a number.
+DELTA_LIKE = 1e15
+
+
+def finite(value, otherwise=0):
+    """``otherwise`` where a phase function is so narrow that single precision has no value for it."""
+    return dr.select(dr.isfinite(value), value, otherwise)
 
 
 def unpolarizing(value):
@@ -47,7 +51,7 @@ def scatter_in_medium(media, here, d_em, u_lobe, u_dir, active, active_em, surfa
     σ_s = mei.medium.get_scattering_coefficients(mei, active)[0]
     f, f_pdf = phase.eval_pdf(ctx, mei, d_em, active_em)
     wo, w, w_pdf = phase.sample(ctx, mei, u_lobe, u_dir, active)
-    w_pdf = finite(w_pdf)
+    w_pdf = finite(w_pdf, DELTA_LIKE)
     w = dr.select(w_pdf > 0, finite(mi.unpolarized_spectrum(w)) * σ_s, 0)
     bs = dr.copy(bs)
     bs.pdf = dr.select(scatter, w_pdf, bs.pdf)
