@@ -160,6 +160,13 @@ def test_stokes_vectors_take_a_polarized_variant():
     assert static(tt.scenes.cornell_box(4), ("transient", "stokes")).variant == "llvm_ad_spectral_polarized"
 
 
+def test_a_scene_that_measures_stokes_vectors_keeps_them():
+    scene = plan_scenes.grey_room(integrator={"type": "stokes", "nested": {"type": "path", "max_depth": 4}})
+    plan = static(scene, max_depth="scene")
+    assert (plan.variant, plan.integrator, plan.max_depth) == ("llvm_ad_mono_polarized", "transient_path", 4)
+    assert plan.renderer()(seed=0, spp=1).transient.shape[:2] == (4, 1)
+
+
 def test_light_between_smooth_surfaces():
     """Two polarizing reflections in a row change the intensity: carried when strict, and said when not."""
     one = plan_scenes.grey_room(wall={"type": "rectangle", "bsdf": {"type": "dielectric"}})

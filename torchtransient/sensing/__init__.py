@@ -1,5 +1,19 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.compose import Compose as Compose
+from torchtransient.sensing.compose import adjoint as adjoint
+from torchtransient.sensing.compose import linearity_error as linearity_error
+from torchtransient.sensing.depth import Returns as Returns
+from torchtransient.sensing.depth import background_per_bin as background_per_bin
+from torchtransient.sensing.depth import centre_of_mass as centre_of_mass
+from torchtransient.sensing.depth import distance_of_position as distance_of_position
+from torchtransient.sensing.depth import distance_to_points as distance_to_points
+from torchtransient.sensing.depth import first_return as first_return
+from torchtransient.sensing.depth import log_matched_filter as log_matched_filter
+from torchtransient.sensing.depth import multi_return as multi_return
+from torchtransient.sensing.depth import peak_position as peak_position
+from torchtransient.sensing.depth import range_deviation_m as range_deviation_m
+from torchtransient.sensing.depth import soft_argmax as soft_argmax
 from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics
 from torchtransient.sensing.electronics import fixed_pattern as fixed_pattern
 from torchtransient.sensing.electronics import ktc_noise as ktc_noise
@@ -7,6 +21,8 @@ from torchtransient.sensing.free_running import FreeRunningSPAD as FreeRunningSP
 from torchtransient.sensing.free_running import free_running_rate as free_running_rate
 from torchtransient.sensing.free_running import nonparalyzable_histogram as nonparalyzable_histogram
 from torchtransient.sensing.free_running import paralyzable_histogram as paralyzable_histogram
+from torchtransient.sensing.gated import GatedIntegration as GatedIntegration
+from torchtransient.sensing.gated import gate_profiles as gate_profiles
 from torchtransient.sensing.impulse_response import ComposedResponse as ComposedResponse
 from torchtransient.sensing.impulse_response import GaussianResponse as GaussianResponse
 from torchtransient.sensing.impulse_response import ImpulseResponse as ImpulseResponse
@@ -70,4 +86,6 @@ from torchtransient.sensing.spatial_psf import SpatialPSF as SpatialPSF
 from torchtransient.sensing.spatial_psf import blur_image as blur_image
 from torchtransient.sensing.spatial_psf import defocus_psf as defocus_psf
 from torchtransient.sensing.spatial_psf import gaussian_psf as gaussian_psf
+from torchtransient.sensing.streak import StreakCamera as StreakCamera
+from torchtransient.sensing.streak import SweepJitter as SweepJitter
 from torchtransient.sensing.time_convolution import convolve_time as convolve_time
