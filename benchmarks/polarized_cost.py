@@ -1,8 +1,8 @@
 """Polarized: `transient_path` in a polarized variant against Mitsuba's steady `stokes(path)`.
 
 Cornell box with a metal and a glass block, 128 x 128, 64 spp, depth 8, 300 bins, `llvm_ad_mono_polarized`. Bar: 1.2 x
-the steady integrator. With `--peer-python` mitransient runs between our runs, in its own process and environment, and is
-compared with its own `stokes(path)`.
+the steady integrator. With `--peer-python` mitransient runs between our runs, in its own process and environment, and
+is compared with its own `stokes(path)`.
 """
 
 from __future__ import annotations
