@@ -49,6 +49,7 @@ class SceneFacts:
         self.two_sided = two_sided_table(bsdfs) if mi.is_polarized else None
         self.media = None
         self.window = None
+        self.light_box = None
         self.delays = None
         self.geometry = False
         self.light_moves = False
@@ -105,9 +106,12 @@ class SceneFacts:
         """How a surface answers a path: which BSDF takes its place, when, and with which weight."""
         return Answer(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
 
-    def in_time(self, active, τ):
-        """Which paths of length ``τ`` can still have an event that the film counts."""
-        return active if self.window is None else active & ~self.window.over(τ)
+    def in_time(self, active, τ, p):
+        """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""
+        if self.window is None:
+            return active
+        least = τ if self.light_box is None else τ + mi.Float64(self.light_box.distance(p))
+        return active & ~self.window.over(least)
 
     def counted(self, active, τ):
         """Which arrivals at ``τ`` the film counts."""
