@@ -1,8 +1,20 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.afterpulsing import Afterpulsing as Afterpulsing
+from torchtransient.sensing.afterpulsing import Crosstalk as Crosstalk
+from torchtransient.sensing.afterpulsing import add_afterpulses as add_afterpulses
+from torchtransient.sensing.afterpulsing import add_crosstalk as add_crosstalk
+from torchtransient.sensing.afterpulsing import afterpulse_kernel as afterpulse_kernel
+from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rates
+from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
+from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
 from torchtransient.sensing.compose import adjoint as adjoint
 from torchtransient.sensing.compose import linearity_error as linearity_error
+from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram
+from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
+from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
+from torchtransient.sensing.compressed_histograms import fourier_codes as fourier_codes
 from torchtransient.sensing.depth import Returns as Returns
 from torchtransient.sensing.depth import background_per_bin as background_per_bin
 from torchtransient.sensing.depth import centre_of_mass as centre_of_mass
@@ -88,6 +100,7 @@ from torchtransient.sensing.shot_noise import poisson_log_prob as poisson_log_pr
 from torchtransient.sensing.spad import CoatesEstimate as CoatesEstimate
 from torchtransient.sensing.spad import SynchronousSPAD as SynchronousSPAD
 from torchtransient.sensing.spad import coates as coates
+from torchtransient.sensing.spad import first_photon_log_prob as first_photon_log_prob
 from torchtransient.sensing.spad import first_photon_probabilities as first_photon_probabilities
 from torchtransient.sensing.spad import sample_detections as sample_detections
 from torchtransient.sensing.spatial_psf import LensBlur as LensBlur
@@ -97,4 +110,6 @@ from torchtransient.sensing.spatial_psf import defocus_psf as defocus_psf
 from torchtransient.sensing.spatial_psf import gaussian_psf as gaussian_psf
 from torchtransient.sensing.streak import StreakCamera as StreakCamera
 from torchtransient.sensing.streak import SweepJitter as SweepJitter
+from torchtransient.sensing.tdc import TDC as TDC
+from torchtransient.sensing.tdc import random_code_widths as random_code_widths
 from torchtransient.sensing.time_convolution import convolve_time as convolve_time

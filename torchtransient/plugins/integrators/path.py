@@ -118,7 +118,7 @@ class TransientPath(TransientIntegrator):
 
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
-            active_next = facts.in_time(active_next, τ)
+            active_next = facts.in_time(active_next, τ, at.p)
             u_late = facts.numbers_for_delays(sampler)
             late = facts.answer(si.bsdf(ray), u_late, ray.wavelengths)
             bsdf = late.bsdf

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import Answer, delays_of
-from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.polarized import from_mirrored
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sensors.origin import shapes_of_sensors
@@ -49,6 +49,7 @@ class SceneFacts:
         self.two_sided = two_sided_table(bsdfs) if mi.is_polarized else None
         self.media = None
         self.window = None
+        self.light_box = None
         self.delays = None
         self.geometry = False
         self.light_moves = False
@@ -105,9 +106,12 @@ class SceneFacts:
         """How a surface answers a path: which BSDF takes its place, when, and with which weight."""
         return Answer(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
 
-    def in_time(self, active, τ):
-        """Which paths of length ``τ`` can still have an event that the film counts."""
-        return active if self.window is None else active & ~self.window.over(τ)
+    def in_time(self, active, τ, p):
+        """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""
+        if self.window is None:
+            return active
+        least = τ if self.light_box is None else τ + mi.Float64(self.light_box.distance(p))
+        return active & ~self.window.over(least)
 
     def counted(self, active, τ):
         """Which arrivals at ``τ`` the film counts."""
@@ -179,8 +183,10 @@ def two_sided_table(bsdfs):
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
     exchanged.
     """
-    # Its description names what a mask or a blend holds, too.
+    # A description names what a mask or a blend holds, too. A path may be handed the part of a BSDF by its own pointer.
     two_sided = [bsdf for bsdf in bsdfs if "TwoSided[" in str(bsdf)]
+    for bsdf in two_sided:
+        two_sided += [part for part in bsdfs_below(bsdf) if "TwoSided[" in str(part)]
     numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in two_sided]
     if not numbers:
         return None
