@@ -69,6 +69,36 @@ ENTRIES = [
         ),
         dtypes=ALL,
     ),
+    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), dtypes=ALL, random=True),
+    Entry(
+        "SynchronousSPAD-gate",
+        lambda **k: sensing.SynchronousSPAD(500, gate=torch.linspace(0, 1, 12), **k),
+        random=True,
+    ),
+    Entry(
+        "SynchronousSPAD-dead-time",
+        lambda **k: sensing.SynchronousSPAD(500, dead_time_s=70 * PS, bin_width_s=20 * PS, **k),
+        random=True,
+    ),
+    Entry(
+        "FreeRunningSPAD",
+        lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, learnable=True, **k),
+        random=True,
+        policies=("expected", "gaussian", "straight_through"),
+    ),
+    Entry(
+        "FreeRunningSPAD-paralyzable",
+        lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="paralyzable", learnable=True, **k),
+        random=True,
+        policies=("expected", "gaussian", "straight_through"),
+        errors=(
+            (lambda: sensing.FreeRunningSPAD(500, 75.0, bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.FreeRunningSPAD(500, 75 * PS), UnitError),
+            (lambda: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="strange"), ShapeError),
+            (lambda: sensing.SynchronousSPAD(2.5), UnitError),
+            (lambda: sensing.SynchronousSPAD(5, dead_time_s=75.0, bin_width_s=20 * PS), UnitError),
+        ),
+    ),
     Entry(
         "ShotNoise",
         sensing.ShotNoise,

@@ -3,6 +3,10 @@
 from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics
 from torchtransient.sensing.electronics import fixed_pattern as fixed_pattern
 from torchtransient.sensing.electronics import ktc_noise as ktc_noise
+from torchtransient.sensing.free_running import FreeRunningSPAD as FreeRunningSPAD
+from torchtransient.sensing.free_running import free_running_rate as free_running_rate
+from torchtransient.sensing.free_running import nonparalyzable_histogram as nonparalyzable_histogram
+from torchtransient.sensing.free_running import paralyzable_histogram as paralyzable_histogram
 from torchtransient.sensing.impulse_response import ComposedResponse as ComposedResponse
 from torchtransient.sensing.impulse_response import GaussianResponse as GaussianResponse
 from torchtransient.sensing.impulse_response import ImpulseResponse as ImpulseResponse
@@ -56,6 +60,11 @@ from torchtransient.sensing.sensor import Sensor as Sensor
 from torchtransient.sensing.shot_noise import ShotNoise as ShotNoise
 from torchtransient.sensing.shot_noise import poisson as poisson
 from torchtransient.sensing.shot_noise import poisson_log_prob as poisson_log_prob
+from torchtransient.sensing.spad import CoatesEstimate as CoatesEstimate
+from torchtransient.sensing.spad import SynchronousSPAD as SynchronousSPAD
+from torchtransient.sensing.spad import coates as coates
+from torchtransient.sensing.spad import first_photon_probabilities as first_photon_probabilities
+from torchtransient.sensing.spad import sample_detections as sample_detections
 from torchtransient.sensing.spatial_psf import LensBlur as LensBlur
 from torchtransient.sensing.spatial_psf import SpatialPSF as SpatialPSF
 from torchtransient.sensing.spatial_psf import blur_image as blur_image
