@@ -72,7 +72,7 @@ def test_thin(sigma_t):
     assert np.array_equal(*[np.flatnonzero(x)[[0, -1]] for x in lit])
 
 
-@pytest.mark.parametrize("grid", [None, 0.0, 1.0])
+@pytest.mark.parametrize("grid", [None, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 1.0))])
 def test_gradient_by_a_density_of_zero(grid):
     """The first medium to come: one-sided differences of second order, since there is nothing on the other side."""
 
