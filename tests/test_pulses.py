@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.pulses import Pulse, cumulative_of_sum
+from torchtransient.pulses import Pulse, cumulative_of_sum, transform
 from torchtransient.units import SPEED_OF_LIGHT
 
 MEASURED = Pulse.tabulated((-0.1, 0.0, 0.05, 0.3), (0.0, 2.0, 1.0, 0.0))
@@ -85,6 +85,17 @@ def test_sum_of_two_boxes_is_a_trapezium():
     # of second order in the step: h^2 / 24 times the largest slope of the density, 1 / (0.2 * 0.1)
     np.testing.assert_allclose(values, expected, atol=50 * h**2)
     assert values[0] == 0 and values[-1] == 1
+
+
+def test_transform():
+    nu = np.array([0.0, 0.5, 3.0, -3.0])
+    s = 0.2 / 2.3548200450309493
+    gaussian = np.exp(-2 * (np.pi * s * nu) ** 2 - 2j * np.pi * nu * 0.1)
+    # the Gaussian is cut at 4 standard deviations
+    np.testing.assert_allclose(transform(Pulse.gaussian(0.2, center_opl=0.1), nu), gaussian, atol=2e-4)
+    box = np.sinc(nu * 0.25) * np.exp(-2j * np.pi * nu * 0.7)
+    np.testing.assert_allclose(transform(Pulse.rectangular(0.25, center_opl=0.7), nu), box, atol=1e-9)
+    assert transform(MEASURED, 0.0) == pytest.approx(1) and transform(MEASURED, 40.0).shape == (1,)
 
 
 @pytest.mark.parametrize(

@@ -60,8 +60,10 @@ class Gate:
         """Fully open at ``center_opl``; closes like a Gaussian, to zero at four standard deviations."""
         if not fwhm_opl > 0:
             raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm_opl!r}.")
-        half = CUT_STDDEVS * float(fwhm_opl) / FWHM_PER_STDDEV
-        return cls("gaussian", float(center_opl) - half, float(center_opl) + half)
+        center, fwhm = float(center_opl), float(fwhm_opl)
+        half = CUT_STDDEVS * fwhm / FWHM_PER_STDDEV
+        # Center and width are kept too: start and end would give them back with a rounding error.
+        return cls("gaussian", center - half, center + half, (center, fwhm))
 
     @classmethod
     def tabulated(cls, opl: Sequence[float], values: Sequence[float]) -> Gate:
@@ -95,6 +97,8 @@ class Gate:
 
     def shifted(self, opl: float) -> Gate:
         """The same gate, opened ``opl`` metres later."""
+        if self.kind == "gaussian":
+            return Gate.gaussian(self.opl[0] + opl, self.opl[1])
         moved = tuple(length + opl for length in self.opl)
         return Gate(self.kind, self.start_opl + opl, self.end_opl + opl, moved, self.values)
 
@@ -156,8 +160,7 @@ class Gate:
             pairs = zip(self.opl, self.values, strict=True)
             return "tabulated " + " ".join(f"{length!r}:{value!r}" for length, value in pairs)
         if self.kind == "gaussian":
-            width = (self.end_opl - self.start_opl) * FWHM_PER_STDDEV / (2 * CUT_STDDEVS)
-            return f"gaussian {0.5 * (self.start_opl + self.end_opl)!r} {width!r}"
+            return f"gaussian {self.opl[0]!r} {self.opl[1]!r}"
         return f"rectangular {self.start_opl!r} {self.end_opl!r}"
 
 

@@ -140,6 +140,23 @@ class Pulse:
         return np.asarray((sums[i] + t * (density[i] + 0.5 * slope * t)) / sums[-1], dtype=np.float64)
 
 
+def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
+    """Fourier transform of a pulse (F,): what it does to a phasor at frequencies (F,) in cycles per metre.
+
+    A phasor film spreads no arrivals; ``out.phasor`` times this, one factor for each frequency, is what it would
+    measure under the pulse. One at frequency zero.
+    """
+    low, high = pulse.support_opl
+    wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64)).ravel()
+    # Sixteen steps for every cycle of the highest frequency, and a factor for the width of a step.
+    count = max(4096, math.ceil(16 * (high - low) * float(np.abs(wanted).max(initial=0.0))))
+    edges = np.linspace(low, high, count + 1)
+    shares = np.diff(pulse.cumulative(edges))
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    waves = np.array([np.exp(-2j * np.pi * nu * middle) @ shares for nu in wanted])
+    return np.asarray(waves * np.sinc(wanted * (high - low) / count), dtype=np.complex128)
+
+
 def cumulative_of_sum(pulses: Sequence[Pulse], step: float) -> tuple[int, Array]:
     """Cumulative distribution of the sum of independent delays, one from each pulse: the convolution of the pulses.
 

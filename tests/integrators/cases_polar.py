@@ -51,6 +51,13 @@ def filtered(element, near=0.01):
     return {**scene, "screen": {"type": "rectangle", "to_world": screen, "bsdf": element}}
 
 
+def from_behind():
+    """The room with a wall of two-sided metal that shows its back."""
+    scene = metal_room({"type": "twosided", "nested": METAL})
+    scene["wall"]["to_world"] = transform().rotate([0, 1, 0], 180)
+    return scene
+
+
 def glass(plugin, **arguments):
     """The slab before a wall of rough metal."""
     scene = glass_slab({"type": plugin, "int_ior": 1.5, "ext_ior": 1.0, **arguments})
@@ -130,6 +137,15 @@ CASES = [
     ),
     polar("polar_wall_distance", MOTION, metal_room, move("wall.to_world", (0, 0, 1)), 0.0, 1e-3),
     polar("polar_wall_tilts", MOTION, metal_room, rotate("wall.to_world", (0.3, 1, 0)), 0.0, 0.1, fd_spp=8192),
+    polar(
+        "polar_two_sided_tilts",
+        MOTION,
+        from_behind,
+        rotate("wall.to_world", (0.3, 1, 0)),
+        0.0,
+        0.1,
+        fd_spp=8192,
+    ),
     polar("polar_mirror_tilts", MOTION, mirrors, rotate("wall.to_world", (0.3, 1, 0)), 0.0, 0.05),
     polar(
         "polar_polarizer_turns",

@@ -135,3 +135,70 @@ def test_layout_of_tensors():
     np.testing.assert_allclose(
         tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=8)(seed=0).steady[0], plain.steady, rtol=1e-5
     )
+
+
+def lit_polarizer(film, kind="polarizer"):
+    """A lamp seen through a polarizer, 3 metres away."""
+    return {
+        "type": "scene",
+        "integrator": {"type": "transient_path", "max_depth": 4},
+        "sensor": {
+            "type": "perspective",
+            "fov": 1e-4,
+            "to_world": t().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+            "film": {"width": 1, "height": 1, "rfilter": {"type": "box"}, **film},
+        },
+        "screen": {
+            "type": "rectangle",
+            "to_world": t().translate([0, 0, 1]),
+            "bsdf": {"type": kind, "theta": number(-25.0)},
+        },
+        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": 2.0}},
+    }
+
+
+STATE = np.array([1.0, np.cos(np.radians(50.0)), np.sin(np.radians(50.0)), 0.0])
+
+
+def test_phasors_of_stokes_vectors():
+    """``S exp(-2 pi i nu opl)``, the components in front of channels and frequencies."""
+    film = {"type": "phasor_hdr_film", "frequencies": "0, 0.7, 12.3"}
+    for variant, channels in ((VARIANT, 1), ("llvm_ad_spectral_polarized", 3)):
+        mi.set_variant(variant)
+        out = tt.TransientRenderer(tt.load(lit_polarizer(film), variant=variant), spp=64)(seed=0)
+        assert out.phasor.shape == (4, channels, 3, 1, 1)
+        wave = np.exp(-2j * np.pi * 3.0 * np.array([0, 0.7, 12.3]))
+        brightness = out.steady[0, :, 0, 0].numpy()
+        if channels == 1:
+            np.testing.assert_allclose(brightness, 1.0, rtol=1e-5)
+        expected = STATE[:, None, None] * brightness[:, None] * wave
+        np.testing.assert_allclose(out.phasor[..., 0, 0].numpy(), expected, atol=3e-5 * brightness.max())
+        np.testing.assert_allclose(out.steady[:, :, 0, 0].numpy(), STATE[:, None] * brightness, atol=1e-5)
+
+
+def test_gradient_of_a_polarization_loss():
+    """Through the layer: the angle of a polarizer from the angle of polarization, S1 and S2 alone."""
+    film = {"type": "transient_hdr_film", "temporal_bins": 10, "start_opl": 2.5, "bin_width_opl": 0.1}
+    key = "screen.bsdf.theta.value"
+    renderer = tt.TransientRenderer(tt.load(lit_polarizer(film), variant=VARIANT), parameters=[key], spp=16)
+    out = renderer({key: renderer.values[key]}, seed=0)
+    angle = tt.stokes.angle_of_linear_polarization(out.transient.sum(-3), tt.stokes.STEADY_DIM)
+    assert float(angle.detach()) == pytest.approx(np.radians(25.0), abs=1e-5)
+    angle.sum().backward()
+    # Mitsuba's angle turns clockwise as the camera sees it.
+    assert float(renderer.values[key].grad) == pytest.approx(-np.pi / 180, rel=1e-3)
+    dop = tt.stokes.degree_of_polarization(renderer(seed=0).steady, tt.stokes.STEADY_DIM)
+    assert float(dop.detach()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_scenes_are_built_with_finite_derivatives():
+    """``tt.load`` takes this library's elements in polarized variants, in others Mitsuba's own."""
+    film = {"type": "transient_hdr_film", "temporal_bins": 10, "start_opl": 2.5, "bin_width_opl": 0.1}
+    for kind in ("polarizer", "retarder"):
+        for variant in (VARIANT, "llvm_ad_mono"):
+            scene = tt.load(lit_polarizer(film, kind), variant=variant)
+            keys = scene.parameters()
+            assert keys["screen.bsdf.theta.value"].differentiable
+            renderer = tt.TransientRenderer(scene, parameters=["screen.bsdf.theta.value"], spp=4)
+            renderer(seed=0).transient.sum().backward()
+            assert np.isfinite(float(renderer.values["screen.bsdf.theta.value"].grad))

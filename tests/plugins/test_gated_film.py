@@ -12,6 +12,7 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import GradientError, SceneError
+from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 from torchtransient.testing.statistics import two_sample_z_test
 
@@ -259,3 +260,38 @@ def test_arguments():
 
 def _pulsed():
     return {**make_room()["sensor"]["film"], "pulse": "gaussian", "pulse_fwhm_opl": 0.2}
+
+
+@pytest.mark.parametrize("kind", ["area light", "glass", "sky"])
+def test_pruning_leaves_every_counted_event(kind):
+    """Paths that cannot reach a light in time end early; what is left is the full render, path by path."""
+    room = mirrored()
+    if kind == "glass":
+        room["box"]["bsdf"] = {"type": "diff_dielectric", "int_ior": 1.2, "ext_ior": 1.5}
+    elif kind == "area light":
+        pose = np.diag([0.3, 0.3, -0.3, 1.0])
+        pose[:3, 3] = -0.5, 0.25, 4.0
+        room["light"] = {
+            "type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 9}}
+        }  # fmt: skip
+    else:
+        room["light"] = {"type": "constant"}
+    scene = tt.load(room, variant=VARIANT)
+    axis = tt.TimeAxis(8.5, 0.1, 30) if kind == "sky" else tt.TimeAxis(7.5, 0.1, 15)
+    cut, _ = runs(tt.TransientRenderer(scene, time_axis=axis, spp=256, steady=False), 2)
+    full, _ = runs(tt.TransientRenderer(scene, time_axis=axis, spp=256), 2)
+    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
+    assert np.count_nonzero(full.sum((0, 1, 3, 4))) > 10
+
+
+def test_light_box():
+    with mi.variant_context(VARIANT):
+        plugins.sync()
+        lamp = {"type": "sphere", "center": [0, 0, 3], "radius": 0.5, "emitter": {"type": "area"}}
+        scene = mi.load_dict({"type": "scene", "lamp": lamp, "spot": {"type": "point", "position": [2, 0, 3]}})
+        p = mi.Point3f([0, 1, -1, 4], [0, 0, 0, 4], [0, 3, 3, 3])
+        box = LightBox.of(scene, [])
+        np.testing.assert_allclose(box.distance(p), [2.5, 0, 0.5, np.hypot(2, 3.5)], rtol=2e-5)
+        glass = mi.load_dict({"type": "dielectric"})
+        assert LightBox.of(scene, [glass]) is None
+        assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None

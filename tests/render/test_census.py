@@ -50,7 +50,7 @@ def polarizes(matrices: np.ndarray) -> bool:
 @pytest.mark.parametrize("name", [*MITSUBA, *OURS])
 def test_what_polarizes_is_listed(name):
     plugins.sync()
-    nested = {"bsdf": {"type": "diffuse"}} if name == "delayed" else {}
+    nested = {"lifetime": 0.1, "bsdf": {"type": "diffuse"}} if name == "delayed" else {}
     found = polarizes(mueller_matrices(mi.load_dict({"type": name, **nested})))
     listed = like_mitsuba(name) in (*POLARIZING_ELEMENTS, *POLARIZING_INTERFACES)
     # Mitsuba's rough dielectric depolarizes; polarized renders replace it by one that does not.

@@ -48,6 +48,8 @@ def light(intensity):
 BANDS = spectrum((450.0, 0.0), (460.0, 1.0), (470.0, 0.0), (640.0, 0.0), (650.0, 1.0), (660.0, 0.0))
 SALMON = {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.4)}
 PIXELS = np.random.default_rng(1).random((2, 2, 3))
+FLAT = spectrum((300.0, 0.5), (900.0, 0.5))
+DYE = {"type": "delayed", "lifetime": 0.1, "bsdf": plan_scenes.GREY, "excitation": FLAT, "emission": FLAT}
 COLOURED = {
     "surface": wall(rgb(0.5, 0.5, 0.4)),
     "hidden surface": {"extra": plan_scenes.hidden({"type": "twosided", "bsdf": SALMON})},
@@ -60,6 +62,7 @@ MEASURED = {
     "emission in two bands": light(BANDS),
     "reflectance": wall(BANDS),
     "gold": {"extra": plan_scenes.hidden({"type": "roughconductor", "material": "Au"})},
+    "fluorescence": {"extra": plan_scenes.hidden(DYE)},
     "black body": {"light": {"type": "constant", "radiance": {"type": "blackbody", "temperature": 3000.0}}},
     "flat table that ends in the visible": light(spectrum((500.0, 1.0), (600.0, 1.0))),
 }
@@ -155,6 +158,13 @@ def test_a_polarizer_by_reference_and_with_colour():
 def test_stokes_vectors_take_a_polarized_variant():
     assert static(plan_scenes.grey_room(), ("stokes",)).variant == "llvm_ad_mono_polarized"
     assert static(tt.scenes.cornell_box(4), ("transient", "stokes")).variant == "llvm_ad_spectral_polarized"
+
+
+def test_a_scene_that_measures_stokes_vectors_keeps_them():
+    scene = plan_scenes.grey_room(integrator={"type": "stokes", "nested": {"type": "path", "max_depth": 4}})
+    plan = static(scene, max_depth="scene")
+    assert (plan.variant, plan.integrator, plan.max_depth) == ("llvm_ad_mono_polarized", "transient_path", 4)
+    assert plan.renderer()(seed=0, spp=1).transient.shape[:2] == (4, 1)
 
 
 def test_light_between_smooth_surfaces():

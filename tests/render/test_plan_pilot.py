@@ -169,6 +169,16 @@ def test_axes_hold_both_ends():
             assert axis.num_bins <= 302
 
 
+def test_delays_are_part_of_the_window():
+    """A wall that answers with a lifetime of 0.5 m: all but a hundredth of the light within ln(100) lifetimes."""
+    slow = {"type": "delayed", "lifetime": 0.5, "bsdf": plan_scenes.GREY}
+    plain = tt.plan(plan_scenes.grey_room(), missed=1e-2)
+    late = tt.plan(plan_scenes.grey_room(wall={"type": "rectangle", "bsdf": slow}), missed=1e-2)
+    assert late.variant == "llvm_ad_mono"
+    tail = late.time_axis.end_opl - plain.time_axis.end_opl
+    assert 0.5 * np.log(100) - 0.15 < tail < 0.5 * np.log(100) + 0.5
+
+
 def test_pulses_widen_the_window():
     scene = tt.scenes.moving_wall()
     plain = tt.plan(scene)
@@ -179,11 +189,24 @@ def test_pulses_widen_the_window():
     assert float(output.transient.sum()) == pytest.approx(float(output.steady.sum()), rel=1e-3)
 
 
+def test_the_sensor_that_was_planned_for():
+    far = plan_scenes.grey_room()["sensor"]
+    far["to_world"] = plan_scenes.look_at([0.0, 0.0, 9.0], [0.0, 0.0, 0.0])
+    scene = plan_scenes.grey_room(far=far)
+    near, distant = tt.plan(scene), tt.plan(scene, sensor=1)
+    assert distant.time_axis.start_opl == pytest.approx(near.time_axis.start_opl + 5.0, abs=0.1)
+    output = distant.renderer()(seed=0)
+    assert float(output.transient.sum()) == pytest.approx(float(output.steady.sum()), rel=1e-3)
+    with pytest.raises(SceneError, match="the scene has 2"):
+        tt.plan(scene, sensor=2)
+
+
 def test_a_dark_scene_says_so():
     scene = plan_scenes.grey_room(light={"type": "point", "position": [0.0, 0.0, -4.0], "intensity": 1.0})
     plan = tt.plan(scene)
     assert plan.time_axis == tt.TimeAxis(7.0, 0.05, 64)
     assert any("no light" in line for line in plan.reasons)
+    assert json.loads(json.dumps(plan.to_dict(), allow_nan=False))["pilot"]["relative_error"] is None
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4}
     with pytest.raises(SceneError, match="no light"):
         tt.plan(scene)

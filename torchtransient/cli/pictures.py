@@ -51,7 +51,7 @@ def check_pictures(options: dict[str, Any], phasors: bool) -> None:
     for name in ("overview", "peak_time", "rainbow"):
         if options[name] and phasors:
             flag = name.replace("_", "-")
-            raise click.UsageError(f"--{flag} shows a histogram over time; leave it out for phasors.")
+            raise click.UsageError(f"--{flag} shows a histogram over time; leave it out for phasors and gates.")
         if options[name]:
             check_picture(options[name])
     if options["video"]:

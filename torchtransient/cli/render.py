@@ -51,14 +51,16 @@ def command(scene: Path, **options: Any) -> None:
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats = output.stats
     stokes = "Stokes x " if output.polarized else ""
-    if output.transient is None:
+    if output.gates is not None:
+        what, how = f"{_sizes(output.transient)} ({stokes}C x G x H x W) gates", ""
+    elif output.transient is None:
         what, how = f"{_sizes(output.phasor)} ({stokes}C x F x H x W) phasors", ""
     else:
         what, how = f"{_sizes(output.transient)} ({stokes}C x T x H x W)", f", {stats.temporal_filter} filter"
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
-    if output.transient is not None:
+    if output.axis is not None:
         _report_energy(output)
-    check_pictures(options, phasors=output.transient is None)
+    check_pictures(options, phasors=output.axis is None)
     write_pictures(output, options, scene.name)
 
 

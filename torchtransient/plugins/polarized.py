@@ -212,3 +212,20 @@ def scattering(value, out, into):
         [b * out.c - a * out.s for a, b in zip(m[1], m[2], strict=True)],
     )
     return mi.Spectrum(*[entry for row in m for entry in row])
+
+
+def from_mirrored(value, wi, wo, mirrored):
+    """A BSDF's value between the frames of its directions, where ``mirrored`` lanes hold it between the frames of their
+    mirror images at the surface.
+
+    Reflected, a frame changes its hand: S2 and S3 change their signs on both sides.
+    """
+    m = [[value[i, j] if (i < 2) == (j < 2) else -value[i, j] for j in range(4)] for i in range(4)]
+    out = turn_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])
+    into = turn_between(-wo, _mirror(mi.coordinate_system(_mirror(-wo))[0]), mi.coordinate_system(-wo)[0])
+    upright = scattering(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
+    return dr.select(mirrored, upright, value)
+
+
+def _mirror(v):
+    return mi.Vector3f(v.x, v.y, -v.z)

@@ -36,9 +36,9 @@ _TRANSPARENT = frozenset((
     "uniform", "rawconstant", "d65", "volume", "cube", "sphere", "rectangle", "disk", "cylinder", "obj", "ply",
     "serialized", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids",
     "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens", "radiancemeter", "irradiancemeter",
-    "distant", "batch", "hdrfilm", "specfilm", "transient_hdr_film", "phasor_hdr_film", "gated_hdr_film",
-    "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent", "gaussian", "mitchell",
-    "catmullrom", "lanczos",
+    "nlos_capture_meter", "distant", "batch", "hdrfilm", "specfilm", "transient_hdr_film", "phasor_hdr_film",
+    "gated_hdr_film", "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent",
+    "gaussian", "mitchell", "catmullrom", "lanczos",
 ))  # fmt: skip
 _MEASURED_PLUGINS = {
     "regular": "spectrum given over wavelength",

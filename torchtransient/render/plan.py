@@ -31,8 +31,8 @@ class Plan:
 
     ``film`` is "transient", "steady" (one bin), "phasor" or "gated". ``max_depth`` None keeps the scene's; so do
     ``time_axis``, ``frequencies`` and ``gates``. ``temporal_filter`` is empty for phasor and gated films.
-    ``reasons``: one line per decision. ``pilot``: what the pilot run found, None without one. ``str(plan)`` prints
-    the reasons.
+    ``reasons``: one line per decision. ``pilot``: what the pilot run found, None without one. ``sensor``: the one
+    that was planned for. ``str(plan)`` prints the reasons.
     """
 
     scene: Scene = field(repr=False)
@@ -50,6 +50,7 @@ class Plan:
     parameters: tuple[str, ...]
     reasons: tuple[str, ...]
     pilot: PilotReport | None = None
+    sensor: int = 0
 
     def renderer(self, **settings: Any) -> Any:
         """A :class:`TransientRenderer` of the planned scene; ``settings`` are its other arguments and go before the
@@ -58,6 +59,7 @@ class Plan:
         from torchtransient.render.renderer import TransientRenderer
 
         settings.setdefault("parameters", self.parameters)
+        settings.setdefault("sensors", self.sensor)
         return TransientRenderer(self.scene, effects=self, **settings)
 
     def film_settings(
@@ -85,7 +87,9 @@ class Plan:
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
         plain["gates"] = None if self.gates is None else [asdict(gate) for gate in self.gates]
-        plain["pilot"] = None if self.pilot is None else asdict(self.pilot)
+        found = {} if self.pilot is None else asdict(self.pilot)
+        # A dark scene has no relative error, and JSON no number for that.
+        plain["pilot"] = {key: None if value != value else value for key, value in found.items()} or None
         return plain
 
     def __str__(self) -> str:
@@ -167,9 +171,10 @@ def plan(
         temporal_filter="",
         parameters=tuple(parameters),
         reasons=tuple(reasons),
+        sensor=sensor,
     )
     _check_known(draft, gates, census)
-    finder = Finder(draft, census, tail, missed, sensor, seed)
+    finder = Finder(draft, census, tail, missed, seed)
     return finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
 
 

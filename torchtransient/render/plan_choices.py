@@ -93,6 +93,8 @@ def _colour(census: Census, spectral: bool) -> tuple[str, str]:
 def _polarization(census: Census, outputs: Sequence[str], strict: bool) -> tuple[bool, str, list[str]]:
     if "stokes" in outputs:
         return True, "polarized, since Stokes vectors are asked for", []
+    if census.integrator == "stokes":
+        return True, "polarized, since the scene's own integrator is stokes", []
     if census.elements:
         return True, f"polarized, since it changes the intensity: {some(census.elements)}", []
     if not census.interfaces:

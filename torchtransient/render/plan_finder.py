@@ -43,9 +43,9 @@ def _seen(gates: Sequence[Gate], pulses: Sequence[Pulse]) -> tuple[Gate, ...]:
 class Finder:
     """The decisions that may need a render: depth, window, temporal filter."""
 
-    def __init__(self, draft: Plan, census: Census, tail: float, missed: float, sensor: int, seed: int):
+    def __init__(self, draft: Plan, census: Census, tail: float, missed: float, seed: int):
         self.draft, self.census, self.tail, self.missed = draft, census, tail, missed
-        self.sensor, self.seed = sensor, seed
+        self.seed = seed
         self.arrivals: Arrivals | None = None
         self.report: PilotReport | None = None
         self.reasons: list[str] = list(draft.reasons)
@@ -96,11 +96,16 @@ class Finder:
             from torchtransient.plugins.integrators.pilot import pilot_events
 
             built = scene.built(options).scene
-            film = built.sensors()[self.sensor].film()
+            sensors = built.sensors()
+            if not 0 <= self.draft.sensor < len(sensors):
+                raise SceneError(
+                    f"sensor: the scene has {len(sensors)}, numbered from 0; got {self.draft.sensor}. Give an index."
+                )
+            film = sensors[self.draft.sensor].film()
             pulses = getattr(film, "pulses", [])
             self.spread = tuple(sum(p.support_opl[side] for p in pulses) for side in (0, 1))
             events = pilot_events(
-                built, built.integrator(), self.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
+                built, built.integrator(), self.draft.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
             )
             scene.drop(options)
         found = Arrivals(events)

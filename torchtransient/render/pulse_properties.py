@@ -30,7 +30,7 @@ def write_pulse(props: Any, prefix: str, pulse: Pulse | None) -> None:
     if props.plugin_name() not in FILMS:
         raise SceneError(
             f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, {', '.join(FILMS)} does. "
-            "Multiply a phasor by the transform of the pulse instead, or leave it out."
+            "Multiply a phasor by torchtransient.pulses.transform(pulse, frequencies) instead, or leave it out."
         )
     for name in _NAMES:
         if f"{prefix}_{name}" in props:

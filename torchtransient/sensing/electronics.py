@@ -82,10 +82,11 @@ def fixed_pattern(
 class PixelElectronics(RandomSensor):
     """The chain above, on mean electrons (..., C, N, H, W), with N exposures, taps or gates where time was.
 
-    ``full_well_e`` electrons or None; ``read_noise_e``, ``ktc_noise_e`` rms electrons; ``excess_noise`` F^2 >= 1 of an
-    intensifier (2 is an exponential pulse height), drawn as normal gain noise; ``gain_e_per_dn`` with ``bits`` adds the
-    converter, both or neither; ``dark_e`` dark electrons per exposure. ``gain_map`` and ``offset_map_e`` are buffers
-    that broadcast to the input. Output in electrons, in the shape of the input.
+    ``shot_noise`` False: the input is a charge that an earlier stage has drawn. ``full_well_e`` electrons or None;
+    ``read_noise_e``, ``ktc_noise_e`` rms electrons; ``excess_noise`` F^2 >= 1 of an intensifier (2 is an exponential
+    pulse height), drawn as normal gain noise; ``gain_e_per_dn`` with ``bits`` adds the converter, both or neither;
+    ``dark_e`` dark electrons per exposure. ``gain_map`` and ``offset_map_e`` are buffers that broadcast to the input.
+    Output in electrons, in the shape of the input.
 
     ``expected`` is the mean with both clips, which takes the charge as normal: 0.01 e off for a full well of 100 e and
     better above. Rounding has the mean zero when the noise is at least half a step, which it does not check.
@@ -101,6 +102,7 @@ class PixelElectronics(RandomSensor):
     def __init__(
         self,
         *,
+        shot_noise: bool = True,
         full_well_e: float | None = None,
         read_noise_e: float = 0.0,
         ktc_noise_e: float = 0.0,
@@ -115,6 +117,7 @@ class PixelElectronics(RandomSensor):
     ) -> None:
         super().__init__(grad)
         me = "PixelElectronics"
+        self.shot_noise = bool(shot_noise)
         self.full_well_e = None if full_well_e is None else check_number(full_well_e, "full_well_e", me, open_low=True)
         self.read_noise_e = check_number(read_noise_e, "read_noise_e", me)
         self.ktc_noise_e = check_number(ktc_noise_e, "ktc_noise_e", me)
@@ -158,15 +161,21 @@ class PixelElectronics(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return self._read_out(poisson(self.collected(x), generator), generator)
+            mean = self.collected(x)
+            return self._read_out(poisson(mean, generator) if self.shot_noise else mean, generator)
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        mean = self.collected(x)
-        return self._read_out(mean + gaussian_noise(mean, generator), generator)
+        charge = self.collected(x)
+        if self.shot_noise:
+            charge = charge + gaussian_noise(charge, generator)
+        return self._read_out(charge, generator)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score":
             return super().forward(x, generator)
+        if not self.shot_noise:
+            # Noise that does not depend on the charge is added to it: the ordinary gradient is unbiased.
+            return self.gaussian(x, generator)
         mean = self.collected(x)
         counts = poisson(mean, generator)
         # What follows the draw does not depend on x, so its score is that of the counts alone.
@@ -176,7 +185,7 @@ class PixelElectronics(RandomSensor):
     def _moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the charge that reaches the converter."""
         mean = self.collected(x)
-        variance = mean * self.excess_noise
+        variance = mean * (self.excess_noise if self.shot_noise else self.excess_noise - 1)
         if self.full_well_e is not None:
             clipped = clipped_normal_mean(mean, variance, high=self.full_well_e)
             mean, variance = clipped, clipped_normal_variance(mean, variance, self.full_well_e)

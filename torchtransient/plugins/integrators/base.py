@@ -14,6 +14,7 @@ from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
+from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
@@ -133,6 +134,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         facts = scene_facts(scene, self.reference(scene))
         if sensor is not None:
             facts.window = sensor.film().arrivals()
+            facts.light_box = LightBox.of(scene, facts.bsdfs) if facts.window is not None else None
         if self.walks_through_media:
             facts.media = media_facts(scene, sensor)
         if facts.media is not None:

@@ -118,7 +118,7 @@ class TransientPath(TransientIntegrator):
 
             # -------------------------------------------------------- emitter and BSDF sampling
             active_next &= (depth + 1 < self.max_depth) & valid
-            active_next = facts.in_time(active_next, τ)
+            active_next = facts.in_time(active_next, τ, at.p)
             u_late = facts.numbers_for_delays(sampler)
             late = facts.answer(si.bsdf(ray), u_late, ray.wavelengths)
             bsdf = late.bsdf
@@ -131,6 +131,7 @@ class TransientPath(TransientIntegrator):
             active_em &= ds.pdf != 0
             wo = si.to_local(ds.d)
             sampled = late.scaled_both(bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, active_next))
+            sampled = facts.upright_both(bsdf, si, wo, sampled)
             bsdf_val, bsdf_pdf, bs, bsdf_weight, out = scatter_in_medium(
                 media, here, ds.d, u_lobe, u_dir, active_next, active_em,
                 (*sampled, si.to_world(sampled[2].wo)),

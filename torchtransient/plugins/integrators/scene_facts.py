@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import Answer, delays_of
-from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_below, bsdfs_of_scene
+from torchtransient.plugins.polarized import from_mirrored
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sensors.origin import shapes_of_sensors
 
@@ -30,7 +31,8 @@ class SceneFacts:
     groups. ``distant``: reference sphere of infinitely distant emitters, None when there are none. ``refraction``:
     table of the indices of transmissive rough BSDFs, None when there are none. ``media``: the participating media,
     None when there are none (or the integrator refuses them). ``delays``: table of the BSDFs that answer late, None
-    when there are none. ``window``: which arrivals the film counts, None where its steady image counts them all.
+    when there are none. ``two_sided``: table of two-sided BSDFs in polarized variants, None when there are none.
+    ``window``: which arrivals the film counts, None where its steady image counts them all.
     The remaining ones describe which gradients are asked for: ``geometry`` (path lengths change), ``light_moves``,
     ``emitter_shape_moves``, ``sphere_lights`` (path lengths change and there are spherical ones), ``sensor_moves``,
     ``index_moves``.
@@ -44,8 +46,10 @@ class SceneFacts:
         self.instances = instances
         self.distant = distant
         self.refraction = refraction
+        self.two_sided = two_sided_table(bsdfs) if mi.is_polarized else None
         self.media = None
         self.window = None
+        self.light_box = None
         self.delays = None
         self.geometry = False
         self.light_moves = False
@@ -68,6 +72,19 @@ class SceneFacts:
         hidden = dr.gather(mi.UInt32, self.lobe_probability, number, number < dr.width(self.lobe_probability)) == 1
         return dr.select(hidden, dr.relative_grad(bs.pdf), 1)
 
+    def upright(self, bsdf, si, wo, value):
+        """``value`` of a BSDF towards ``wo``, put right where :func:`two_sided_table` says so."""
+        if self.two_sided is None:
+            return value
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        listed = dr.gather(mi.UInt32, self.two_sided, number, number < dr.width(self.two_sided)) == 1
+        return from_mirrored(value, si.wi, wo, listed & (si.wi.z < 0))
+
+    def upright_both(self, bsdf, si, wo, sampled):
+        """The same for the value and the weight of what ``eval_pdf_sample`` returns."""
+        val, pdf, bs, weight = sampled
+        return self.upright(bsdf, si, wo, val), pdf, bs, self.upright(bsdf, si, bs.wo, weight)
+
     def index_towards(self, bsdf, si, wo, η):
         """Index of the medium that ``wo`` points into, where ``η`` is the one that the path arrived in."""
         if self.refraction is None:
@@ -89,9 +106,12 @@ class SceneFacts:
         """How a surface answers a path: which BSDF takes its place, when, and with which weight."""
         return Answer(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
 
-    def in_time(self, active, τ):
-        """Which paths of length ``τ`` can still have an event that the film counts."""
-        return active if self.window is None else active & ~self.window.over(τ)
+    def in_time(self, active, τ, p):
+        """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""
+        if self.window is None:
+            return active
+        least = τ if self.light_box is None else τ + mi.Float64(self.light_box.distance(p))
+        return active & ~self.window.over(least)
 
     def counted(self, active, τ):
         """Which arrivals at ``τ`` the film counts."""
@@ -149,6 +169,25 @@ def lobe_probability_table(bsdfs):
     for bsdf in bsdfs:
         if bsdf.class_name() in _CANCELLING or (bsdf.class_name() == "TwoSidedBRDF" and _nests(bsdf)):
             numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]))
+    if not numbers:
+        return None
+    table = dr.zeros(mi.UInt32, max(numbers) + 1)
+    dr.scatter(table, mi.UInt32(1), mi.UInt32(numbers))
+    return table
+
+
+def two_sided_table(bsdfs):
+    """Which BSDFs, by their number in Dr.Jit's registry, are two-sided; None if none is.
+
+    From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
+    Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
+    exchanged.
+    """
+    # A description names what a mask or a blend holds, too. A path may be handed the part of a BSDF by its own pointer.
+    two_sided = [bsdf for bsdf in bsdfs if "TwoSided[" in str(bsdf)]
+    for bsdf in two_sided:
+        two_sided += [part for part in bsdfs_below(bsdf) if "TwoSided[" in str(part)]
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in two_sided]
     if not numbers:
         return None
     table = dr.zeros(mi.UInt32, max(numbers) + 1)

@@ -130,6 +130,7 @@ def emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts):
 
     wo = si.to_local(d)
     val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, d, v.lit)
+    val = facts.upright(bsdf, si, wo, val)
     mis = dr.select(ds.delta | cone, 1, mis_weight(ds.pdf, dr.detach(pdf)))
     terms.f = dr.select(v.lit, scattered(val, turn) * em_weight * mis, 0)
     if facts.media is not None:
@@ -182,12 +183,14 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
         J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead, nxt.volume))
     wo = si.to_local(out)
     val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward, sampled=True)
+    val = facts.upright(bsdf, si, wo, val)
     inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
     terms.W = dr.select(onward, scattering(val, turn, turn_in(si, wo, out, nxt.d)) * (inv_pdf * J), 0)
     terms.out, terms.ahead = out, ahead
     terms.step = dr.select(onward, facts.index_towards(bsdf, si, wo, mi.Float(1)), 1)
     if facts.delta:
         bs, weight = bsdf.sample(ctx, si, v.u_lobe, v.u_dir, terms.mirrored)
+        weight = facts.upright(bsdf, si, bs.wo, weight)
         terms.p_out, terms.d_out = si.p, si.to_world(bs.wo)
         weight = scattering(weight, turn, turn_in(si, bs.wo, terms.d_out, nxt.d)) * (facts.unweighted(bsdf, bs) * v.rr)
         terms.W = dr.select(terms.mirrored, weight, terms.W)
@@ -218,7 +221,8 @@ def emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts):
     out = direction_to(si.p, si_e.p, lit, mi.Vector3f(nxt.d))
     si_e.wi = dr.select(lit, si_e.to_local(-out), dr.detach(si_e.wi))
     J = dr.relative_grad(solid_angle_over_area(si.p, si_e.p, si_e.n, lit)) * dr.relative_grad(dr.select(lit, area, 1))
-    val, _ = evaluate(terms.inside, ctx, bsdf, si, si.to_local(out), out, lit)
+    wo = si.to_local(out)
+    val = facts.upright(bsdf, si, wo, evaluate(terms.inside, ctx, bsdf, si, wo, out, lit)[0])
     Le = mi.unpolarized_spectrum(dr.detach(si_e).emitter(scene).eval(si_e, lit))
     terms.E = dr.select(lit, scattered(val, turn) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
     terms.length_E = dr.norm(dr.select(lit, si_e.p - si.p, mi.Vector3f(0, 0, 1)))
