@@ -72,6 +72,15 @@ from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
+from torchtransient.sensing.polarization import Analysers as Analysers
+from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
+from torchtransient.sensing.polarization import circular_analysers as circular_analysers
+from torchtransient.sensing.polarization import demosaic as demosaic
+from torchtransient.sensing.polarization import linear_analysers as linear_analysers
+from torchtransient.sensing.polarization import mosaic_rows as mosaic_rows
+from torchtransient.sensing.polarization import project_physical as project_physical
+from torchtransient.sensing.polarization import stokes_from as stokes_from
+from torchtransient.sensing.polarization import unphysical_part as unphysical_part
 from torchtransient.sensing.policies import GRAD_POLICIES as GRAD_POLICIES
 from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
