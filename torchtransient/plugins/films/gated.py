@@ -74,6 +74,10 @@ class GatedHDRFilm(TimeResolvedFilm):
         """What errors call the film's response over time."""
         return "rectangular gate"
 
+    @property
+    def slope_remedy(self) -> str:
+        return "Use gates that rise from zero and fall to zero (gaussian, tabulated), or give the film a pulse."
+
     def arrivals(self):
         """What can count: arrivals while some gate is open."""
         return self._window
