@@ -10,6 +10,7 @@ from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
 from torchtransient.sensing.compose import adjoint as adjoint
+from torchtransient.sensing.compose import deepinv_physics as deepinv_physics
 from torchtransient.sensing.compose import linearity_error as linearity_error
 from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
@@ -26,6 +27,8 @@ from torchtransient.sensing.depth import multi_return as multi_return
 from torchtransient.sensing.depth import peak_position as peak_position
 from torchtransient.sensing.depth import range_deviation_m as range_deviation_m
 from torchtransient.sensing.depth import soft_argmax as soft_argmax
+from torchtransient.sensing.devices import Device as Device
+from torchtransient.sensing.devices import build_stage as build_stage
 from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics
 from torchtransient.sensing.electronics import fixed_pattern as fixed_pattern
 from torchtransient.sensing.electronics import ktc_noise as ktc_noise
@@ -86,6 +89,8 @@ from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.presets import DEVICES as DEVICES
+from torchtransient.sensing.presets import device as device
 from torchtransient.sensing.pulse import apply_pulse as apply_pulse
 from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
 from torchtransient.sensing.response_shapes import emg_cdf as emg_cdf
