@@ -164,6 +164,6 @@ def test_media_inside_instances():
     expected = steady_runs(load(objects, integrator="volpath"), spp=512, seed=900)
     result = two_sample_z_test(steady, expected, rounding=1e-5)
     assert result.passed, str(result)
+    refused = load(objects, integrator="transient_path")
     with pytest.raises(SceneError, match="transient_prbvolpath"):
-        refused = load(objects, integrator="transient_path")
         refused.integrator().render(refused, spp=1)
