@@ -25,6 +25,10 @@ NOT_SUPPORTED = (
         "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",
     ),
     (
+        "derivatives of Mitsuba's own `conductor`, `polarizer`, `retarder`, `circular` in polarized variants",
+        "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place, see docs/polarization.md",
+    ),
+    (
         "vertices of light-emitting meshes without texture coordinates",
         "rigid motion only: the area element is not differentiated",
     ),

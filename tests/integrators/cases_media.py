@@ -43,6 +43,8 @@ def block(medium, bsdf=None, **arguments):
         **({"depth": 4} | arguments),
     )
     scene["integrator"]["type"] = "transient_prbvolpath"
+    # Scattering points see the rim of the wall: far away, it casts no moving silhouette.
+    scene["wall"]["to_world"] = transform().scale(20)
     return scene
 
 
@@ -51,6 +53,7 @@ def fog(medium, light=None, **arguments):
     scene = room(light=light, **({"depth": 4} | arguments))
     scene["integrator"]["type"] = "transient_prbvolpath"
     scene["fog"] = medium
+    scene["wall"]["to_world"] = transform().scale(20)
     scene["sensor"]["medium"] = {"type": "ref", "id": "fog"}
     for name in ("wall", "side"):
         scene[name]["interior"] = scene[name]["exterior"] = {"type": "ref", "id": "fog"}
@@ -58,8 +61,8 @@ def fog(medium, light=None, **arguments):
 
 
 def sparse():
-    """A grid with cells of no density and with many at the maximum."""
-    return np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.3, 0.0, 1.0, 0.0]).repeat(3).reshape(3, 3, 3)
+    """A grid with cells of hardly any density and with many at the maximum."""
+    return np.array([0.02, 0.02, 1.0, 1.0, 1.0, 0.3, 0.02, 1.0, 0.02]).repeat(3).reshape(3, 3, 3)
 
 
 def pool(medium, bsdf):
@@ -67,7 +70,6 @@ def pool(medium, bsdf):
     scene = block(medium, bsdf, light={"type": "point", "position": [1.8, 0.0, 2.0], "intensity": 10.0})
     pose = transform().translate([0, 0, 2.2]).rotate([0, 1, 0], 30).scale([0.8, 0.8, 0.3])
     scene["block"]["to_world"] = pose
-    scene["wall"]["to_world"] = transform().scale(3)
     return scene
 
 
@@ -137,6 +139,8 @@ BLOCKS = {
     "albedo grid": lambda: block(clouds(albedo=volume(sparse()))),
     "lamp": lambda: block(homogeneous(), **lamp()),
     "fog": lambda: fog(homogeneous(0.3)),
+    # Deeper paths have vertices that come as close to the moving wall as they like: right, and of unbounded variance.
+    "fog, scattered once": lambda: fog(homogeneous(0.3), depth=2),
     "fog and lamp": lambda: fog(homogeneous(0.1), **wide_lamp()),
     "fog and ball": lambda: fog(homogeneous(0.3), **lamp("sphere")),
     "smooth glass": smooth_pool,
@@ -172,7 +176,7 @@ CASES = [
         spp=4096, fd_spp=4096, tags=SLOW,
     ),
     lengths("wall_behind", "plain", move("wall.to_world", FORWARD)),
-    lengths("wall_in_fog", "fog", move("wall.to_world", FORWARD)),
+    lengths("wall_in_fog", "fog, scattered once", move("wall.to_world", FORWARD)),
     lengths("wall_behind_grid", "clouds", move("wall.to_world", FORWARD), tags=SLOW),
     lengths("light_in_fog", "fog", move_point("light.position", FORWARD)),
     lengths("light_behind", "plain", move_point("light.position", FORWARD), tags=SLOW),

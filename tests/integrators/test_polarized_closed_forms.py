@@ -313,4 +313,5 @@ def test_depolarising_walls_leave_nothing():
     bright = seen[0] > 0
     assert bright.sum() > 50
     expected = np.array([1.0, math.cos(math.radians(-60)), math.sin(math.radians(-60)), 0])
-    np.testing.assert_allclose(seen[:, bright], expected[:, None] * seen[0, bright], atol=3e-6 * seen[0].max())
+    # Float32 sums of up to 4096 terms, whose order is chance: some sqrt(4096) ulp.
+    np.testing.assert_allclose(seen[:, bright], expected[:, None] * seen[0, bright], atol=2e-5 * seen[0].max())

@@ -1,5 +1,6 @@
 """The sum over time is what Mitsuba's steady volumetric path tracer renders."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
@@ -102,6 +103,30 @@ def test_depth_counts_real_events(max_depth):
     expected = steady_runs(load(objects, integrator="volpath", max_depth=max_depth))
     result = two_sample_z_test(steady, expected, rounding=1e-5)
     assert result.passed, str(result)
+
+
+def test_wavelengths():
+    """Extinction by wavelength: the free flights of four wavelengths share one sample."""
+    with mi.variant_context("llvm_ad_spectral"):
+        objects = block(coloured())
+        steady, _ = runs(load(objects))
+        expected = steady_runs(load(objects, integrator="volpath"))
+        total = two_sample_z_test(steady.mean((1, 2)), expected.mean((1, 2)))
+    assert total.passed, str(total)
+
+
+def test_scattering_in_a_medium_leaves_no_polarization():
+    """A phase function of one number says nothing of polarization, and light that is scattered once has none."""
+    with mi.variant_context("llvm_ad_mono_polarized"):
+        objects = block(homogeneous(1.0, 0.8))
+        objects["floor"]["bsdf"] = {"type": "conductor", "material": "Au"}
+        deep, transient = runs(load(objects, max_depth=3), count=2)
+        fog = {name: objects[name] for name in ("block", "lamp")}
+        scattered, _ = runs(load(fog), count=2)
+    assert np.isfinite(transient).all() and np.isfinite(deep).all()
+    assert scattered[..., 0].min() > 0 and abs(scattered[..., 1:]).max() == 0
+    # The metal floor turns what it reflects towards the camera.
+    assert abs(deep[..., 1:]).max() > 1e-4 * deep[..., 0].max()
 
 
 def test_surface_integrator_names_the_other_one():

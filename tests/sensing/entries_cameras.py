@@ -41,6 +41,14 @@ def streak(grad="expected"):
     )
 
 
+def stokes_like(shape, seed):
+    """Physical Stokes vectors (..., 4, C, T, H, W), polarized by up to a half."""
+    g = torch.Generator().manual_seed(seed)
+    x = torch.rand(shape, generator=g, dtype=torch.float64) - 0.5
+    x.select(-5, 0).add_(1.5)
+    return x
+
+
 ENTRIES: list[Entry] = [
     Entry(
         "ItofCorrelation",
@@ -71,5 +79,20 @@ ENTRIES: list[Entry] = [
         "GatedIntegration",
         lambda: sensing.GatedIntegration([4e-9, 6e-9], 3e-9, AXIS, rise_s=0.8e-9, leakage=0.01, learnable=True),
         errors=((lambda: sensing.GatedIntegration([], 1e-9, AXIS), ShapeError),),
+    ),
+    Entry(
+        "PolarizationMosaic",
+        lambda: sensing.PolarizationMosaic.polarsens(200.0),
+        shape=(2, 4, 1, 3, 4, 5),
+        input=stokes_like,
+        errors=((lambda: sensing.PolarizationMosaic(torch.ones(4)), ShapeError),),
+    ),
+    Entry(
+        "Analysers",
+        lambda: sensing.Analysers(sensing.linear_analysers([0, 60, 120], 50.0)),
+        shape=(2, 4, 1, 3, 2, 2),
+        input=stokes_like,
+        # Half of the light passes an analyser: two thirds of three pictures of it are S0.
+        conserves=lambda y: y.select(-5, 0).sum() if y.shape[-5] == 4 else y.sum() * 2 / 3 / (1 + 1 / 50.0),
     ),
 ]

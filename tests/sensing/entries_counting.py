@@ -100,6 +100,31 @@ ENTRIES = [
         ),
     ),
     Entry(
+        "Afterpulsing",
+        lambda **k: sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, bin_width_s=20 * PS, learnable=True, **k),
+        random=True,
+        errors=(
+            (lambda: sensing.Afterpulsing(5.0, 90 * PS, 50 * PS, bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.Afterpulsing(0.05, 90.0, 50 * PS, bin_width_s=20 * PS), UnitError),
+        ),
+    ),
+    Entry(
+        "Crosstalk",
+        lambda **k: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True, **k),
+        random=True,
+        errors=((lambda: sensing.Crosstalk(0.5), UnitError),),
+    ),
+    Entry(
+        "TDC",
+        lambda: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0))),
+        conserves=lambda y: y.sum(-3),
+        dtypes=ALL,
+    ),
+    Entry("TDC-dither", lambda: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3)),
+    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True, dtypes=ALL),
+    Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
+    Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
+    Entry(
         "ShotNoise",
         sensing.ShotNoise,
         random=True,

@@ -296,7 +296,8 @@ def _override_integrator(state: Any, options: BuildOptions) -> None:
     index = find_child(state, state.root, is_integrator)
     if options.transient:
         if index is None:
-            _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
+            plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
+            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
         if options.integrator is not None and plugin != options.integrator:

@@ -10,6 +10,11 @@ from torchtransient.plugins import kind_of
 # Direct children of the scene that matter only where something refers to them.
 _DECLARATIONS = ("BSDF", "Medium", "Texture", "Volume", "PhaseFunction", "ReconstructionFilter", "Film", "Sampler")
 
+# Mitsuba's own integrators that are written in Python.
+_PYTHON_INTEGRATORS = (
+    "prb", "prb_basic", "prb_projective", "prbvolpath", "direct_projective", "volprim_rf_basic",
+)  # fmt: skip
+
 
 def children(state: Any, node: Any) -> list[tuple[str, int]]:
     """(property, node index) for every child object of a node, references by id included."""
@@ -44,8 +49,9 @@ def is_integrator(node: Any) -> bool:
     """As :func:`is_film`, for integrators."""
     import mitsuba as mi
 
-    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().startswith("transient_")
-    return unknown or node.type == mi.ObjectType.Integrator
+    plugin = node.props.plugin_name()
+    named = plugin.startswith("transient_") or plugin in _PYTHON_INTEGRATORS
+    return node.type == mi.ObjectType.Integrator or (named and node.type == mi.ObjectType.Unknown)
 
 
 def kind_of_node(node: Any) -> str:

@@ -1,8 +1,21 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.afterpulsing import Afterpulsing as Afterpulsing
+from torchtransient.sensing.afterpulsing import Crosstalk as Crosstalk
+from torchtransient.sensing.afterpulsing import add_afterpulses as add_afterpulses
+from torchtransient.sensing.afterpulsing import add_crosstalk as add_crosstalk
+from torchtransient.sensing.afterpulsing import afterpulse_kernel as afterpulse_kernel
+from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rates
+from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
+from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
 from torchtransient.sensing.compose import adjoint as adjoint
+from torchtransient.sensing.compose import deepinv_physics as deepinv_physics
 from torchtransient.sensing.compose import linearity_error as linearity_error
+from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram
+from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
+from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
+from torchtransient.sensing.compressed_histograms import fourier_codes as fourier_codes
 from torchtransient.sensing.depth import Returns as Returns
 from torchtransient.sensing.depth import background_per_bin as background_per_bin
 from torchtransient.sensing.depth import centre_of_mass as centre_of_mass
@@ -14,6 +27,8 @@ from torchtransient.sensing.depth import multi_return as multi_return
 from torchtransient.sensing.depth import peak_position as peak_position
 from torchtransient.sensing.depth import range_deviation_m as range_deviation_m
 from torchtransient.sensing.depth import soft_argmax as soft_argmax
+from torchtransient.sensing.devices import Device as Device
+from torchtransient.sensing.devices import build_stage as build_stage
 from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics
 from torchtransient.sensing.electronics import fixed_pattern as fixed_pattern
 from torchtransient.sensing.electronics import ktc_noise as ktc_noise
@@ -60,11 +75,22 @@ from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
+from torchtransient.sensing.polarization import Analysers as Analysers
+from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
+from torchtransient.sensing.polarization import circular_analysers as circular_analysers
+from torchtransient.sensing.polarization import demosaic as demosaic
+from torchtransient.sensing.polarization import linear_analysers as linear_analysers
+from torchtransient.sensing.polarization import mosaic_rows as mosaic_rows
+from torchtransient.sensing.polarization import project_physical as project_physical
+from torchtransient.sensing.polarization import stokes_from as stokes_from
+from torchtransient.sensing.polarization import unphysical_part as unphysical_part
 from torchtransient.sensing.policies import GRAD_POLICIES as GRAD_POLICIES
 from torchtransient.sensing.policies import GradPolicy as GradPolicy
 from torchtransient.sensing.policies import ScoreFunction as ScoreFunction
 from torchtransient.sensing.policies import gaussian_noise as gaussian_noise
 from torchtransient.sensing.policies import straight_through as straight_through
+from torchtransient.sensing.presets import DEVICES as DEVICES
+from torchtransient.sensing.presets import device as device
 from torchtransient.sensing.pulse import apply_pulse as apply_pulse
 from torchtransient.sensing.pulse import axis_with_margin as axis_with_margin
 from torchtransient.sensing.response_shapes import emg_cdf as emg_cdf
@@ -79,6 +105,7 @@ from torchtransient.sensing.shot_noise import poisson_log_prob as poisson_log_pr
 from torchtransient.sensing.spad import CoatesEstimate as CoatesEstimate
 from torchtransient.sensing.spad import SynchronousSPAD as SynchronousSPAD
 from torchtransient.sensing.spad import coates as coates
+from torchtransient.sensing.spad import first_photon_log_prob as first_photon_log_prob
 from torchtransient.sensing.spad import first_photon_probabilities as first_photon_probabilities
 from torchtransient.sensing.spad import sample_detections as sample_detections
 from torchtransient.sensing.spatial_psf import LensBlur as LensBlur
@@ -88,4 +115,6 @@ from torchtransient.sensing.spatial_psf import defocus_psf as defocus_psf
 from torchtransient.sensing.spatial_psf import gaussian_psf as gaussian_psf
 from torchtransient.sensing.streak import StreakCamera as StreakCamera
 from torchtransient.sensing.streak import SweepJitter as SweepJitter
+from torchtransient.sensing.tdc import TDC as TDC
+from torchtransient.sensing.tdc import random_code_widths as random_code_widths
 from torchtransient.sensing.time_convolution import convolve_time as convolve_time

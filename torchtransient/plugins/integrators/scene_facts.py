@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import Answer, delays_of
-from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_of_scene
+from torchtransient.plugins.bsdfs.refraction_table import RefractionTable, bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.polarized import from_mirrored
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sensors.origin import shapes_of_sensors
@@ -183,8 +183,10 @@ def two_sided_table(bsdfs):
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
     exchanged.
     """
-    # Its description names what a mask or a blend holds, too.
+    # A description names what a mask or a blend holds, too. A path may be handed the part of a BSDF by its own pointer.
     two_sided = [bsdf for bsdf in bsdfs if "TwoSided[" in str(bsdf)]
+    for bsdf in two_sided:
+        two_sided += [part for part in bsdfs_below(bsdf) if "TwoSided[" in str(part)]
     numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in two_sided]
     if not numbers:
         return None

@@ -18,8 +18,11 @@ class TransientVolpath(path.TransientPath):
     Optical length is geometric length times the index of the medium, whether the walk collides or not. The index
     changes where a BSDF refracts.
 
-    Not supported: derivatives in scenes with media (``GradientError``), media that emit light, polarization. The
-    length between a sensor and its near clip plane counts in time but is not attenuated, as in Mitsuba.
+    Gradients as in ``transient_path``, and of extinction, albedo, phase function, grids of both, and path lengths in
+    media (see ``docs/media.md``). In polarized variants scattering in a medium leaves no polarization.
+
+    Not supported: media that emit light. The length between a sensor and its near clip plane counts in time but is not
+    attenuated, as in Mitsuba.
     """
 
     walks_through_media = True
