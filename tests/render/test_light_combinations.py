@@ -34,8 +34,11 @@ def render(node, variant, **settings):
     return tt.render(tt.load(node, variant=variant), seed=2, spp=64, **settings)
 
 
-@pytest.mark.parametrize("late", [None, LATE, {**LATE, **SHIFT}], ids=["at once", "late", "shifted"])
-@pytest.mark.parametrize("bands", [False, True])
+@pytest.mark.parametrize(
+    "bands, late",
+    [(True, None), (False, LATE), (True, {**LATE, **SHIFT})],
+    ids=["at once", "late", "shifted"],
+)
 def test_intensity_of_polarized_renders(bands, late):
     node = room(bands, late)
     plain = render(node, "llvm_ad_spectral", time_axis=AXIS)
