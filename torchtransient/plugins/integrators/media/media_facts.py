@@ -61,8 +61,8 @@ class MediaFacts:
         """
         if sphere_lights and not self.emitter_sampling:
             raise GradientError(
-                "transient_prbvolpath: derivatives of path lengths reach spherical lights through connections only, and "
-                "a medium has sample_emitters = false. Set it to true, or use lights of another shape."
+                "transient_prbvolpath: derivatives of path lengths reach spherical lights through connections only, "
+                "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
             )
 
     @property
