@@ -145,10 +145,12 @@ class Gate:
         if self.kind == "rectangular":
             values = pulse.cumulative(self.end_opl - at) - pulse.cumulative(self.start_opl - at)
         else:
-            delays = np.linspace(low, high, NODES)
-            shares = np.diff(pulse.cumulative(delays))
-            middle = 0.5 * (delays[1:] + delays[:-1])
-            values = np.array([self.value(x + middle) @ shares for x in at])
+            # On one grid for both: the pulse's shares of each step, the profile at the steps' centres.
+            step = (at[-1] - at[0]) / (NODES - 1)
+            count = max(1, math.ceil((high - low) / step))
+            shares = np.diff(pulse.cumulative(low + step * np.arange(count + 1)))
+            profile = self.value(at[0] + low + step * (np.arange(NODES + count - 1) + 0.5))
+            values = np.correlate(profile, shares, mode="valid")
         values[[0, -1]] = 0.0
         return Gate.tabulated(at.tolist(), np.maximum(values, 0.0).tolist())
 

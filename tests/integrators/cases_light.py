@@ -300,4 +300,15 @@ CASES = [
         8192,
         fd_spp=8192,
     ),
+    Case(
+        "polarized_fluorescent_yield",
+        "quantum yield of a delayed BSDF",
+        fluorescent_room,
+        set_color("wall.bsdf.quantum_yield"),
+        0.7,
+        0.05,
+        "llvm_ad_spectral_polarized",
+        8192,
+        fd_spp=32768,
+    ),
 ]

@@ -25,9 +25,13 @@ POLARIZER = {"type": "polarizer", "theta": 20.0}
 PLATE = {"type": "retarder", "theta": 30.0, "delta": 90.0}
 
 
+SLOW = {"polar_rough_glass_index", "polar_camera_rolls", "polar_camera_turns", "polar_wall_spectral"}
+
+
 def polar(name, row, scene, apply, value, step, variant=VARIANT, spp=2048, fd_spp=2048):
     """A case in a polarized variant."""
-    return Case(name, row, scene, apply, value, step, variant, spp=spp, fd_spp=fd_spp)
+    tags = ("slow",) if name in SLOW else ()
+    return Case(name, row, scene, apply, value, step, variant, spp=spp, fd_spp=fd_spp, tags=tags)
 
 
 def mirrors():
@@ -173,6 +177,8 @@ CASES = [
         rotate("sensor.to_world", (0, 0, 1)),
         0.0,
         1.0,
+        spp=1024,
+        fd_spp=2048,
     ),
     polar(
         "polar_camera_turns",
@@ -181,7 +187,8 @@ CASES = [
         rotate("sensor.to_world", (0, 1, 0)),
         0.0,
         0.1,
-        fd_spp=8192,
+        spp=1024,
+        fd_spp=4096,
     ),
-    polar("polar_wall_spectral", MOTION, metal_room, move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, SPECTRAL),
+    polar("polar_wall_spectral", MOTION, metal_room, move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, SPECTRAL, spp=512),
 ]

@@ -1,5 +1,6 @@
 """The sum over time is what Mitsuba's steady volumetric path tracer renders."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -136,13 +137,33 @@ def test_surface_integrator_names_the_other_one():
 
 
 def test_without_media_it_is_the_surface_integrator():
+    """The same numbers from kernels of the same size: walks are not there at all."""
     objects = block(clouds())
     del objects["block"]
-    results = []
+    results, sizes = [], []
     for name in ("transient_path", "transient_prbvolpath", "transient_volpath"):
         scene = load(objects, integrator=name, max_depth=5)
-        results.append(scene.integrator().render(scene, seed=1, spp=32))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            results.append(scene.integrator().render(scene, seed=1, spp=32))
+            dr.eval(*results[-1])
+            sizes.append([k["operation_count"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT])
     for steady, transient in results[1:]:
         assert np.array_equal(np.array(steady), np.array(results[0][0]))
         # Atomic additions come in any order.
         np.testing.assert_allclose(np.array(transient), np.array(results[0][1]), rtol=1e-5, atol=1e-7)
+    assert max(sizes[0]) > 1000 and sizes[1][-3:] == sizes[2][-3:] == sizes[0][-3:]
+
+
+def test_media_inside_instances():
+    objects = block(homogeneous(1.0, 0.8))
+    group = {"type": "shapegroup", "block": objects.pop("block")}
+    pose = T().rotate([0, 0, 1], 30)
+    objects |= {"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": pose}}
+    steady, _ = runs(load(objects), spp=512, seed=40)
+    expected = steady_runs(load(objects, integrator="volpath"), spp=512, seed=900)
+    result = two_sample_z_test(steady, expected, rounding=1e-5)
+    assert result.passed, str(result)
+    refused = load(objects, integrator="transient_path")
+    with pytest.raises(SceneError, match="transient_prbvolpath"):
+        refused.integrator().render(refused, spp=1)

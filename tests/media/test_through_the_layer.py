@@ -6,6 +6,7 @@ import torch
 from media_scenes import block, camera, clouds, homogeneous
 
 import torchtransient as tt
+from torchtransient.render.variant import active_variant
 
 VARIANT = "llvm_ad_rgb"
 AXIS = tt.TimeAxis(start_opl=0.0, bin_width_opl=0.2, num_bins=100)
@@ -116,3 +117,32 @@ def test_gradients_arrive_in_torch():
     lower = (renderer(step, seed=0).transient * weights).sum()
     assert lower < loss
     assert np.isfinite(lower.item())
+
+
+def test_no_kernels_are_compiled_while_training():
+    """Nor when a shape moves, which changes the size of the scene, and nothing of Dr.Jit's graph stays behind."""
+    objects = block(clouds())
+    keys = ["block.interior_medium.sigma_t.data", "floor.to_world", "block.interior_medium.albedo.value.value"]
+    renderer = tt.TransientRenderer(steady_scene("volpath", **objects), parameters=keys, time_axis=AXIS, spp=4)
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=1e-3)
+
+    def step(seed):
+        optimizer.zero_grad()
+        renderer(seed=seed).transient.square().sum().backward()
+        optimizer.step()
+
+    with active_variant(VARIANT):
+        import drjit as dr
+
+        empty = len(dr.whos_ad(as_string=True).splitlines())
+        step(0)
+        step(1)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for seed in range(2, 5):
+                step(seed)
+            history = dr.kernel_history()
+        assert len(dr.whos_ad(as_string=True).splitlines()) == empty
+    kernels = [entry for entry in history if entry["type"] == dr.KernelType.JIT]
+    assert len(kernels) >= 6
+    assert all(entry["cache_hit"] for entry in kernels)

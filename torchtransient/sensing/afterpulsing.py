@@ -34,6 +34,10 @@ class AddedCounts(RandomSensor):
     of single detections; its variance is larger by the probability of the effect (1 % of itself at 1 %).
     """
 
+    def rough_extra(self, x: Tensor) -> Tensor:
+        """`extra` as precisely as a draw needs it."""
+        return self.extra(x)
+
     def extra(self, x: Tensor) -> Tensor:
         """Mean of the counts added, in the shape of `x`."""
         raise NotImplementedError(f"{type(self).__name__} has to define extra(x).")
@@ -46,7 +50,7 @@ class AddedCounts(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return x.detach() + self._draw(self.extra(x), generator)
+            return x.detach() + self._draw(self.rough_extra(x.detach()), generator)
 
     def _draw(self, mean: Tensor, generator: torch.Generator | None) -> Tensor:
         work = mean.detach().clamp_min(0)
@@ -60,6 +64,8 @@ class AddedCounts(RandomSensor):
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad == "expected":
             return self.expected(x)
+        if self.grad != "gaussian" and not torch.is_grad_enabled():
+            return self.sample(x, generator)
         mean = self.extra(x)
         if self.grad == "gaussian":
             return x + mean + gaussian_noise(mean, generator)
@@ -90,12 +96,19 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     return folded.roll(start % period_bins)
 
 
-def add_afterpulses(counts: Tensor, probability: Tensor | float, kernel: Tensor, *, only_added: bool = False) -> Tensor:
+def add_afterpulses(
+    counts: Tensor,
+    probability: Tensor | float,
+    kernel: Tensor,
+    *,
+    only_added: bool = False,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
     `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel`; the window is the first T bins of
     a period of P. Afterpulses outside the window are lost. With P = T sums grow by 1/(1 - probability) exactly.
-    Differentiable in all three. Computed in float64 by FFT round the period; dtype and device are kept.
+    Differentiable in all three. Computed in `dtype` by FFT round the period; the dtype and device of `counts` are kept.
     """
     check_transient(counts, "add_afterpulses")
     bins, period = counts.shape[TIME], kernel.shape[0]
@@ -105,9 +118,11 @@ def add_afterpulses(counts: Tensor, probability: Tensor | float, kernel: Tensor,
     transfer = p * torch.fft.rfft(kernel.to(counts.device, torch.float64))
     # only what is added is transformed: the detections themselves keep all their digits
     gain = transfer / (1 - transfer)
-    spectrum = torch.fft.rfft(counts.to(torch.float64), n=period, dim=TIME) * gain.view(-1, 1, 1)
-    wide: Tensor = torch.fft.irfft(spectrum, n=period, dim=TIME)
-    added = wide.narrow(TIME, 0, bins).to(counts.dtype)
+    # rows of time next to each other: the copy costs less than a transform that strides
+    rows = counts.movedim(TIME, -1).contiguous().to(dtype)
+    spectrum = torch.fft.rfft(rows, n=period) * gain.to(dtype.to_complex())
+    wide: Tensor = torch.fft.irfft(spectrum, n=period)
+    added = wide[..., :bins].movedim(-1, TIME).contiguous().to(counts.dtype)
     return added if only_added else counts + added
 
 
@@ -162,9 +177,15 @@ class Afterpulsing(AddedCounts):
         return self.log_tau_s.double().exp()
 
     def extra(self, x: Tensor) -> Tensor:
+        return self._extra(x, torch.float64)
+
+    def rough_extra(self, x: Tensor) -> Tensor:
+        return self._extra(x, torch.float64 if x.dtype == torch.float64 else torch.float32)
+
+    def _extra(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         check_transient(x, "Afterpulsing")
         kernel = afterpulse_kernel(self.tau_s, self.dead_time_s, self.bin_width_s, self.period_bins or x.shape[TIME])
-        return add_afterpulses(x, self.probability, kernel, only_added=True)
+        return add_afterpulses(x, self.probability, kernel, only_added=True, dtype=dtype)
 
 
 def add_crosstalk(

@@ -61,9 +61,8 @@ def _split(totals: Tensor, weights: Tensor, generator: torch.Generator | None) -
     counts = totals.unsqueeze(0)
     for finer, coarser in zip(reversed(levels[:-1]), reversed(levels[1:]), strict=True):
         pairs = finer.shape[0] - coarser.shape[0]
-        share = finer[:pairs] / coarser[:pairs]
-        # 0/0: no light, hence no counts; and rounding must not lead above 1
-        share = share.nan_to_num_(0.0).clamp_(max=1.0)
+        # at most 1, as a rounded sum of two positive numbers is not below either; 0/0 means no light and no counts
+        share = finer[:pairs] / coarser[:pairs].clamp_min(torch.finfo(finer.dtype).tiny)
         first = torch.binomial(counts[:pairs], share, generator=generator)
         counts = torch.cat([first, counts[pairs:], counts[:pairs] - first])
     return counts

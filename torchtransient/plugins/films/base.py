@@ -64,6 +64,11 @@ class TimeResolvedFilm(mi.Film):
         """Whether what is stored changes smoothly with the path length."""
         return True
 
+    @property
+    def slope_remedy(self) -> str:
+        """What to do where there is no slope: the end of an error message."""
+        return "Set temporal_filter to 'tent' or 'gaussian'."
+
     def take_filter(self, name: str, stddev: float | None):
         """Take over an integrator's settings of the temporal filter; empty name and None leave the film's own."""
 

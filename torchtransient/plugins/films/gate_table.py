@@ -62,3 +62,50 @@ class GateTable:
         at = dr.gather(mi.UInt32, self._offset, gate, inside) + i
         a, b = dr.gather(mi.Float, self._values, at, inside), dr.gather(mi.Float, self._values, at + 1, inside)
         return dr.select(inside, dr.fma(b - a, x - mi.Float(i), a), 0), dr.select(inside, (b - a) * scale, 0)
+
+
+@dr.syntax
+def put_gates(spot, table, opl, value, slope_value, active):
+    """Add to every gate that light arriving at ``opl`` meets."""
+    g, end = table.candidates(opl, active)
+    going = mi.Bool(active) & (g < end)
+    while dr.hint(going, label="gates put"):
+        weight, slope = table.value(g, opl, going)
+        _scatter(spot, g, weight, slope, value, slope_value, going & ((weight != 0) | (slope != 0)))
+        g += 1
+        going = going & (g < end)
+
+
+def _scatter(spot, gate, weight, slope, value, slope_value, active):
+    for c in range(spot.channels):
+        v = value[c] * weight
+        if slope_value is not None:
+            v += slope_value[c] * slope
+        index = dr.fma(gate, spot.bin_stride, spot.base) + c * spot.channel_stride
+        dr.scatter_reduce(dr.ReduceOp.Add, spot.flat, type(spot.flat)(v), index, active)
+
+
+@dr.syntax
+def read_gates(spot, table, opl, steady, active):
+    """Adjoint and its slope summed over the gates that light arriving at ``opl`` meets."""
+    A, slope = [mi.Float(0) for _ in range(spot.channels)], [mi.Float(0) for _ in range(spot.channels)]
+    g, end = table.candidates(opl, active)
+    going = mi.Bool(active) & (g < end)
+    while dr.hint(going, label="gates read"):
+        weight, dweight = table.value(g, opl, going)
+        A, slope = _gathered(spot, g, weight, dweight, steady, A, slope, going)
+        g += 1
+        going = going & (g < end)
+    return A, slope
+
+
+def _gathered(spot, gate, weight, dweight, steady, A, slope, active):
+    index = dr.fma(gate, spot.bin_stride, spot.base)
+    total_A, total_slope = [], []
+    for c in range(spot.channels):
+        a = mi.Float(0) if steady is None else steady[c]
+        if spot.flat is not None:
+            a = a + dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, active)
+        total_A.append(dr.fma(a, weight, A[c]))
+        total_slope.append(dr.fma(a, dweight, slope[c]))
+    return total_A, total_slope

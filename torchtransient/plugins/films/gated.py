@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.gates import gates_from_text
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.gate_table import GateTable
+from torchtransient.plugins.films.gate_table import GateTable, put_gates, read_gates
 from torchtransient.plugins.films.long_kernel import Spot
 from torchtransient.plugins.films.pulsed_filter import pulse_of
 from torchtransient.plugins.films.window import GappedWindow
@@ -75,6 +74,10 @@ class GatedHDRFilm(TimeResolvedFilm):
         """What errors call the film's response over time."""
         return "rectangular gate"
 
+    @property
+    def slope_remedy(self) -> str:
+        return "Use gates that rise from zero and fall to zero (gaussian, tabulated), or give the film a pulse."
+
     def arrivals(self):
         """What can count: arrivals while some gate is open."""
         return self._window
@@ -126,53 +129,6 @@ class GatedHDRFilm(TimeResolvedFilm):
             f"  gates = {self.gate_count()} between {self.table.first + self.start_opl:g} m and "
             f"{self.table.last + self.start_opl:g} m\n]"
         )
-
-
-@dr.syntax
-def put_gates(spot, table, opl, value, slope_value, active):
-    """Add to every gate that light arriving at ``opl`` meets."""
-    g, end = table.candidates(opl, active)
-    going = mi.Bool(active) & (g < end)
-    while dr.hint(going, label="gates put"):
-        weight, slope = table.value(g, opl, going)
-        _scatter(spot, g, weight, slope, value, slope_value, going & ((weight != 0) | (slope != 0)))
-        g += 1
-        going = going & (g < end)
-
-
-def _scatter(spot, gate, weight, slope, value, slope_value, active):
-    for c in range(spot.channels):
-        v = value[c] * weight
-        if slope_value is not None:
-            v += slope_value[c] * slope
-        index = dr.fma(gate, spot.bin_stride, spot.base) + c * spot.channel_stride
-        dr.scatter_reduce(dr.ReduceOp.Add, spot.flat, type(spot.flat)(v), index, active)
-
-
-@dr.syntax
-def read_gates(spot, table, opl, steady, active):
-    """Adjoint and its slope summed over the gates that light arriving at ``opl`` meets."""
-    A, slope = [mi.Float(0) for _ in range(spot.channels)], [mi.Float(0) for _ in range(spot.channels)]
-    g, end = table.candidates(opl, active)
-    going = mi.Bool(active) & (g < end)
-    while dr.hint(going, label="gates read"):
-        weight, dweight = table.value(g, opl, going)
-        A, slope = _gathered(spot, g, weight, dweight, steady, A, slope, going)
-        g += 1
-        going = going & (g < end)
-    return A, slope
-
-
-def _gathered(spot, gate, weight, dweight, steady, A, slope, active):
-    index = dr.fma(gate, spot.bin_stride, spot.base)
-    total_A, total_slope = [], []
-    for c in range(spot.channels):
-        a = mi.Float(0) if steady is None else steady[c]
-        if spot.flat is not None:
-            a = a + dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, active)
-        total_A.append(dr.fma(a, weight, A[c]))
-        total_slope.append(dr.fma(a, dweight, slope[c]))
-    return total_A, total_slope
 
 
 register("film", "gated_hdr_film", GatedHDRFilm)

@@ -375,8 +375,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if facts.geometry and not film.has_slope:
             raise GradientError(
                 "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
-                f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
-                "'tent' or 'gaussian'."
+                f"needs a response over time with a slope; the film has {film.temporal_filter!r}. {film.slope_remedy}"
             )
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(

@@ -97,7 +97,9 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
 
     Returns (collides, is the collision real, distance of the collision, factor on the weight).
     """
-    rate = dr.maximum(medium.get_majorant(medium_interaction(ray, medium, t), inside), media.rate_floor)
+    rate = medium.get_majorant(medium_interaction(ray, medium, t), inside)
+    if media.rate_floor is not None:
+        rate = dr.maximum(rate, media.rate_floor)
     many = len(rate) > 1
     p = channel_probabilities(carried)
     one = pick(rate, p, rng.next_float32()) if many else rate[0]
@@ -113,7 +115,7 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
         analytic = medium.is_homogeneous()
     if media.homogeneous:
         σ_t = rate
-        if media.rate_floor > 0:
+        if media.rate_floor is not None:
             σ_t = medium.get_majorant(mei, inside & analytic)
         density = attenuation(rate, stretch)
         density = dr.sum(p * dr.select(collides, rate * density, density))
@@ -122,7 +124,7 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
         σ_t = medium.get_scattering_coefficients(mei, collides & ~analytic)[2]
         # Forced collisions where there is little density, about one in four walks through the scene in total.
         chance = dr.sum(p * σ_t) / one
-        if media.rate_floor > 0:
+        if media.rate_floor is not None:
             chance = dr.maximum(chance, 0.25 * media.rate_floor / one)
         chance = dr.minimum(chance, 1)
         delta_real = rng.next_float32() < chance

@@ -19,8 +19,8 @@ class MediaFacts:
     For derivatives: ``recorded`` (the path is kept), ``legs_change`` (a transmittance can change), ``keeps_entry`` (the
     boundary before a vertex is kept, since the vertex may move with it).
 
-    ``rate_floor`` (1 / m, 0 when no extinction is differentiated) is the smallest rate at which collisions are sampled:
-    where the density is zero, its derivative is not, and is found by collisions alone.
+    ``rate_floor`` (1 / m, None when no extinction is differentiated) is the smallest rate at which collisions are
+    sampled: where the density is zero, its derivative is not, and is found by collisions alone.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -33,7 +33,7 @@ class MediaFacts:
         self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
         self.open_boundaries = open_boundaries
         self.extent = extent
-        self.rate_floor = 0.0
+        self.rate_floor = None
         self.recorded = False
         self.legs_change = False
         self.keeps_entry = False
@@ -48,7 +48,9 @@ class MediaFacts:
         media.recorded = True
         media.legs_change = geometry or density
         media.keeps_entry = geometry and self.open_boundaries
-        media.rate_floor = 0.5 / self.extent if density else 0.0
+        if density:
+            # Opaque: as a literal, every change of the scene's size would compile another kernel.
+            media.rate_floor = dr.opaque(mi.Float, 0.5 / self.extent)
         return media
 
     @property
