@@ -52,6 +52,20 @@ def test_buffers_move_with_the_module(entry):
     assert all(t.is_meta for t in [*module.parameters(), *module.buffers()])
 
 
+@pytest.mark.gpu
+@each
+def test_cuda_gives_the_same(entry):
+    x = entry.x()
+    reference = parts(expected(entry.module(), x))
+    module = entry.module().cuda()
+    for value, exact in zip(parts(expected(module, x.cuda())), reference, strict=True):
+        assert value.is_cuda
+        torch.testing.assert_close(value.cpu(), exact, rtol=1e-9, atol=1e-10)
+    with torch.no_grad():
+        for value in parts(module(x.cuda(), generator=torch.Generator("cuda").manual_seed(0))):
+            assert value.is_cuda
+
+
 @each
 def test_gradcheck_of_the_expectation(entry):
     module, x = entry.module(), entry.x()[:1].requires_grad_()

@@ -43,7 +43,7 @@ def convolve_time(
     check_choice(method, Method, "method", "convolve_time")
     if kernel.ndim != 1 or kernel.numel() == 0:
         raise ShapeError(f"convolve_time: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
-    bins = x.shape[TIME]
+    bins, kernel = x.shape[TIME], kernel.to(x.device)
     if boundary == "periodic":
         kernel, first = _fold(kernel, first, bins)
     else:
