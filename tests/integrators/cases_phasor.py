@@ -96,7 +96,7 @@ CASES = [
     Case(
         "phasor_fog_density",
         ROW,
-        lambda: seen_as_phasors(block(homogeneous())),
+        lambda: seen_as_phasors(block(homogeneous()), frequencies="0.0, 0.13"),
         set_color(SIGMA_T),
         0.8,
         0.02,
