@@ -148,6 +148,24 @@ BLOCKS = {
 }
 
 
+def with_phasors():
+    """The block seen by a phasor film."""
+    scene = block(homogeneous())
+    size = {key: scene["sensor"]["film"][key] for key in ("width", "height", "rfilter")}
+    scene["sensor"]["film"] = {"type": "phasor_hdr_film", **size, "start_opl": 6.0, "frequencies": "0.1, 0.35, 0.6"}
+    return scene
+
+
+def over_metal():
+    """The block before a wall of metal, which polarizes."""
+    scene = block(homogeneous())
+    scene["wall"]["bsdf"] = {"type": "roughconductor", "material": "Al", "alpha": 0.5}
+    return scene
+
+
+BLOCKS |= {"phasors": with_phasors, "metal": over_metal}
+
+
 def case(name, row, scene, apply, value, step, **arguments):
     return Case("medium_" + name, row, BLOCKS[scene], apply, value, step, **arguments)
 
@@ -187,5 +205,15 @@ CASES = [
     lengths("camera_in_fog", "fog", move("sensor.to_world", FORWARD), tags=SLOW),
     lengths("index_smooth", "smooth glass", set_color("block.bsdf.eta"), value=1.3),
     lengths("index_rough", "rough glass", set_color("block.bsdf.eta"), value=1.3, tags=SLOW),
+    case("phasor_sigma_t", "medium extinction", "phasors", set_color(SIGMA_T), 0.8, 0.02, tags=SLOW),
+    lengths("phasor_wall", "phasors", move("wall.to_world", FORWARD), tags=SLOW),
+    case(
+        "polar_sigma_t", "medium extinction", "metal", set_color(SIGMA_T), 0.8, 0.05,
+        variant="llvm_ad_mono_polarized", fd_spp=8192, tags=SLOW,
+    ),
+    lengths(
+        "polar_wall", "metal", move("wall.to_world", FORWARD), variant="llvm_ad_mono_polarized", spp=4096,
+        fd_spp=4096, tags=SLOW,
+    ),
     lengths("boundary", "plain", thicken("block.vertex_positions"), step=2e-2, tags=SLOW),
 ]  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from cases_media import SIGMA_T, block, homogeneous
+from cases_polar import METAL, metal_room
 from gradient_cases import Case, area_light, camera, glass_slab, move, move_point, room, rotate, set_color
 
 ROW = "through a phasor film: albedo, light, geometry, index"
@@ -90,6 +92,27 @@ CASES = [
         0.1,
         spp=2048,
         fd_spp=16384,
+    ),
+    Case(
+        "phasor_fog_density",
+        ROW,
+        lambda: seen_as_phasors(block(homogeneous()), frequencies="0.0, 0.13"),
+        set_color(SIGMA_T),
+        0.8,
+        0.02,
+        spp=8192,
+        fd_spp=8192,
+    ),
+    Case(
+        "phasor_polarized_metal_moves",
+        ROW,
+        lambda: seen_as_phasors(metal_room(METAL), **LIST),
+        move("wall.to_world", (0, 0, 1)),
+        0.0,
+        2e-3,
+        "llvm_ad_mono_polarized",
+        spp=2048,
+        fd_spp=2048,
     ),
     Case("phasor_glass_index", ROW, glass, set_color("slab.bsdf.eta"), 1.5, 4e-3, spp=8192, fd_spp=8192),
 ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import GradientError, SceneError
 from torchtransient.testing.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_rgb"
@@ -134,6 +134,21 @@ def test_surface_integrator_names_the_other_one():
     scene = load(block(clouds()), integrator="transient_path")
     with pytest.raises(SceneError, match="transient_prbvolpath"):
         scene.integrator().render(scene, spp=1)
+
+
+def test_spherical_lights_need_connections():
+    objects = block(homogeneous(1.0, 0.8, sample_emitters=False))
+    objects["lamp"] = {"type": "sphere", "center": [0, 1.6, 2], "emitter": {"type": "area", "radiance": 5.0}}
+    scene = load(objects, camera(filter="tent"))
+    params = mi.traverse(scene)
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    shift = mi.AffineTransform4f().translate(mi.Vector3f(0, 0, 1) * x)
+    params["floor.to_world"] = shift @ mi.AffineTransform4f(params["floor.to_world"])
+    params.update()
+    adjoint = mi.TensorXf(np.ones(scene.sensors()[0].film().cube_shape(), dtype=np.float32))
+    with pytest.raises(GradientError, match="sample_emitters"):
+        scene.integrator().render_backward(scene, params, (None, adjoint), spp=1)
 
 
 def test_without_media_it_is_the_surface_integrator():

@@ -211,7 +211,7 @@ class TransientRenderer(nn.Module):
 
     @property
     def effective_filter(self) -> str:
-        """The temporal filter that renders use; empty for a phasor film."""
+        """The temporal filter that renders use; empty for a film that has none."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
@@ -225,6 +225,8 @@ class TransientRenderer(nn.Module):
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
             )
+        if self.axis is None and temporal_filter not in (None, "auto"):
+            raise SceneError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
             twin._options = replace(self._options, sampler=sampler)

@@ -103,7 +103,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
     integrator are ignored. The spatial filter and double precision above 2^16 samples per pixel are as in
     ``transient_hdr_film``.
 
-    Memory: the phasors, and up to 256 MB of events of the kernel in flight; never a histogram.
+    Memory: the phasors, and up to 256 MB of events of the kernel in flight (twice that in forward mode); never a
+    histogram.
 
     Not supported: alpha channel, half precision, exhaustive scans.
     """

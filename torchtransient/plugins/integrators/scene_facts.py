@@ -150,6 +150,7 @@ class SceneFacts:
         facts.index_moves = index
         if facts.media is not None:
             facts.media = facts.media.with_gradients(facts.geometry)
+            facts.media.check_spheres(facts.sphere_lights)
         facts.lobe_probability = lobe_probability_table(self.bsdfs) if facts.delta else None
         return facts
 

@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import GradientError
+
 
 class MediaFacts:
     """Static choices for the walks through media.
@@ -52,6 +54,16 @@ class MediaFacts:
             # Opaque: as a literal, every change of the scene's size would compile another kernel.
             media.rate_floor = dr.opaque(mi.Float, 0.5 / self.extent)
         return media
+
+    def check_spheres(self, sphere_lights: bool) -> None:
+        """Where path lengths change, spherical lights (``sphere_lights``) are sampled by connections alone, which every
+        medium has to allow. Raises ``GradientError`` otherwise.
+        """
+        if sphere_lights and not self.emitter_sampling:
+            raise GradientError(
+                "transient_prbvolpath: derivatives of path lengths reach spherical lights through connections only, "
+                "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
+            )
 
     @property
     def one_stretch(self) -> bool:
