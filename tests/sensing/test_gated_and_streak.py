@@ -25,10 +25,21 @@ def test_gate_profile_is_the_mean_over_bins():
     for g in range(2):
         rise = torch.special.ndtr((t - delays[g].double()) / (0.4e-9 / RISE_PER_SIGMA))
         fall = torch.special.ndtr((t - delays[g].double() - widths[g].double()) / (0.9e-9 / RISE_PER_SIGMA))
-        exact = 0.01 + 0.99 * (rise - fall).reshape(200, 400).mean(1)
+        exact = 0.01 + 0.99 * (rise - fall).reshape(200, 400).mean(1).clamp(min=0)
         torch.testing.assert_close(found[g], exact, rtol=0, atol=1e-6)
     # From 10 % to 90 % within the time that it says.
     assert abs(float(torch.special.ndtr(torch.tensor(RISE_PER_SIGMA / 2))) - 0.9) < 1e-6
+
+
+def test_shut_gates_do_not_go_below_zero():
+    """Counting refuses negative light, rounding included, however far the gate is and however sharp its edges are."""
+    axis = TimeAxis(0.0, 0.02, 3000)
+    delays = torch.linspace(0, 190e-9, 40, dtype=torch.float64)
+    for rise_s in (1e-12, 0.5e-9, 5e-9):
+        profile = gate_profiles(delays, torch.full_like(delays, 4e-9), axis, rise_s=rise_s, fall_s=rise_s)
+        assert float(profile.min()) >= 0.0 and float(profile.max()) <= 1 + 1e-12
+        open_s = float((profile > 1e-9).double().sum(1).max()) * axis.bin_width_s
+        assert open_s < 4e-9 + 8 * rise_s + 3 * axis.bin_width_s
 
 
 def test_gates_in_a_row_give_the_distance():

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import correlate
 from torchtransient.sensing.layout import check_number, check_seconds
 from torchtransient.sensing.response_shapes import normal_cdf
@@ -34,7 +34,8 @@ def gate_profiles(
 
     ``delays_s`` and ``widths_s`` (G,): middle of the opening edge, counted from the emission of the light, and time
     from there to the middle of the closing edge. ``rise_s``, ``fall_s``: from 10 % to 90 %, above zero. Differentiable
-    in delays and widths. A gate narrower than its edges does not open fully. Raises UnitError, ShapeError.
+    in delays and widths. A gate narrower than its edges does not open fully, and what
+    the formula has below zero before it is zero. Raises UnitError, ShapeError.
     """
     me = "gate_profiles"
     rise = check_seconds(rise_s, "rise_s", me, open_low=True) / RISE_PER_SIGMA
@@ -49,7 +50,9 @@ def gate_profiles(
     closed = opened + widths_s.double().unsqueeze(1)
     open_part = _edge_integral(edges, opened, rise).diff(dim=1)
     close_part = _edge_integral(edges, closed, fall).diff(dim=1)
-    profile = (open_part - close_part) / edges.diff()
+    # Far from the gate both parts are equal up to rounding; before a gate that closes much slower than it opens and is
+    # narrower than that, the closing edge comes first. Neither leaves negative light.
+    profile = ((open_part - close_part) / edges.diff()).clamp_min(0)
     return leakage + (1 - leakage) * profile
 
 
@@ -93,6 +96,12 @@ class GatedIntegration(Sensor):
         self.axis = axis
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
+        window_s = axis.num_bins * axis.bin_width_s
+        if max(self.rise_s, self.fall_s) > 10 * window_s:
+            raise UnitError(
+                f"{me}: expected edges in seconds that fit a window of {window_s:g} s, got {self.rise_s!r} and "
+                f"{self.fall_s!r}. Nanoseconds? 0.2 ns is 0.2e-9."
+            )
         self.leakage = check_number(leakage, "leakage", me, high=1.0)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
         values = {

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.impulse_response import GaussianResponse, ImpulseResponse
@@ -64,7 +64,7 @@ class SweepJitter(RandomSensor):
         return self.jitter_fwhm_s / FWHM_PER_SIGMA / self.bin_width_s
 
     def expected(self, x: Tensor) -> Tensor:
-        check_transient(x, type(self).__name__)
+        self._check(x)
         if self.sigma_bins == 0:
             return x
         reach = math.ceil(6 * self.sigma_bins) + 1
@@ -82,7 +82,7 @@ class SweepJitter(RandomSensor):
             return self._shifted(x, generator)
 
     def _shifted(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
-        check_transient(x, type(self).__name__)
+        self._check(x)
         if self.sigma_bins == 0:
             return x
         items = x.shape[:-4]
@@ -96,6 +96,14 @@ class SweepJitter(RandomSensor):
             if abs(lag) < x.shape[TIME] and bool((weights[..., k] > 0).any()):
                 result = result + weights[..., k].reshape(*items, 1, 1, 1, 1) * _moved(x, lag)
         return result
+
+    def _check(self, x: Tensor) -> None:
+        check_transient(x, type(self).__name__)
+        if self.sigma_bins > x.shape[TIME]:
+            raise UnitError(
+                f"{type(self).__name__}: expected jitter below the window of {x.shape[TIME] * self.bin_width_s:g} s, "
+                f"got jitter_fwhm_s={self.jitter_fwhm_s!r}. Picoseconds? 1 ps is 1e-12."
+            )
 
     def extra_repr(self) -> str:
         return f"jitter_fwhm_s={self.jitter_fwhm_s:g}, sweeps={self.sweeps}, {super().extra_repr()}"
