@@ -45,7 +45,7 @@ def log_matched_filter(
         raise ShapeError(f"{me}: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
     if bool((kernel < 0).any()):
         raise UnitError(f"{me}: expected shares >= 0 in the kernel, got {float(kernel.min()):g}.")
-    weights = torch.log1p(ratio * kernel)
+    weights = torch.log1p(ratio * kernel.to(histogram.device))
     return convolve_time(histogram, weights.flip(0), -(first + kernel.numel() - 1), boundary=boundary)
 
 
