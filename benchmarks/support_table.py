@@ -1,7 +1,7 @@
 """Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
 markers.
 
-The cases are those of ``tests/integrators/gradient_cases.py``: what the table says is what the tests check.
+The cases are those of ``tests/integrators/all_cases.py``: what the table says is what the tests check.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ NOT_SUPPORTED = (
     (
         "eta of Mitsuba's own `dielectric`, `roughdielectric`",
         "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",
+    ),
+    (
+        "derivatives of Mitsuba's own `conductor`, `polarizer`, `retarder`, `circular` in polarized variants",
+        "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place, see docs/polarization.md",
     ),
     (
         "vertices of light-emitting meshes without texture coordinates",
@@ -73,14 +77,14 @@ def main() -> None:
     arguments = parser.parse_args()
 
     sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "integrators")]
-    from gradient_cases import CASES
+    from all_cases import ALL_CASES
     from tqdm import tqdm
 
     import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
 
     rows = defaultdict(list)
     for case in tqdm(
-        [c for c in CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
+        [c for c in ALL_CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
     ):
         rows[case.row].append((case, measure(case)))
     text = table(rows)

@@ -14,7 +14,7 @@ import torchtransient
 
 PACKAGE = Path(torchtransient.__file__).parent
 LEVEL = {
-    "errors": 0, "_llvm": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
+    "errors": 0, "_llvm": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0, "gates": 0,
     "stokes": 0,
     "plugins": 1, "sensing": 1, "nlos": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
@@ -35,7 +35,7 @@ FORBIDDEN = {
     "interfaces": {"torch", *MITSUBA},
     **dict.fromkeys(TORCH_PILLAR, MITSUBA),
 }
-HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "click", "rich"}
+HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich"}
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -88,8 +88,10 @@ def violations(path, package=PACKAGE):
 def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
-    # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know the errors.
-    return other == "errors" or (room, other) in {("accuracy", "testing"), ("axes", "units")}
+    # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
+    # likelihoods are those of the sensors.
+    within = {("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing")}
+    return other in {"errors", "units"} or (room, other) in within
 
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)

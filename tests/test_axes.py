@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -93,3 +93,38 @@ def test_equal_hashable_picklable_frozen():
 def test_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         TimeAxis(*arguments)
+
+
+def test_frequencies_and_wavelengths():
+    axis = FrequencyAxis.uniform(0.0, 0.25, 5)
+    assert axis.num_frequencies == 5 and axis.frequencies == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert axis.per_metre.dtype == axis.hertz.dtype == torch.float64
+    assert axis.wavelengths_opl.tolist() == [float("inf"), 4.0, 2.0, pytest.approx(4 / 3), 1.0]
+    modulation = FrequencyAxis.from_hertz([20e6, 100e6], start_opl=1.0)
+    torch.testing.assert_close(modulation.hertz, torch.tensor([20e6, 100e6], dtype=torch.float64), rtol=1e-15, atol=0)
+    assert modulation.wavelengths_opl[1].item() == pytest.approx(2.99792458)
+    assert modulation.start_opl == 1.0 and "start_opl=1" in repr(modulation)
+
+
+def test_frequency_axes_are_plain_values():
+    axis = FrequencyAxis(np.array([0.5, -1.5]), np.float64(2.0))
+    assert axis == FrequencyAxis(torch.tensor([0.5, -1.5]), 2) == pickle.loads(pickle.dumps(axis))
+    assert hash(axis) == hash(FrequencyAxis((0.5, -1.5), 2.0)) and axis != FrequencyAxis((0.5, -1.5))
+
+
+@pytest.mark.parametrize(
+    "arguments, error, message",
+    [
+        ((()), ShapeError, "at least one"),
+        ((float("inf"),), UnitError, "finite"),
+        (("a",), UnitError, "one number"),
+    ],
+)
+def test_frequencies_that_are_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        FrequencyAxis(arguments)
+
+
+def test_a_phase_origin_that_is_refused():
+    with pytest.raises(UnitError, match="start_opl"):
+        FrequencyAxis((1.0,), float("nan"))

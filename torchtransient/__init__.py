@@ -16,16 +16,23 @@ del globals()["render"]
 
 _LAZY = {
     "FrequencyAxis": "torchtransient.axes",
+    "Gate": "torchtransient.gates",
+    "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.render.output",
     "RenderStats": "torchtransient.render.output",
     "Scene": "torchtransient.render.scene_handle",
     "TimeAxis": "torchtransient.axes",
     "TransientRenderer": "torchtransient.render.renderer",
     "cost_of_accuracy": "torchtransient.accuracy.cost",
+    "Plan": "torchtransient.render.plan",
     "load": "torchtransient.render.scene_handle",
+    "plan": "torchtransient.render.plan",
+    "losses": "torchtransient.losses",
     "render": "torchtransient.render.renderer",
     "scenes": "torchtransient.scenes",
+    "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
+    "vis": "torchtransient.vis",
 }
 
 
@@ -34,7 +41,7 @@ def __getattr__(name: str) -> object:
     if name not in _LAZY:
         raise AttributeError(f"module 'torchtransient' has no attribute {name!r}")
     module = importlib.import_module(_LAZY[name])
-    value = module if name in ("scenes", "stokes") else getattr(module, name)
+    value = module if _LAZY[name] == f"torchtransient.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

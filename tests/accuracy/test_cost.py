@@ -141,3 +141,17 @@ def test_errors():
         tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, samplers=("no_such_sampler",), progress=False)
     with pytest.raises(SceneError, match="temporal_filter"):
         tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, temporal_filters=("round",), progress=False)
+
+
+def test_phasors_have_a_cost_too():
+    scene = tt.load(tt.scenes.moving_wall(resolution=2, num_bins=64, bin_width_opl=0.05), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[WALL], frequencies=[0.0, 0.4])
+    report = tt.cost_of_accuracy(
+        renderer, spp=(16, 64, 256), gradients=[WALL], repeats=8, samplers=("independent",), progress=False
+    )
+    assert report.quantities() == ["phasor", f"d loss / d {WALL}"]
+    slope = report.slope("phasor", Choice("independent", ""))
+    assert abs(slope.slope + 1) < max(4 * slope.standard_error, 0.1)
+    assert "phasor [independent]" in report.table() and report.settings["time_axis"] is None
+    with pytest.raises(SceneError, match="the film has none"):
+        tt.cost_of_accuracy(renderer, temporal_filters=("tent",), progress=False)

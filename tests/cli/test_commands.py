@@ -59,6 +59,30 @@ def test_render_writes_what_the_library_renders(folder, ending):
     assert f"out.{ending}: 3 x 40 x 8 x 8" in result.stdout
 
 
+def test_render_writes_phasors(folder):
+    result = run("render", "box.xml", "-o", "out.h5", "--frequencies", "0,0.5,-1.25", "--seed", 3, "--quiet")
+    assert result.exit_code == 0, result.output
+    stored = read_result(folder / "out.h5")
+    expected = tt.render("box.xml", seed=3, frequencies=[0.0, 0.5, -1.25])
+    torch.testing.assert_close(stored.phasor, expected.phasor)
+    assert stored.frequencies == expected.frequencies and stored.transient is None
+    assert "out.h5: 3 x 3 x 8 x 8 (C x F x H x W) phasors" in result.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("--frequencies", "1,fast"), "numbers with commas"),
+        (("--frequencies", "1,nan"), "numbers with commas"),
+        (("--frequencies", "1", "--start-opl", 0, "--bin-width-opl", 1, "--num-bins", 2), "leave out one"),
+        (("--frequencies", "1", "--overview", "a.png"), "--overview"),
+    ],
+)
+def test_frequencies_that_cannot_be_rendered(folder, arguments, message):
+    result = run("render", "box.xml", *arguments, "--quiet")
+    assert result.exit_code == 2 and message in result.output and not (folder / "box.h5").exists()
+
+
 def test_options_of_render(folder):
     options = (
         "--param",
@@ -119,6 +143,8 @@ def test_list_of_parameters(folder):
         (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),
         (("box.xml", "--overview", "nowhere/out.png"), "'nowhere' does not exist"),
         (("box.xml", "--overview", "out.docx"), ".png"),
+        (("box.xml", "--rainbow", "nowhere/out.png"), "'nowhere' does not exist"),
+        (("box.xml", "--video", "out.avi"), ".mp4 or .gif"),
         (("box.xml", "--start-opl", "0", "--bin-width-opl", "-1", "--num-bins", "3"), "bin_width_opl > 0"),
     ],
 )

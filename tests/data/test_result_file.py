@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.data import result_file
 from torchtransient.data.result_file import check_target, read_result, write_result
 from torchtransient.errors import StorageError
@@ -39,6 +39,34 @@ def test_round_trip(tmp_path, ending, leading):
     assert back.axis == AXIS
     assert back.metadata["scene"] == "box.xml"
     assert back.metadata["stats"]["energy_after"] == [0.25]
+
+
+def phasors(leading=()):
+    generator = torch.Generator().manual_seed(1)
+    film = torch.rand(*leading, 4, 6, 3, 2, 2, generator=generator)  # the film's order: H, W, F, C, parts
+    phasor = torch.view_as_complex(film).movedim((-1, -2), (-4, -3))
+    return RenderOutput(None, phasor[..., 0, :, :].real, phasor, None, STATS, FrequencyAxis((0.0, 0.5, -2.0), 1.5))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("leading", [(), (2,)])
+def test_round_trip_of_phasors(tmp_path, monkeypatch, ending, leading):
+    monkeypatch.setattr(result_file, "_PART_BYTES", 100)
+    made = phasors(leading)
+    back = read_result(write_result(tmp_path / f"a.{ending}", made, {"scene": "box.xml"}))
+    assert back.phasor.dtype == torch.complex64 and torch.equal(back.phasor, made.phasor)
+    assert torch.equal(back.steady, made.steady)
+    assert back.frequencies == made.frequencies and back.transient is None and back.axis is None
+
+
+def test_a_phasor_file_that_does_not_fit_together(tmp_path):
+    made = phasors()
+    path = write_result(tmp_path / "a.npz", made)
+    with np.load(path) as file:
+        changed = {name: file[name] for name in file.files} | {"frequencies_per_metre": np.array([1.0])}
+    np.savez(path, **changed)
+    with pytest.raises(StorageError, match="F = 1"):
+        read_result(path)
 
 
 def test_a_cube_written_in_many_parts(tmp_path, monkeypatch):

@@ -712,9 +712,19 @@ CASES = [
 
 
 def weights(scene_film):
-    """Loss weights: the sine of three times the optical path length at each bin's centre."""
+    """Loss weights, of the shape that lies behind a pixel.
+
+    Of a histogram the sine of three times the optical path length at each bin's centre, in polarized variants with
+    factors that differ between the Stokes components and let the polarization count; of phasors and gates a
+    pattern in which no two entries weigh the same.
+    """
+    if scene_film.measures != "transient":
+        shape = scene_film.cube_shape()[2:]
+        number = np.arange(int(np.prod(shape)))
+        return (np.cos(1.7 * number + 0.4) / (1 + 0.3 * number)).reshape(shape)
     centers = scene_film.start_opl + (np.arange(scene_film.temporal_bins) + 0.5) * scene_film.bin_width_opl
-    return np.sin(3 * centers)
+    components = np.repeat([0.2, 1.0, -0.7, 1.3], scene_film.channel_count() // 4) if mi.is_polarized else np.ones(1)
+    return np.sin(3 * centers)[:, None] * components
 
 
 class Changes(dict):
@@ -758,13 +768,13 @@ class Problem:
     def loss(self, x: float, seed: int) -> float:
         self.install(mi.Float(x))
         _, transient = self.scene.integrator().render(self.scene, seed=seed, spp=self.case.fd_spp)
-        return float((np.array(transient).sum((0, 1, 3)) * weights(self.film)).sum())
+        return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())
 
     def reverse(self, seed: int) -> float:
         x = mi.Float(self.case.value)
         dr.enable_grad(x)
         keys = self.install(x)
-        g = np.broadcast_to(weights(self.film)[None, None, :, None], self.film.cube_shape()).astype(np.float32)
+        g = np.broadcast_to(weights(self.film), self.film.cube_shape()).astype(np.float32)
         self.scene.integrator().render_backward(
             self.scene, self.params, (None, mi.TensorXf(g)), seed=seed, spp=self.case.spp
         )
@@ -779,4 +789,4 @@ class Problem:
         self.install(x)
         dr.set_grad(x, 1.0)
         _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
-        return float((np.array(transient).sum((0, 1, 3)) * weights(self.film)).sum())
+        return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())

@@ -9,12 +9,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gradient_cases import CASES, Problem
+from all_cases import ALL_CASES
+from gradient_cases import Problem
 
 SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
 # sqrt(n) ulp.
 ROUNDING = 2e-3
+
+
+def marked(cases):
+    """Parameters of a test, with the marker that a case's tags ask for."""
+    slow = pytest.mark.slow
+    return [pytest.param(c, id=c.name, marks=[slow] if "slow" in c.tags else []) for c in cases]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +38,7 @@ def _problem(problems, case):
     return problems[case.name]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", marked(ALL_CASES))
 def test_forward_equals_reverse(problems, case):
     problem = _problem(problems, case)
     reverse, forward = problem.reverse(100), problem.forward(100)
@@ -39,7 +46,7 @@ def test_forward_equals_reverse(problems, case):
     assert forward == pytest.approx(reverse, rel=ROUNDING)
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.support == "correct"], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", marked(c for c in ALL_CASES if c.support == "correct"))
 def test_reverse_against_finite_differences(problems, case):
     problem = _problem(problems, case)
     reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])

@@ -10,6 +10,7 @@ import torch
 
 import torchtransient as tt
 
+VARIANT = "llvm_ad_rgb"
 HEIGHT = 4.0
 
 

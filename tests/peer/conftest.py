@@ -29,7 +29,10 @@ def peer_python():
 
 @pytest.fixture
 def peer(tmp_path):
-    """`peer(scene, seeds, spp)` -> the peer's steady (K, H, W, C) and transient (K, H, W, T, C), float64."""
+    """`peer(scene, seeds, spp)` -> the peer's steady (K, H, W, C) and transient (K, H, W, T, C), float64.
+
+    `peer.frequencies` are those of the last render's phasor film, as the peer stores them.
+    """
 
     def render(scene, seeds, spp, variant="llvm_ad_rgb"):
         request, result = tmp_path / "request.pickle", tmp_path / "result.npz"
@@ -42,6 +45,7 @@ def peer(tmp_path):
         assert done.returncode == 0, done.stderr
         with np.load(result) as data:
             assert str(data["version"]).startswith("1.3"), f"compared with 1.3.1, found {data['version']}"
+            render.frequencies = data["frequencies"]
             return data["steady"].astype(np.float64), data["transient"].astype(np.float64)
 
     return render

@@ -1,7 +1,8 @@
 """Renders with mitransient in its own environment: `python peer_render.py REQUEST.pickle RESULT.npz`.
 
 The request holds `variant`, `scene` (a dictionary with (4, 4) arrays as transforms), `seeds` and `spp`. The result
-holds `steady` (K, H, W, C) and `transient` (K, H, W, T, C) for the K seeds, and the peer's `version`.
+holds `steady` (K, H, W, C) and `transient` (K, H, W, T, C) for the K seeds, of a phasor film (K, H, W, F, 2) and its
+`frequencies` (F,), and the peer's `version`.
 """
 
 import pickle
@@ -27,7 +28,10 @@ def main():
     scene = mi.load_dict(decoded(request["scene"]))
     images = [scene.integrator().render(scene, seed=seed, spp=request["spp"]) for seed in request["seeds"]]
     steady, transient = (np.stack([np.array(pair[i]) for pair in images]) for i in range(2))
-    np.savez(sys.argv[2], steady=steady, transient=transient, version=mitransient.__version__)
+    frequencies = np.ravel(np.array(getattr(scene.sensors()[0].film(), "frequencies", [])))
+    np.savez(
+        sys.argv[2], steady=steady, transient=transient, frequencies=frequencies, version=mitransient.__version__
+    )
 
 
 if __name__ == "__main__":

@@ -134,3 +134,27 @@ def test_crop_keeps_its_own_shape(peer):
     assert result.passed, str(result)
     _, b = peer(with_film(box, **crop), range(2), 16)
     assert b.shape[1:3] == (8, 6), "the peer returns the full size, with the crop in a corner"
+
+
+def test_stokes_vectors_in_time(peer):
+    """A metal floor and a metal block, in every bin and component. The peer's window opens earlier by the near clip
+    plane.
+    """
+    box = scenes.cornell_box(4, num_bins=30, bin_width_opl=0.2, max_depth=5)
+    metal = {"type": "roughconductor", "eta": 0.8, "k": 2.5, "alpha": 0.3}
+    for name in ("floor", "large-box"):
+        box[name] = {**box[name], "bsdf": metal}
+    near, variant = box["sensor"]["near_clip"], "llvm_ad_mono_polarized"
+    mi.set_variant(variant)
+    plugins.sync()
+    _, a = ours(box, range(RUNS), 8192)
+    _, b = peer(with_film(box, start_opl=3.5 - near), range(1000, 1000 + RUNS), 8192, variant)
+    assert a.shape == b.shape == (RUNS, 4, 4, 30, 4)
+    for k in range(4):
+        assert np.abs(b[..., k]).max() > 1e-4
+    totals = two_sample_z_test(a.sum(axis=3), b.sum(axis=3))
+    assert totals.passed, str(totals)
+    tested = enough_events(a[..., 0], b[..., 0], 1e-2)
+    result = two_sample_z_test(a[:, tested], b[:, tested])
+    assert result.passed, str(result)
+    assert abs(result.chi2_z) < 4.5, str(result)

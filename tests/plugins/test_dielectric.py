@@ -87,7 +87,8 @@ def contexts():
         yield ctx
 
 
-def compare(ours, theirs, ctx):
+def compare(ours, theirs, ctx, power_alone=False):
+    """``power_alone``: of Mueller matrices compare the first entry only."""
     for i in range(2):
         assert ours.flags(i) == theirs.flags(i)
     got, expected = evaluate_all(ours, ctx), evaluate_all(theirs, ctx)
@@ -99,6 +100,8 @@ def compare(ours, theirs, ctx):
     steep = np.abs(inputs(weight.shape[-1])[0][:, 2]) > 0.05
     for k, (a, b) in enumerate(zip(got, expected, strict=True)):
         assert np.isfinite(a).all()
+        if power_alone and a.ndim == 4:
+            a, b = a[0, 0], b[0, 0]
         if k < 5:
             a, b = a[..., lit], b[..., lit]
         elif k == 5 and mi.is_polarized:
@@ -127,7 +130,8 @@ def test_rough_equals_mitsuba(variant):
     for (material, roughness), ctx in product(zip(MATERIALS, ROUGHNESSES, strict=True), contexts()):
         both = {**material, **roughness}
         ours = mi.load_dict({"type": "diff_rough_dielectric", **both})
-        compare(ours, mi.load_dict({"type": "roughdielectric", **both}), ctx)
+        # Mitsuba's depolarises
+        compare(ours, mi.load_dict({"type": "roughdielectric", **both}), ctx, power_alone=mi.is_polarized)
 
 
 def test_grazing_mueller_matrix():

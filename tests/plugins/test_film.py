@@ -200,13 +200,16 @@ def test_nothing_rendered_yet():
         make_film().develop()
 
 
-def test_no_arbitrary_outputs_and_no_polarization():
+def test_no_arbitrary_outputs():
     with pytest.raises(SceneError, match="albedo"):
         make_film().prepare(["albedo"])
-    with mi.variant_context("llvm_ad_mono_polarized"):
-        plugins.sync()
-        with pytest.raises(SceneError, match="polarized"):
-            make_film().prepare()
+
+
+def test_four_channels_a_colour_in_polarized_variants():
+    for variant, channels in (("llvm_ad_mono_polarized", 4), ("llvm_ad_spectral_polarized", 12)):
+        with mi.variant_context(variant):
+            plugins.sync()
+            assert make_film().prepare() == channels
 
 
 def test_row_too_large(monkeypatch):

@@ -270,7 +270,7 @@ def test_undeclared_value(room_scene):
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"effects": "polarization"}, tt.errors.SceneError, "only 'auto'"),
+        ({"effects": "polarization"}, tt.errors.SceneError, "'auto' or a plan"),
         ({"temporal_filter": "hat"}, tt.errors.SceneError, "box, tent, gaussian"),
         ({"parameters": COLOUR}, tt.errors.SceneError, "expected a list of keys"),
         ({"parameters": [COLOUR, COLOUR]}, tt.errors.SceneError, "both set"),

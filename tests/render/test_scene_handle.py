@@ -244,8 +244,8 @@ def test_max_depth_replaces_the_integrators(room_scene):
 
 def test_foreign_integrator_is_refused():
     room = make_room()
-    room["integrator"] = {"type": "volpath"}
-    with pytest.raises(tt.errors.SceneError, match=r"volpath.*transient_path"):
+    room["integrator"] = {"type": "ptracer"}
+    with pytest.raises(tt.errors.SceneError, match=r"ptracer.*transient_path"):
         tt.TransientRenderer(tt.load(room, variant=VARIANT))
 
 

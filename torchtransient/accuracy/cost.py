@@ -21,10 +21,12 @@ Loss = Callable[[RenderOutput], torch.Tensor]
 
 def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
     """The default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over
-    pixels.
+    pixels; of phasors, the sum of their real parts, mean over pixels.
 
-    It is linear in the transient, so that its gradient has no bias, and it changes with energy and with arrival time.
+    It is linear in what is measured, so that its gradient has no bias, and it changes with energy and arrival time.
     """
+    if out.transient is None:
+        return out.phasor.real.sum() / (out.phasor.shape[-2] * out.phasor.shape[-1])
     bins = out.transient.shape[-3]
     phase = 2.0 * math.pi * (torch.arange(bins, device=out.transient.device) + 0.5) / bins
     pixels = out.transient.shape[-2] * out.transient.shape[-1]
@@ -58,6 +60,9 @@ def cost_of_accuracy(
     medians of wall time: a forward render for the transient, render and backward for gradients; the runs of all curves
     take turns. A loss that is not linear has a biased gradient, which only a reference shows, and only in part.
 
+    Of a phasor film the quantity "phasor" takes the place of "transient": real and imaginary parts, frequencies in the
+    place of bins; it has no temporal filters to choose from.
+
     Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler
     that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
     per curve.
@@ -68,9 +73,10 @@ def cost_of_accuracy(
             f"gradients: {missing} are not parameters of this renderer, which has {list(renderer.values)}; "
             "name them in TransientRenderer(parameters=[...])"
         )
-    filters = [renderer.effective_filter] if temporal_filters is None else list(temporal_filters)
+    filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
     if not samplers or not filters:
         raise SceneError("expected at least one sampler and one temporal filter, got none")
+    axis = renderer.axis
     candidates: dict[Choice, Candidate] = {}
     without: list[str] = []
     for sampler in samplers:
@@ -89,7 +95,8 @@ def cost_of_accuracy(
         "spp": list(spp),
         "gradients": list(gradients),
         "loss": getattr(loss, "__name__", type(loss).__name__),
-        "time_axis": [renderer.axis.start_opl, renderer.axis.bin_width_opl, renderer.axis.num_bins],
+        "measured": repr(renderer.axis or renderer.frequencies or renderer.gates),
+        "time_axis": axis and [axis.start_opl, axis.bin_width_opl, axis.num_bins],
         "without_gradients": without,
     }
     # One switch of variant for all runs: a switch within each would be timed with it.
@@ -109,9 +116,13 @@ def _values_task(renderer: TransientRenderer) -> Task:
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
-        return Estimates({"transient": _array(out.transient)}, renderer.samples_drawn(spp))
+        if out.transient is None:
+            estimate = {"phasor": _array(torch.view_as_real(out.phasor))}
+        else:
+            estimate = {"transient": _array(out.transient)}
+        return Estimates(estimate, renderer.samples_drawn(spp))
 
-    return Task(run, {"transient": -3})
+    return Task(run, {"transient": -3, "phasor": -4})
 
 
 def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:

@@ -23,15 +23,16 @@ class Choice:
     temporal_filter: str
 
     def __str__(self) -> str:
-        return f"{self.sampler}, {self.temporal_filter}"
+        return f"{self.sampler}, {self.temporal_filter}" if self.temporal_filter else self.sampler
 
 
 @dataclass(frozen=True)
 class CostPoint:
     """One point of a curve.
 
-    `quantity`: "transient" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median wall time
-    of one run (forward for values, forward and backward for gradients). The errors are those of `ErrorEstimate`.
+    `quantity`: "transient", "phasor" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median
+    wall time of one run (forward for values, forward and backward for gradients). The errors are those of
+    `ErrorEstimate`.
     """
 
     choice: Choice

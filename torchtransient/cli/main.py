@@ -18,7 +18,10 @@ from torchtransient.errors import TorchTransientError
 # In the order of the help text: name of the command (and of its module), what the help says about it.
 COMMANDS = {
     "doctor": "Check that this machine can render, and say what to install.",
-    "render": "Render a scene file to HDF5 or npz, with an overview picture.",
+    "plan": "Say what a render of a scene needs, and why.",
+    "render": "Render a scene file to HDF5 or npz, with pictures and video.",
+    "video": "Write the light in flight of a result as .mp4 or .gif.",
+    "picture": "Draw a result: peak time, rainbow, streak, frames, polarization, ...",
     "cost": "Measure what accuracy costs in time on a scene.",
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }

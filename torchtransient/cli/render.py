@@ -9,12 +9,13 @@ from typing import Any
 import click
 
 from torchtransient.cli.options import assignments, frequency_list, load_scene, scene_options, scene_values, time_axis
+from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
 
 
 @click.command()
 @scene_options
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Result, .h5 or .npz.  [default: SCENE.h5]")
-@click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png).")
+@picture_options
 @click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
 @click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
@@ -26,12 +27,12 @@ from torchtransient.cli.options import assignments, frequency_list, load_scene, 
 def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
-    The file holds transient (C, T, H, W), steady (C, H, W), the time axis in metres of optical path, and how it was
-    made; with --frequencies, or for a scene with a phasor film, phasor (C, F, H, W) in place of the transient.
+    The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
+    polarized variant, the time axis in metres of optical path, and how it was made; with --frequencies, or for a scene
+    with a phasor film, phasor (C, F, H, W) in place of the transient.
     torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
-    from torchtransient.vis.overview import check_picture, plot_overview
 
     assignments(options["params"], "--param")
     axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
@@ -41,10 +42,7 @@ def command(scene: Path, **options: Any) -> None:
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
-    if options["overview"]:
-        check_picture(options["overview"])
-        if options["frequencies"]:
-            raise click.UsageError("--overview shows a histogram over time; leave it out with --frequencies.")
+    check_pictures(options, phasors=frequencies is not None)
     described = load_scene(scene, options["variant"], options["params"])
     if options["list_parameters"]:
         click.echo(described.parameters())
@@ -52,20 +50,18 @@ def command(scene: Path, **options: Any) -> None:
     output = _render(described, values, axis, frequencies, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
     stats = output.stats
-    if output.transient is None:
-        what, how = f"{_sizes(output.phasor)} (C x F x H x W) phasors", ""
+    stokes = "Stokes x " if output.polarized else ""
+    if output.gates is not None:
+        what, how = f"{_sizes(output.transient)} ({stokes}C x G x H x W) gates", ""
+    elif output.transient is None:
+        what, how = f"{_sizes(output.phasor)} ({stokes}C x F x H x W) phasors", ""
     else:
-        what, how = f"{_sizes(output.transient)} (C x T x H x W)", f", {stats.temporal_filter} filter"
+        what, how = f"{_sizes(output.transient)} ({stokes}C x T x H x W)", f", {stats.temporal_filter} filter"
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
-    if output.transient is not None:
+    if output.axis is not None:
         _report_energy(output)
-    if options["overview"] and output.transient is None:
-        raise click.UsageError("--overview shows a histogram over time, and the scene's film keeps phasors.")
-    if options["overview"]:
-        plot_overview(
-            output.transient, output.steady, output.axis, options["overview"], pixel=options["pixel"], title=scene.name
-        )
-        click.echo(f"{options['overview']}: overview")
+    check_pictures(options, phasors=output.axis is None)
+    write_pictures(output, options, scene.name)
 
 
 def _sizes(tensor: Any) -> str:
@@ -92,10 +88,15 @@ def _render(described: Any, values: dict[str, Any], axis: Any, frequencies: Any,
         )
 
 
+def _power(output: Any) -> tuple[Any, Any]:
+    """Transient and steady image without the components that describe the polarization."""
+    return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
+
+
 def _report_energy(output: Any) -> None:
     """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
     before, after = sum(output.stats.energy_before), sum(output.stats.energy_after)
-    inside = _mean_over_channels(output.transient)
+    inside = _mean_over_channels(_power(output)[0])
     total = before + after + inside
     if total > 0 and before + after > 0.001 * total:
         axis = output.axis

@@ -2,10 +2,12 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. The numbers of the axis
-(`start_opl`, and for a transient `bin_width_opl`, in metres, `num_bins`), `format` and `metadata` (JSON) are
-attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second
-copy of it is needed.
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. A gated film's images are
+a `transient` (..., C, G, H, W) with `gates` (the text of scene files) instead of an axis. Polarized variants have
+the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
+metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
+the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
+needed.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.gates import Gate, gates_from_text, gates_to_text
 from torchtransient.render.output import RenderOutput
 
 FORMAT = "torchtransient result 1"
@@ -38,7 +41,7 @@ _PART_BYTES = 2**26
 class Result:
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    Either `transient` and `axis`, or `phasor` and `frequencies`; the others are None.
+    Either `transient` with `axis` or `gates`, or `phasor` and `frequencies`; the others are None.
     """
 
     transient: torch.Tensor | None
@@ -47,6 +50,8 @@ class Result:
     metadata: dict[str, Any] = field(default_factory=dict)
     phasor: torch.Tensor | None = None
     frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
+    gates: tuple[Gate, ...] | None = None
 
 
 def check_target(path: str | Path) -> Path:
@@ -84,7 +89,7 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
     measured, numbers = _measured(output)
-    entries: dict[str, Any] = {"format": FORMAT, **numbers, "metadata": note}
+    entries: dict[str, Any] = {"format": FORMAT, **numbers, "channels": json.dumps(output.channels), "metadata": note}
     arrays = {"steady": output.steady.detach().cpu().numpy(), **measured}
     with _replacing(target) as unfinished:
         if target.suffix.lower() in _HDF5:
@@ -107,6 +112,8 @@ def _measured(output: RenderOutput) -> tuple[dict[str, NDArray[Any]], dict[str, 
             "bin_width_opl": axis.bin_width_opl,
             "num_bins": axis.num_bins,
         }
+    if output.transient is not None and output.gates is not None:
+        return {"transient": output.transient.detach().cpu().numpy()}, {"gates": gates_to_text(output.gates)}
     if output.phasor is not None and output.frequencies is not None:
         phasor = output.phasor.detach().resolve_conj().cpu().numpy()
         arrays = {"phasor": phasor, "frequencies_per_metre": output.frequencies.per_metre.numpy()}
@@ -136,14 +143,14 @@ def read_result(path: str | Path) -> Result:
         raise StorageError(
             f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
         ) from error
-    name, cube, count = (
-        ("transient", result.transient, result.axis.num_bins)
-        if result.axis is not None
-        else ("phasor", result.phasor, 0 if result.frequencies is None else result.frequencies.num_frequencies)
-    )
+    name, letter, cube = "transient", "T", result.transient
+    count = 0 if result.axis is None else result.axis.num_bins
+    if result.frequencies is not None:
+        name, letter, cube, count = "phasor", "F", result.phasor, result.frequencies.num_frequencies
+    elif result.gates is not None:
+        letter, count = "G", len(result.gates)
     if cube is None or cube.ndim < 4 or cube.shape[-3] != count:
         shape = None if cube is None else tuple(cube.shape)
-        letter = "T" if name == "transient" else "F"
         raise StorageError(
             f"result file: '{source}' holds a {name} of shape {shape}; expected "
             f"(..., C, {letter}, H, W) with {letter} = {count}."
@@ -153,13 +160,18 @@ def read_result(path: str | Path) -> Result:
 
 def _result(values: Mapping[str, Any]) -> Result:
     metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
+    # Files of earlier versions have no names of channels.
+    channels = tuple(json.loads(str(values.get("channels", "[]"))))
+    if "gates" in values:
+        transient, gates = torch.from_numpy(values["transient"]), gates_from_text(str(values["gates"]))
+        return Result(transient, steady, None, metadata, channels=channels, gates=gates)
     start = float(values["start_opl"])
     if "phasor" in values:
         frequencies = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), start)
         phasor = torch.from_numpy(values["phasor"])
-        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies)
+        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies, channels=channels)
     axis = TimeAxis(start, float(values["bin_width_opl"]), int(values["num_bins"]))
-    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata)
+    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata, channels=channels)
 
 
 @contextmanager

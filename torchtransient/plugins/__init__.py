@@ -4,6 +4,7 @@ Importing this package lets Mitsuba call us whenever its variant changes; see `_
 """
 
 from torchtransient.plugins._registry import attach as _attach
+from torchtransient.plugins._registry import kind_of as kind_of
 from torchtransient.plugins._registry import plugin_errors as plugin_errors
 from torchtransient.plugins._registry import register as register
 from torchtransient.plugins._registry import register_module as register_module

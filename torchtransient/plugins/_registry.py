@@ -62,11 +62,23 @@ class PluginModule:
 PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.gated", (("film", "gated_hdr_film"),)),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
+    PluginModule(
+        "torchtransient.plugins.integrators.volpath",
+        (("integrator", "transient_prbvolpath"), ("integrator", "transient_volpath")),
+    ),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
+    PluginModule(
+        "torchtransient.plugins.bsdfs.thin_elements",
+        (("bsdf", "diff_polarizer"), ("bsdf", "diff_retarder"), ("bsdf", "diff_circular")),
+    ),
 )
 
 
@@ -141,6 +153,16 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
         except PluginRegistrationError:
             _state.third_party = before  # one bad module must not block all later scene loads
             raise
+
+
+def kind_of(name: str) -> str | None:
+    """The kind of a plugin of this library or of a module that was added to it, such as "bsdf"; None for others."""
+    with _state.lock:
+        for entry in (*PLUGIN_MODULES, *_state.third_party):
+            for kind, plugin in entry.plugins:
+                if plugin == name:
+                    return kind
+        return next((kind for kind, plugin in _state.constructors if plugin == name), None)
 
 
 def sync() -> str | None:

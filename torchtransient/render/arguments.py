@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import nn
 
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.gates import Gate
 
 SEED_RANGE = 2**32
 
@@ -87,3 +90,45 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
     batch = ("B", *shape)
     with_batch = f"({', '.join(str(n) for n in batch)}{',' if len(batch) == 1 else ''})"
     raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")
+
+
+def film_choice(time_axis: Any, frequencies: Any, gates: Any) -> dict[str, Any]:
+    """What the films are to measure, as build options: ``time_axis``, ``frequencies`` and ``gates``, at most one of
+    them set. Raises ``SceneError``.
+    """
+    if time_axis is not None and not isinstance(time_axis, TimeAxis):
+        raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
+    if sum(choice is not None for choice in (time_axis, frequencies, gates)) > 1:
+        raise SceneError(
+            "time_axis, frequencies, gates: a film is a histogram, a phasor film or a gated film; give one of them."
+        )
+    if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
+        frequencies = FrequencyAxis(frequencies)
+    if gates is not None:
+        gates = (gates,) if isinstance(gates, Gate) else tuple(gates)
+        if not gates or not all(isinstance(gate, Gate) for gate in gates):
+            raise SceneError(
+                "gates: expected one or more tt.Gate objects, for instance [tt.Gate.gaussian(6.0, 0.2)], got "
+                f"{gates!r}."
+            )
+    axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
+    return {"time_axis": axis, "frequencies": frequencies, "gates": gates}
+
+
+class Values(Mapping[str, nn.Parameter]):
+    """The renderer's parameters under their Mitsuba keys."""
+
+    def __init__(self, module: nn.Module, names: Mapping[str, str]):
+        self._module, self._names = module, names
+
+    def __getitem__(self, key: str) -> nn.Parameter:
+        return getattr(self._module, self._names[key])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))

@@ -7,7 +7,7 @@ derivatives, stable names), and the list is instantiated. The same edits serve X
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,22 +16,39 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.gates import Gate, gates_to_text
+from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
+from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.pulse_properties import FILMS as PULSED_FILMS
+from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
-# Steady integrators whose parameters mean the same for `transient_path`.
-_PATH_INTEGRATORS = ("path", "prb", "prb_basic", "prb_projective")
+# Steady integrators, and the transient ones for which their parameters mean the same.
+_COUNTERPARTS = {
+    **dict.fromkeys(("path", "prb", "prb_basic", "prb_projective"), "transient_path"),
+    **dict.fromkeys(("volpath", "volpathmis", "prbvolpath"), "transient_prbvolpath"),
+}
 _PATH_PROPERTIES = ("max_depth", "rr_depth", "hide_emitters")
+_TRANSIENT_PROPERTIES = (
+    *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
+)  # fmt: skip
 # What a transient film takes over from a steady one; file formats and alpha have no meaning for it.
 _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
 )  # fmt: skip
-_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film")
+_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film", "gated_hdr_film")
 # Properties of a phasor film that say which frequencies it keeps; explicit frequencies replace them.
 _PEER_FREQUENCIES = (
     "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
 )  # fmt: skip
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# In polarized variants these stand in for Mitsuba's always: derivatives of theirs are NaN where frames coincide, their
+# rough dielectric depolarises and their wave plate jumps at oblique incidence.
+POLARIZED_PLUGINS = {
+    **DIFFERENTIABLE_PLUGINS,
+    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+}
 
 
 @dataclass(frozen=True)
@@ -44,7 +61,11 @@ class BuildOptions:
     derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
     away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
     that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``.
+    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``:
+    shape of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
+    ``integrator``: plugin name of a transient integrator that replaces the scene's, with the parameters that both have;
+    None to keep it.
+    ``gates``: every film becomes a gated film with these. ``steady``: False takes the steady image from the histograms.
     """
 
     time_axis: tuple[float, float, int] | None = None
@@ -55,6 +76,11 @@ class BuildOptions:
     transient: bool = False
     sampler: str | None = None
     frequencies: FrequencyAxis | None = None
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
+    gates: tuple[Gate, ...] | None = None
+    steady: bool = True
+    integrator: str | None = None
 
 
 @dataclass
@@ -89,7 +115,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _override_samplers(state, options)
             _substitute_plugins(state, options)
             transforms = _mesh_transforms(state)
-            integrator = _find_child(state, state.root, _is_integrator)
+            integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             _forget_queries(state)
             mi.parser.transform_all(config, state)
@@ -118,41 +144,6 @@ def _check_root(state: Any) -> None:
 # --------------------------------------------------------------------------------------------------------- nodes
 
 
-def _children(state: Any, node: Any) -> list[tuple[str, int]]:
-    """(property, node index) for every child object of a node, references by id included."""
-    import mitsuba as mi
-
-    result, by_id = [], state.id_to_index
-    for key, value in node.props.items():
-        if isinstance(value, mi.Properties.ResolvedReference):
-            result.append((key, value.index()))
-        elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
-            result.append((key, by_id[value.id()]))
-    return result
-
-
-def _find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
-    for _, index in _children(state, node):
-        if matches(state.nodes[index]):
-            return index
-    return None
-
-
-def _is_film(node: Any) -> bool:
-    """In dictionaries Mitsuba does not know the kind of plugins written in Python; those are told by their name."""
-    import mitsuba as mi
-
-    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().endswith("_film")
-    return unknown or node.type == mi.ObjectType.Film
-
-
-def _is_integrator(node: Any) -> bool:
-    import mitsuba as mi
-
-    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().startswith("transient_")
-    return unknown or node.type == mi.ObjectType.Integrator
-
-
 def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, properties: Mapping[str, Any]) -> None:
     import mitsuba as mi
 
@@ -171,9 +162,9 @@ def name_nodes(state: Any) -> None:
     """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``,
     ``shape_1``.
     """
-    children = [state.nodes[index] for _, index in _children(state, state.root)]
-    taken = {node.props.id() for node in children}
-    nameless = [node for node in children if not node.props.id()]
+    direct = [state.nodes[index] for _, index in children(state, state.root)]
+    taken = {node.props.id() for node in direct}
+    nameless = [node for node in direct if not node.props.id()]
     count: dict[str, int] = {}
     for node in nameless:
         kind = str(node.type).rsplit(".", 1)[-1].lower()
@@ -195,7 +186,7 @@ def _name_nested(state: Any) -> None:
     """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
     import mitsuba as mi
 
-    direct = {index for _, index in _children(state, state.root)}
+    direct = {index for _, index in children(state, state.root)}
     taken = {node.props.id() for node in state.nodes}
     for index, node in enumerate(state.nodes):
         if node.type == mi.ObjectType.BSDF and index not in direct:
@@ -226,22 +217,32 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
 def _override_films(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    if options.time_axis is None and options.frequencies is None and not options.transient:
+    if options.time_axis is None and options.frequencies is None and options.gates is None and not options.transient:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
-        film = _find_child(state, node, _is_film)
+        film = find_child(state, node, is_film)
         if film is None and node.type == mi.ObjectType.Sensor:
             _add_child(state, index, "film", "hdrfilm", mi.ObjectType.Film, {})
             film = len(state.nodes) - 1
         if film is not None:
             _override_film(state, film, options)
+            props = state.nodes[film].props
+            for prefix in PREFIXES:
+                write_pulse(props, prefix, getattr(options, prefix))
+            if not options.steady:
+                if props.plugin_name() != "transient_hdr_film":
+                    raise SceneError(
+                        f"steady=False spares a histogram the light outside of its window; the film is a "
+                        f"{props.plugin_name()!r}. Leave it out."
+                    )
+                props["steady"] = False
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     props = state.nodes[index].props
     plugin = props.plugin_name()
-    if options.time_axis is None and options.frequencies is None:
+    if options.time_axis is None and options.frequencies is None and options.gates is None:
         if options.transient and plugin in _STEADY_FILMS:
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., "
@@ -249,18 +250,24 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
                 "frequencies=tt.FrequencyAxis(...)), or make the film a transient_hdr_film or a phasor_hdr_film."
             )
         return
-    wanted = "transient_hdr_film" if options.time_axis is not None else "phasor_hdr_film"
+    wanted = "gated_hdr_film" if options.gates is not None else "phasor_hdr_film"
+    wanted = "transient_hdr_film" if options.time_axis is not None else wanted
     if plugin in _STEADY_FILMS and not options.transient:
         return
     if plugin in (*_STEADY_FILMS, *_TIME_FILMS) and plugin != wanted:
-        _become(state, index, wanted, keep=_FILM_PROPERTIES)
+        if wanted not in PULSED_FILMS and any(prefix in props for prefix in PREFIXES):
+            raise SceneError(f"the film {plugin!r} has a pulse or an irf, which a {wanted} would lose; take it out.")
+        _become(state, index, wanted, keep=_FILM_PROPERTIES + PROPERTIES)
         props = state.nodes[index].props
     if options.time_axis is not None:
         start, width, bins = options.time_axis
         props["start_opl"], props["bin_width_opl"], props["temporal_bins"] = float(start), float(width), int(bins)
+        return
+    if props.plugin_name() != wanted:
+        raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
+    if options.gates is not None:
+        props["gates"] = gates_to_text(options.gates)
     elif options.frequencies is not None:
-        if props.plugin_name() != wanted:
-            raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
         for name in _PEER_FREQUENCIES:
             if name in props:
                 del props[name]
@@ -268,16 +275,17 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
         props["start_opl"] = options.frequencies.start_opl
 
 
-def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
-    """Turn a node into another plugin; keep the named properties and every child object."""
+def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:
+    """Turn a node into another plugin; keep the named properties and, if ``nested``, child objects and spectra."""
     import mitsuba as mi
 
     old = state.nodes[index].props
-    children = {key for key, _ in _children(state, state.nodes[index])}
+    inner = {key for key, _ in children(state, state.nodes[index])}
+    inner |= {key for key in list(old.keys()) if old.type(key) == mi.Properties.Type.Spectrum}
     new = mi.Properties(plugin)
     new.set_id(old.id())
     for key in list(old.keys()):
-        if key in keep or key in children:
+        if key in keep or (nested and key in inner):
             new[key] = old[key]
     state.nodes[index].props = new
 
@@ -285,20 +293,22 @@ def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...]) -> None:
 def _override_integrator(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    index = _find_child(state, state.root, _is_integrator)
+    index = find_child(state, state.root, is_integrator)
     if options.transient:
         if index is None:
-            _add_child(state, 0, "integrator", "transient_path", mi.ObjectType.Integrator, {})
+            plugin = "transient_prbvolpath" if media_in_use(state) else "transient_path"
+            _add_child(state, 0, "integrator", plugin, mi.ObjectType.Integrator, {})
             index = len(state.nodes) - 1
         plugin = state.nodes[index].props.plugin_name()
-        if plugin in _PATH_INTEGRATORS:
-            _become(state, index, "transient_path", keep=_PATH_PROPERTIES)
+        if options.integrator is not None and plugin != options.integrator:
+            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False)
+        elif plugin in _COUNTERPARTS:
+            wanted = "transient_prbvolpath" if media_in_use(state) else _COUNTERPARTS[plugin]
+            _become(state, index, wanted, keep=_PATH_PROPERTIES)
         elif not plugin.startswith("transient_"):
             raise SceneError(
-                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, or one that it can "
-                f"stand "
-                "in for: "
-                f"{', '.join(_PATH_INTEGRATORS)}."
+                f"integrator {plugin!r} has no transient counterpart. Expected transient_path, transient_prbvolpath, "
+                f"or one that they can stand in for: {', '.join(_COUNTERPARTS)}."
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
@@ -314,7 +324,7 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
         node = state.nodes[index]
         if node.type != mi.ObjectType.Sensor:
             continue
-        sampler = _find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
+        sampler = find_child(state, node, lambda child: child.type == mi.ObjectType.Sampler)
         if sampler is None:
             _add_child(state, index, "sampler", options.sampler, mi.ObjectType.Sampler, {})
         else:
@@ -323,9 +333,13 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
 
 def _substitute_plugins(state: Any, options: BuildOptions) -> None:
     """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
+    import mitsuba as mi
+
     for node in state.nodes:
         plugin = node.props.plugin_name()
-        if plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
+        if mi.is_polarized and plugin in POLARIZED_PLUGINS:
+            node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
+        elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"

@@ -356,11 +356,16 @@ def _check_slope(session: _Session) -> None:
     ]
     film = session.film(session.job.items[0])
     if moving and not film.has_slope:
-        raise GradientError(no_slope(moving, film.temporal_filter))
+        raise GradientError(no_slope(moving, film.temporal_filter, film.slope_remedy))
 
 
-def no_slope(keys: Sequence[str], temporal_filter: str) -> str:
-    """The message for a derivative through the time of flight that the temporal filter does not have."""
+def no_slope(keys: Sequence[str], temporal_filter: str, remedy: str | None = None) -> str:
+    """The message for a derivative through the time of flight that the film's response over time does not have."""
+    if remedy is not None:
+        return (
+            f"{', '.join(repr(k) for k in keys)} can change path lengths, and the film's {temporal_filter!r} has no "
+            f"slope: the derivative through the time of flight would be lost. {remedy}"
+        )
     return (
         f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has "
         "no slope: the derivative through the time of flight would be lost. Use temporal_filter='auto', 'tent' or "

@@ -33,7 +33,14 @@ _BIASED = {
     ("Principled", "specular"): _PRINCIPLED,
 }
 _SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
-_SENSOR_KEYS = ("to_world", "x_fov", "principal_point_offset_x", "principal_point_offset_y")
+_SENSOR_KEYS = (
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+)
 _LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
 
 
@@ -159,6 +166,8 @@ def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool
         return True, True, CORRECT
     if (node.class_name(), name) in _BIASED:
         return True, name in ("eta", "specular"), _BIASED[node.class_name(), name]
+    if type(node).__name__ == "DelayedBSDF":
+        return True, name == "lifetime", CORRECT
     if name == "eta" and type(node).__name__.startswith("Diff"):
         return True, True, CORRECT
     if name == "eta" and isinstance(node, mi.BSDF):

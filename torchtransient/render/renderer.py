@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,15 @@ from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
+from torchtransient.gates import Gate
+from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
+    Values,
     as_float,
     checked_grad_seed,
+    film_choice,
     fit_shape,
     mangle,
     mix_seed,
@@ -34,29 +38,13 @@ from torchtransient.render.output import (
     transient_channels_first,
 )
 from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.plan import Plan
+from torchtransient.render.progress import Bar
+from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.variant import active_variant, device_type
+from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
-
-
-class _Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys."""
-
-    def __init__(self, module: nn.Module, names: Mapping[str, str]):
-        self._module, self._names = module, names
-
-    def __getitem__(self, key: str) -> nn.Parameter:
-        return getattr(self._module, self._names[key])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
 
 
 class TransientRenderer(nn.Module):
@@ -72,7 +60,8 @@ class TransientRenderer(nn.Module):
 
     ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
-    place of ``out.transient``. At most one of the two. ``max_depth``: replaces the integrator's. ``spp``,
+    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films. At most one of the
+    three. ``max_depth``: replaces the integrator's. ``spp``,
     ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
@@ -80,12 +69,21 @@ class TransientRenderer(nn.Module):
     a box has no slope in time. Asking for such a derivative through an explicit box raises ``GradientError``. Phasors
     are smooth in time and take no filter.
 
+    ``steady``: False for a histogram without a steady image of its own: paths end with the window, and ``out.steady``
+    is the sum over the bins.
+
+    ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor (:class:`Pulse`), for every film
+    instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
+    and every filter has a slope then. After a render ``sensing.pulse.apply_pulse`` does the same to a transient.
+
     ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
     have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
     gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
-    ``effects``: only "auto". ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with
-    the same number of samples.
+    ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
+    its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise. ``sampler``: plugin name of
+    a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -101,14 +99,25 @@ class TransientRenderer(nn.Module):
         max_depth: int | None = None,
         temporal_filter: str = "auto",
         sensors: int | Sequence[int] | str = 0,
-        effects: str = "auto",
+        effects: Plan | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
+        pulse: Pulse | None = None,
+        irf: Pulse | None = None,
+        gates: Sequence[Gate] | None = None,
+        steady: bool = True,
     ):
         super().__init__()
-        if effects != "auto":
-            raise SceneError(f"effects: only 'auto' is supported so far, got {effects!r}.")
+        if isinstance(effects, Plan):
+            scene = load(scene, variant=effects.variant)
+            time_axis, frequencies, gates, temporal_filter = effects.film_settings(
+                time_axis, frequencies, gates, temporal_filter
+            )
+            max_depth = effects.max_depth if max_depth is None else max_depth
+            pulse, irf = pulse or effects.pulse, irf or effects.irf
+        elif effects != "auto":
+            raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
         if temporal_filter not in TEMPORAL_FILTERS:
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
@@ -122,7 +131,10 @@ class TransientRenderer(nn.Module):
         self.temporal_filter = temporal_filter
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
-        self._options = self._build_options(time_axis, frequencies, max_depth, sampler)
+        changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
+        changes |= film_choice(time_axis, frequencies, gates)
+        changes |= {"steady": bool(steady), "integrator": effects.integrator if isinstance(effects, Plan) else None}
+        self._options = self._build_options(max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
             self._read_scene(sensors)
@@ -133,19 +145,10 @@ class TransientRenderer(nn.Module):
 
     # --------------------------------------------------------------------------------------------------- set-up
 
-    def _build_options(
-        self, time_axis: TimeAxis | None, frequencies: Any, max_depth: int | None, sampler: str | None
-    ) -> BuildOptions:
-        if time_axis is not None and not isinstance(time_axis, TimeAxis):
-            raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
+    def _build_options(self, max_depth: int | None, sampler: str | None, changes: dict[str, Any]) -> BuildOptions:
         if max_depth is not None and (isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < -1):
             raise SceneError(f"max_depth: expected an integer of at least -1, got {max_depth!r}.")
-        if time_axis is not None and frequencies is not None:
-            raise SceneError("time_axis and frequencies: a film is a histogram or a phasor film, give one of them.")
-        if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-            frequencies = FrequencyAxis(frequencies)
-        axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-        options = BuildOptions(axis, max_depth, transient=True, sampler=sampler, frequencies=frequencies)
+        options = BuildOptions(max_depth=max_depth, transient=True, sampler=sampler, **changes)
         return self.scene.options_for(self._keys, options)
 
     def _parameter_infos(self) -> dict[str, ParameterInfo]:
@@ -163,14 +166,20 @@ class TransientRenderer(nn.Module):
         film = found[self._sensors[0]].film()
         self.axis: TimeAxis | None = None
         self.frequencies: FrequencyAxis | None = None
+        self.gates: tuple[Gate, ...] | None = None
         self._cube_shape = tuple(film.cube_shape())
+        self._channels = tuple(film.channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
-        self._scene_filter = ""
-        if film.response == "phasor":
-            self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+        self._scene_filter, self._pulsed = "", False
+        self._pulsed = bool(getattr(film, "pulses", ()))
+        if film.measures != "transient":
+            if film.measures == "phasor":
+                self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
+            else:
+                self.gates = film.gates
             if self.temporal_filter != "auto":
                 raise SceneError(
-                    f"temporal_filter: a phasor film has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {film.measures} film has none, expected 'auto', got {self.temporal_filter!r}."
                 )
             return
         self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
@@ -198,15 +207,15 @@ class TransientRenderer(nn.Module):
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
         """The parameters under their Mitsuba keys."""
-        return _Values(self, self._names)
+        return Values(self, self._names)
 
     @property
     def effective_filter(self) -> str:
-        """The temporal filter that renders use; empty for a phasor film."""
+        """The temporal filter that renders use; empty for a film that has none."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
         moves = any(info.moves_path_length for info in self._infos.values())
-        return "tent" if moves and self._scene_filter == "box" else self._scene_filter
+        return "tent" if moves and self._scene_filter == "box" and not self._pulsed else self._scene_filter
 
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
@@ -216,6 +225,8 @@ class TransientRenderer(nn.Module):
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
             )
+        if self.axis is None and temporal_filter not in (None, "auto"):
+            raise SceneError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
             twin._options = replace(self._options, sampler=sampler)
@@ -225,7 +236,8 @@ class TransientRenderer(nn.Module):
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
         """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
-        return self.effective_filter != "box" or not any(self._infos[key].moves_path_length for key in keys)
+        sloped = self._pulsed or self.effective_filter != "box"
+        return sloped or not any(self._infos[key].moves_path_length for key in keys)
 
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
@@ -262,7 +274,7 @@ class TransientRenderer(nn.Module):
         self._check_slope(temporal_filter, tensors)
         used = samples("spp", spp) or self.spp or self._scene_spp
         items = self._items(seed, batch)
-        bar = _Bar() if progress else None
+        bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
             options=self._options,
@@ -280,10 +292,13 @@ class TransientRenderer(nn.Module):
             if bar is not None:
                 bar.close()
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
-        steady, stats = steady_channels_first(steady, leading), self._stats(job)
+        stats, components = self._stats(job), stokes_components(self.scene.variant)
+        steady = steady_channels_first(steady, leading, components)
         if self.frequencies is not None:
-            return RenderOutput(None, steady, phasor_channels_first(response, leading), None, stats, self.frequencies)
-        return RenderOutput(transient_channels_first(response, leading), steady, None, self.axis, stats)
+            phasor = phasor_channels_first(response, leading, components)
+            return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
+        transient = transient_channels_first(response, leading, components)
+        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels, gates=self.gates)
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
@@ -317,7 +332,7 @@ class TransientRenderer(nn.Module):
         return tensors, batched, batch
 
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
-        if temporal_filter != "box" or not torch.is_grad_enabled():
+        if temporal_filter != "box" or self._pulsed or not torch.is_grad_enabled():
             return
         moving = [
             k for k, t in zip(self._keys, tensors, strict=True) if t.requires_grad and self._infos[k].moves_path_length
@@ -370,6 +385,8 @@ class TransientRenderer(nn.Module):
         """Shown by ``print(renderer)``."""
         keys, used = list(self._keys), self.effective_filter
         measured = f"axis={self.axis}, temporal_filter={used!r}" if self.axis else f"frequencies={self.frequencies}"
+        if self.gates is not None:
+            measured = f"gates={len(self.gates)}"
         return f"{self.scene!r}, parameters={keys}, {measured}"
 
 
@@ -392,20 +409,3 @@ def render(
     for parameter in renderer.parameters():
         parameter.requires_grad_(False)
     return renderer(values, seed=seed, progress=progress)
-
-
-class _Bar:
-    """A progress bar that takes fractions. Made on demand: tqdm is imported only when asked for."""
-
-    def __init__(self) -> None:
-        from tqdm.auto import tqdm
-
-        self._bar: Any = tqdm(
-            total=1.0, desc="render", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
-        )
-
-    def __call__(self, fraction: float) -> None:
-        self._bar.update(fraction - self._bar.n)
-
-    def close(self) -> None:
-        self._bar.close()

@@ -85,6 +85,11 @@ def device_type(variant: str) -> str:
     return "cuda" if variant.startswith("cuda") else "cpu"
 
 
+def stokes_components(variant: str) -> int:
+    """Components of the light that a variant renders: the four of a Stokes vector in polarized ones, otherwise 1."""
+    return 4 if variant.endswith("_polarized") else 1
+
+
 @contextmanager
 def active_variant(variant: str) -> Iterator[None]:
     """Hold the engine lock with ``variant`` active and this library's plugins registered for it.

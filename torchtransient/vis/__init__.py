@@ -1,0 +1,32 @@
+"""Pictures and videos of transients: `tt.vis`.
+
+Functions take tensors or arrays (C, T, H, W), a RenderOutput, or the path of a result file; they return an RGB array or
+a matplotlib figure and write a file when they are given a path. docs/pictures.md shows one of each.
+"""
+
+from torchtransient.vis.arrival import peak_time_picture as peak_time_picture
+from torchtransient.vis.arrival import rainbow as rainbow
+from torchtransient.vis.colour_maps import cyclic as cyclic
+from torchtransient.vis.colour_maps import cyclic_map as cyclic_map
+from torchtransient.vis.colour_maps import rainbow_map as rainbow_map
+from torchtransient.vis.fit_progress import plot_fit as plot_fit
+from torchtransient.vis.gradients import gradient_picture as gradient_picture
+from torchtransient.vis.overview import light_curve as light_curve
+from torchtransient.vis.overview import median_pixel as median_pixel
+from torchtransient.vis.overview import peak_time as peak_time
+from torchtransient.vis.overview import plot_overview as plot_overview
+from torchtransient.vis.phasors import domain_colours as domain_colours
+from torchtransient.vis.phasors import phasor_picture as phasor_picture
+from torchtransient.vis.phasors import phasor_video as phasor_video
+from torchtransient.vis.polarization import polarization_picture as polarization_picture
+from torchtransient.vis.slices import frame_grid as frame_grid
+from torchtransient.vis.slices import histogram as histogram
+from torchtransient.vis.slices import streak as streak
+from torchtransient.vis.tone_mapping import exposure_of as exposure_of
+from torchtransient.vis.tone_mapping import exposure_of_video as exposure_of_video
+from torchtransient.vis.tone_mapping import tone_map as tone_map
+from torchtransient.vis.video import Frames as Frames
+from torchtransient.vis.video import frames as frames
+from torchtransient.vis.video import side_by_side as side_by_side
+from torchtransient.vis.video import video as video
+from torchtransient.vis.video_file import write_video as write_video

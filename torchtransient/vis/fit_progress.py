@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, StorageError
-from torchtransient.vis.overview import figure_type
+from torchtransient.errors import ShapeError
+from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 # A curve called by the name of a channel is drawn in its colour.
@@ -59,7 +59,4 @@ def plot_fit(
     for panel in (left, right):
         panel.set_xlabel("step")
         panel.grid(True, color="0.9", linewidth=0.6)
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:  # matplotlib raises ValueError for an unknown ending
-        raise StorageError(f"plot_fit: cannot write '{path}': {error}. Choose a writable .png.") from error
+    save_figure(figure, path, "plot_fit")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError
+from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.tone_mapping import tone_map
 
 _NANOSECONDS = 1e9
@@ -132,10 +133,7 @@ def plot_overview(
         panel.set_axis_off()
     if title:
         figure.suptitle(title, fontsize=11)
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:  # matplotlib raises ValueError for an unknown ending
-        raise StorageError(f"plot_overview: cannot write '{path}': {error}. Choose a writable .png.") from error
+    save_figure(figure, path, "plot_overview")
     return shown
 
 
@@ -175,17 +173,6 @@ def _draw_histogram(panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[
     panel.set_ylabel("radiance in a bin")
     panel.set_title(f"pixel at row {pixel[0]}, column {pixel[1]}", fontsize=10)
     panel.margins(x=0)
-
-
-def figure_type() -> Any:
-    """matplotlib's Figure, which draws without a window; StorageError when matplotlib is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise StorageError(
-            "pictures need the package matplotlib. Install it with pip install 'torchtransient[vis]'."
-        ) from error
-    return Figure
 
 
 def _check(transient: Tensor, axis: TimeAxis | None = None) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
+CURVES = ("srgb", "gamma", "log", "linear")
+_FRAMES_AT_ONCE = 16
+_LOG_STEPS = 4096
 
 
 def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
@@ -28,21 +33,79 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
     return 1.0 / (white if white > 0 else lit[-1].item())
 
 
-def tone_map(image: Tensor, exposure: float | None = None) -> Tensor:
-    """(C, H, W) linear radiance, C = 1 or 3 (linear sRGB), to (H, W, 3) in [0, 1] with the sRGB curve (IEC 61966-2-1).
+def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
+    """One factor for all frames: it brings the given quantile of the *lit* pixels of all frames to white.
 
-    `exposure` None takes `exposure_of(image)`. Negative values become black; pixels that are not finite magenta.
-    Raises ShapeError for another shape.
+    `transient`: (C, T, H, W) linear radiance in a bin. Most pixels of most frames are black: only what is lit counts.
+    The quantile is found to 1 % of its value over nine decades below the maximum; nothing of the size of the cube is
+    allocated. 1 for a black cube. Raises ShapeError and UnitError.
+    """
+    if transient.ndim != 4 or transient.shape[0] not in (1, 3):
+        raise ShapeError(f"exposure_of_video: expected (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}.")
+    if not 0 < quantile <= 1:
+        raise UnitError(f"exposure_of_video: expected 0 < quantile <= 1, got {quantile!r}.")
+    parts = list(range(0, transient.shape[1], _FRAMES_AT_ONCE))
+    highest = max((_lit(transient, start).max().item() for start in parts if _lit(transient, start).numel()), default=0)
+    if highest <= 0:
+        return 1.0
+    if quantile == 1:
+        return 1.0 / highest
+    low, high = math.log(highest) - 9 * math.log(10), math.log(highest)
+    counts = torch.zeros(_LOG_STEPS, dtype=torch.float64)
+    for start in parts:
+        values = _lit(transient, start).to(torch.float64).log()
+        counts += torch.histc(values.clamp(min=low), _LOG_STEPS, low, high)
+    reached = counts.cumsum(0) / counts.sum()
+    step = min(int(torch.searchsorted(reached, torch.tensor(quantile, dtype=torch.float64))), _LOG_STEPS - 1)
+    return 1.0 / math.exp(low + (step + 1) * (high - low) / _LOG_STEPS)
+
+
+def _lit(transient: Tensor, start: int) -> Tensor:
+    values = transient[:, start : start + _FRAMES_AT_ONCE].detach().amax(0)
+    return values[torch.isfinite(values) & (values > 0)]
+
+
+def tone_map(
+    image: Tensor, exposure: float | None = None, curve: str = "srgb", *, gamma: float = 2.2, stops: float = 10.0
+) -> Tensor:
+    """(C, H, W) linear radiance, C = 1 or 3 (linear sRGB), to (H, W, 3) float64 in [0, 1].
+
+    `exposure` multiplies before the curve; None takes `exposure_of(image)`. `curve`: "srgb" (IEC 61966-2-1), "gamma"
+    (`x ** (1 / gamma)`), "linear", or "log", which spreads `stops` factors of two below white evenly over the scale,
+    for direct and late light in one picture; there the brightest channel is mapped and the others keep their ratio
+    to it. Negative values become black; pixels that are not finite magenta. Raises ShapeError for another shape,
+    UnitError for an unknown curve, or an exposure, gamma or number of stops that is not positive.
     """
     _check(image)
-    scale = exposure_of(image) if exposure is None else exposure
+    scale = exposure_of(image) if exposure is None else float(exposure)
+    for name, value in (("exposure", scale), ("gamma", gamma), ("stops", stops)):
+        if not (math.isfinite(value) and value > 0):
+            raise UnitError(f"tone_map: expected {name} > 0, got {value!r}.")
     shown = image.detach().to(torch.float64) * scale
     broken = ~torch.isfinite(shown).all(0)
-    shown = torch.nan_to_num(shown, nan=0.0, posinf=1.0, neginf=0.0).clamp(0, 1)
-    shown = torch.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown.clamp(min=1e-12) ** (1 / 2.4) - 0.055)
+    shown = torch.nan_to_num(shown, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)
+    shown = _curve(shown, curve, gamma, stops).clamp(0, 1)
     shown = shown.expand(3, -1, -1).permute(1, 2, 0).contiguous()
     shown[broken] = shown.new_tensor(BROKEN)
     return shown
+
+
+def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
+    if curve == "srgb":
+        x = linear.clamp(max=1)
+        return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=1e-12) ** (1 / 2.4) - 0.055)
+    if curve == "gamma":
+        return linear.clamp(max=1) ** (1 / gamma)
+    if curve == "linear":
+        return linear
+    if curve == "log":
+        brightest = linear.amax(0)
+        tiny = torch.finfo(linear.dtype).tiny
+        level = (1 + brightest.clamp(min=tiny, max=1).log2() / stops).clamp(0, 1)
+        # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
+        ratio = linear / torch.where(brightest > 0, brightest, 1.0)
+        return level * _curve(ratio, "srgb", gamma, stops)
+    raise UnitError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {curve!r}.")
 
 
 def _check(image: Tensor) -> None:

@@ -11,6 +11,7 @@ from torchtransient.plugins._registry import register
 
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
+from .mueller import Interface, across_plane
 
 
 class DiffDielectric(mi.BSDF):
@@ -96,20 +97,9 @@ class DiffDielectric(mi.BSDF):
         towards_light, towards_sensor = (bs.wo, si.wi) if forward else (si.wi, bs.wo)
         # Both matrices are the same seen from either side. The cosine that was given is the accurate one: that of a
         # refracted direction close to the critical angle has lost the digits that matter.
-        reflection = mi.mueller.specular_reflection(si.wi.z, mi.Complex2f(self.eta))
-        transmission = mi.mueller.specular_transmission(si.wi.z, self.eta)
-        matrix = dr.select(selected_r, reflection, transmission)
-        normal = mi.Vector3f(0, 0, 1)
-        s_in, s_out = dr.cross(normal, -towards_light), dr.cross(normal, towards_sensor)
-        along_normal = (dr.squared_norm(s_in) == 0) | (dr.squared_norm(s_out) == 0)
-        s_in = dr.normalize(dr.select(along_normal, mi.Vector3f(1, 0, 0), s_in))
-        s_out = dr.normalize(dr.select(along_normal, mi.Vector3f(1, 0, 0), s_out))
-        matrix = mi.mueller.rotate_mueller_basis(
-            matrix,
-            -towards_light, s_in, mi.mueller.stokes_basis(-towards_light),
-            towards_sensor, s_out, mi.mueller.stokes_basis(towards_sensor),
-        )  # fmt: skip
-        return mi.Spectrum(matrix)
+        interface = Interface(si.wi.z, self.eta)
+        matrix = dr.select(selected_r, interface.reflection(), interface.transmission())
+        return across_plane(matrix, mi.Vector3f(0, 0, 1), towards_sensor, towards_light)
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return mi.Spectrum(0)

@@ -64,7 +64,7 @@ def fresnel(cos_theta_i: Any, eta: Any) -> FresnelTerms:
 
     g2 = c * c + d
     total = g2 <= 0
-    g = dr.select(total, 0.0, _sqrt_with_bounded_slope(dr.select(total, 1.0, g2)))
+    g = dr.select(total, 0.0, sqrt_with_bounded_slope(dr.select(total, 1.0, g2)))
 
     invisible = c + g < _BOTH_GRAZING
     rcp_s = dr.rcp(dr.select(invisible, 1.0, c + g))
@@ -83,7 +83,7 @@ def fresnel(cos_theta_i: Any, eta: Any) -> FresnelTerms:
     return FresnelTerms(reflectance, transmittance, cos_theta_t, eta_it, eta_ti)
 
 
-def _sqrt_with_bounded_slope(x: Any) -> Any:
+def sqrt_with_bounded_slope(x: Any) -> Any:
     root = dr.sqrt(dr.detach(x))
     return dr.replace_grad(root, x * (0.5 / dr.maximum(root, _MIN_ROOT_IN_SLOPE)))
 

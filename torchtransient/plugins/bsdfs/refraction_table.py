@@ -76,12 +76,12 @@ def bsdfs_of_scene(scene: Any) -> list[Any]:
     shapes = scene.shapes()
     if any(shape.class_name() == "Instance" for shape in shapes):
         # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
-        return _bsdfs_below(scene)
+        return bsdfs_below(scene)
     found = {bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
     return list(found.values())
 
 
-def _bsdfs_below(node: Any) -> list[Any]:
+def bsdfs_below(node: Any) -> list[Any]:
     """The outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order."""
     found: dict[int, Any] = {}
     visited: set[int] = set()
@@ -111,7 +111,7 @@ def _refractive_leaf(bsdf: Any) -> Any | None:
     pending = [bsdf]
     while pending:
         node = pending.pop()
-        nested = _bsdfs_below(node)
+        nested = bsdfs_below(node)
         if nested:
             pending.extend(child for child in nested if _has_refraction_lobe(child))
         elif node.class_name() not in _NOT_AN_INTERFACE:

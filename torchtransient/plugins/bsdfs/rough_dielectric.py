@@ -13,6 +13,7 @@ from torchtransient.plugins._registry import register
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
 from .microfacet import ALPHA_MIN, half_vector, normal_density, smith_g1_over_cos
+from .mueller import Interface, across_plane
 
 _DISTRIBUTIONS = {"ggx": True, "beckmann": False}
 
@@ -34,6 +35,9 @@ class DiffRoughDielectric(mi.BSDF):
     Single precision: the half vector of a refraction keeps about ``1e-7 / |eta - 1|`` of relative accuracy. At an
     index of exactly one the transmitted lobe is a delta function, which this plugin cannot represent: it evaluates
     to zero.
+
+    In polarized variants every facet is a smooth interface with its Mueller matrix, as in Mitsuba's
+    ``roughconductor``; Mitsuba's ``roughdielectric`` depolarises instead. Powers of unpolarized light agree.
 
     With ``sample_visible`` off, weights of ``roughdielectric`` lack the ratio of the two normal densities; here
     they are value over density.
@@ -170,9 +174,19 @@ class DiffRoughDielectric(mi.BSDF):
         transmission = textured(1.0, self.specular_transmittance, si, active & (reflect ^ True))
         return dr.select(reflect, reflection, transmission)
 
-    def _spectrum(self, si: Any, value: Any, reflect: Any, active: Any) -> Any:
+    def _spectrum(self, ctx: Any, si: Any, wo: Any, m: Any, value: Any, reflect: Any, active: Any) -> Any:
         colour = self._colour(si, reflect, active) * value
-        return (mi.mueller.depolarizer(colour) if mi.is_polarized else mi.Spectrum(colour)) & active
+        if not mi.is_polarized:
+            return mi.Spectrum(colour) & active
+        # The facet is a smooth interface. The power of its matrix is in the value already.
+        interface = Interface(dr.dot(si.wi, m), self.eta)
+        matrix = dr.select(reflect, interface.reflection(), interface.transmission())
+        power = matrix[0, 0][0]
+        there = active & (power > 0)
+        radiance = ctx.mode == mi.TransportMode.Radiance
+        towards_sensor, towards_light = (si.wi, wo) if radiance else (wo, si.wi)
+        matrix = across_plane(matrix, m, towards_sensor, towards_light)
+        return mi.mueller.absorber(colour * dr.rcp(dr.select(there, power, 1.0))) @ matrix & there
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         wi = si.wi
@@ -181,7 +195,7 @@ class DiffRoughDielectric(mi.BSDF):
         eta_it = dr.select(wi.z > 0, self.eta, dr.rcp(self.eta))
         m, defined = half_vector(wi, wo, dr.select(reflect, 1.0, eta_it))
         pdf, weight, active = self._lobe(ctx, si, wo, m, reflect, active & defined)
-        return self._spectrum(si, pdf * weight, reflect, active), pdf
+        return self._spectrum(ctx, si, wo, m, pdf * weight, reflect, active), pdf
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return self.eval_pdf(ctx, si, wo, active)[0]
@@ -221,7 +235,7 @@ class DiffRoughDielectric(mi.BSDF):
         bs.sampled_type = dr.select(
             selected_r, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.GlossyTransmission)
         )
-        return bs, self._spectrum(si, weight, selected_r, active)
+        return bs, self._spectrum(ctx, si, wo, m, weight, selected_r, active)
 
     def _draw_normal(self, si: Any, wi: Any, sample2: Any, active: Any) -> Any:
         alpha_u, alpha_v = self._alpha(si, active)

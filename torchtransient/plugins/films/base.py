@@ -8,6 +8,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.lane import AdjointLane, Lane
+from torchtransient.plugins.films.response import SensorResponse
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -20,15 +21,19 @@ MAX_SINGLE_PRECISION_SAMPLES = 2**16
 class TimeResolvedFilm(mi.Film):
     """Abstract base of films that keep an array behind every pixel beside the steady image.
 
-    A subclass has ``plugin`` (its name in messages), ``response`` (what its array is: ``transient`` or ``phasor``), the
+    A subclass has ``plugin`` (its name in messages), ``measures`` (what its array is: ``transient`` or ``phasor``), the
     shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
     integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
     handed over as ``opl - start_opl`` in double precision.
+
+    Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
     """
 
     plugin = "time-resolved film"
-    response = "transient"
+    measures = "transient"
     exhaustive_scan = False
+    # Whether there is a steady image beside the array, of light at any time; otherwise it is the sum over the array.
+    keeps_steady = True
     # Whether the film has a window that light can miss, which is then counted in `outside`.
     has_window = True
 
@@ -37,10 +42,17 @@ class TimeResolvedFilm(mi.Film):
         self.start_opl = float(props.get("start_opl", 0.0))
         if not abs(self.start_opl) < float("inf"):
             raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
+        self.curves = SensorResponse.of(props)
         self.bands = []
         self.steady = None
         self.outside = None
         self._offset_distribution = None
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        if self.curves is not None:
+            for name, curve in zip(self.curves.names, self.curves.textures, strict=True):
+                cb.put(name, curve, mi.ParamFlags.NonDifferentiable)
 
     def base_channels_count(self):
         return self.channel_count()
@@ -52,16 +64,25 @@ class TimeResolvedFilm(mi.Film):
         """Whether what is stored changes smoothly with the path length."""
         return True
 
+    @property
+    def slope_remedy(self) -> str:
+        """What to do where there is no slope: the end of an error message."""
+        return "Set temporal_filter to 'tent' or 'gaussian'."
+
     def take_filter(self, name: str, stddev: float | None):
         """Take over an integrator's settings of the temporal filter; empty name and None leave the film's own."""
+
+    def arrivals(self):
+        """Which arrivals count (:class:`.window.ArrivalWindow`), None for all: for a film without a steady image."""
 
     def lanes_at_most(self, depth: int) -> int | None:
         """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
         return None
 
-    def lane(self, job, base, match, tangents: bool = False) -> Lane:
+    def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
         """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of
+        contributions (``put``).
         """
         return Lane(self, self.bands[job.band][2], base, match)
 
@@ -74,8 +95,18 @@ class TimeResolvedFilm(mi.Film):
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """1 in monochromatic variants, 3 otherwise."""
-        return 1 if mi.is_monochromatic else 3
+        """The number of :meth:`channel_names`, in polarized variants four times that: first all of S0, then S1, S2,
+        S3.
+        """
+        return len(self.channel_names()) * (4 if mi.is_polarized else 1)
+
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels: those of the response curves, else ("L",) in monochromatic variants and ("R", "G",
+        "B").
+        """
+        if self.curves is not None:
+            return self.curves.names
+        return ("L",) if mi.is_monochromatic else ("R", "G", "B")
 
     def band_rows(self) -> int:
         """Rows of one storage band: as many as 32-bit indices allow."""
@@ -98,8 +129,6 @@ class TimeResolvedFilm(mi.Film):
         """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
-        if mi.is_polarized:
-            raise SceneError(f"{self.plugin}: polarized variants are not supported; use the unpolarized one.")
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
@@ -110,13 +139,24 @@ class TimeResolvedFilm(mi.Film):
         return self.channel_count()
 
     def settle(self):
-        """End of a render: sums kept in double precision become single precision."""
+        """End of a render: sums kept in double precision become single precision, and a film without a steady image
+        sums one up.
+        """
         if dr.type_v(self.steady) != dr.type_v(mi.Float):
             self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
             self.steady = mi.Float(self.steady)
             if self.outside is not None:
                 self.outside = mi.Float(self.outside)
             dr.eval(self.steady, self.outside, *(band[2] for band in self.bands))
+        if not self.keeps_steady:
+            self._sum_up()
+
+    def _sum_up(self):
+        width, channels = int(self.crop_size()[0]), self.channel_count()
+        for first, rows, flat in self.bands:
+            total = dr.sum(mi.TensorXf(flat, (rows * width, self.entries_per_pixel() // channels, channels)), axis=1)
+            index = dr.arange(mi.UInt32, rows * width * channels) + first * width * channels
+            dr.scatter(self.steady, total.array, index)
 
     def clear(self):
         """Drop the storage; tensors developed before keep their memory."""
@@ -148,12 +188,12 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def energy_before(self) -> float:
-        """Light that arrived before ``start_opl``: sum over pixels, mean over channels."""
+        """Light that arrived before ``start_opl``: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(0)
 
     @property
     def energy_after(self) -> float:
-        """Light that arrived after the end of the window: sum over pixels, mean over channels."""
+        """Light that arrived after the end of the window: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(1)
 
     def _energy_outside(self, side: int) -> float:

@@ -8,7 +8,15 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.temporal_filter import check_stddev, make_temporal_filter
+from torchtransient.plugins.films.long_kernel import Spot
+from torchtransient.plugins.films.long_kernel import put as put_long
+from torchtransient.plugins.films.long_kernel import read as read_long
+from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
+from torchtransient.plugins.films.temporal_filter import check_name, check_stddev, make_temporal_filter
+from torchtransient.plugins.films.window import ArrivalWindow
+
+# Kernels of more bins are looped over instead of written out.
+MAX_UNROLLED = 9
 
 
 class TransientHDRFilm(TimeResolvedFilm):
@@ -23,11 +31,26 @@ class TransientHDRFilm(TimeResolvedFilm):
     ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0)
         One histogram for every pair of sensor and laser position; layout ``(H, W, Lh, Lw, T, C)``.
 
-    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T, C)``
-    of the crop window with C = 1 in monochromatic variants and 3 otherwise (linear sRGB in spectral ones); there are no
-    alpha or weight channels. Light outside the window is not stored but counted: ``energy_before`` and ``energy_after``
-    are sums over pixels of the mean over channels. With the sum over the stored bins they make up the steady image,
-    whatever the temporal filter: what it spreads over the rim of the window counts as outside.
+    ``pulse``, ``irf`` (``gaussian`` | ``rectangular`` | ``tabulated``; none)
+        Shape of the light's pulse and impulse response of the sensor, densities over optical path length: every arrival
+        is spread by both. ``pulse_fwhm_opl``; ``pulse_width_opl``; ``pulse_opl`` and ``pulse_values`` (numbers between
+        spaces or commas) give the shape, ``pulse_center_opl`` (0) shifts it; the same for ``irf``. See
+        :mod:`.pulsed_filter`. With one of them every temporal filter has a slope.
+    ``steady`` (bool, true)
+        False: no steady image is asked for. Paths end where they are longer than the window, no shadow ray is traced
+        for light that would arrive outside of it, and ``steady`` is the sum over the bins. No bin's expected value
+        changes; light outside the window is not counted then.
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, as in ``specfilm``: the name of a spectrum is that of its channel,
+        which holds the integral over wavelength (nm) of radiance times curve. See :mod:`.response`.
+
+    A bin holds radiance integrated over the bin: the sum over all bins is the steady image. Storage is ``(H, W, T,
+    C)`` of the crop window with C = 1 in monochromatic variants, the number of response curves where there are
+    some, and 3 otherwise (linear sRGB in spectral variants); in polarized variants four times as many: all of S0, then
+    S1, S2, S3, in the sensor's frame. There are no alpha or weight channels. Light outside the window is not stored
+    but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean over channels (of S0). With
+    the sum over the stored bins they make up the steady image, whatever the temporal filter: what it spreads over the
+    rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
@@ -51,8 +74,10 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
         self.laser_scan_width = int(props.get("laser_scan_width", 0))
         self.laser_scan_height = int(props.get("laser_scan_height", 0))
+        self.keeps_steady = self.has_window = bool(props.get("steady", True))
+        self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
-        self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
+        self._make_filter()
 
     # ------------------------------------------------------------------------------------- parameters
 
@@ -83,8 +108,9 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     @temporal_filter.setter
     def temporal_filter(self, name: str):
-        self.filter = make_temporal_filter(name, self._gaussian_stddev)
+        check_name(name)
         self._filter_name = name
+        self._make_filter()
 
     @property
     def gaussian_stddev(self) -> float:
@@ -95,7 +121,13 @@ class TransientHDRFilm(TimeResolvedFilm):
     def gaussian_stddev(self, stddev: float):
         check_stddev(stddev)
         self._gaussian_stddev = float(stddev)
+        self._make_filter()
+
+    def _make_filter(self):
         self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
+        if self.pulses:
+            self.filter = PulsedFilter(self.filter, self.pulses, self.bin_width_opl)
+        self._long = getattr(self.filter, "count", 0) > MAX_UNROLLED
 
     def take_filter(self, name: str, stddev: float | None):
         if stddev is not None:
@@ -107,6 +139,12 @@ class TransientHDRFilm(TimeResolvedFilm):
     def has_slope(self) -> bool:
         """Whether the temporal filter has a slope."""
         return self.filter.has_slope
+
+    def arrivals(self):
+        if self.keeps_steady:
+            return None
+        early, late = self.filter.reach
+        return ArrivalWindow(-late * self.bin_width_opl, (self.temporal_bins - early) * self.bin_width_opl)
 
     def end_opl(self) -> float:
         """End of the last bin in metres."""
@@ -153,6 +191,8 @@ class TransientHDRFilm(TimeResolvedFilm):
         x = self.bin_position(opl_from_start)
         bins, channels = self.temporal_bins, self.channel_count()
         base = self.pixel_base(base, laser)
+        if self._long:
+            return put_long(Spot(cube, base, channels, 1, bins, channels), self.filter, x, value, None, active)
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
         # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a
@@ -168,15 +208,19 @@ class TransientHDRFilm(TimeResolvedFilm):
                 dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
         return before, after
 
-    def read(self, adjoint, base, opl_from_start, active):
+    def read(self, adjoint, base, opl_from_start, active, steady=None):
         """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, bin stride, channel stride)`` and ``base`` the index of the histogram's first
-        value in it.
+        ``adjoint`` is ``(flat array, bin stride, channel stride)`` or None, and ``base`` the index of the histogram's
+        first value in it; ``steady`` is the adjoint of the sum over the bins.
         """
-        flat, bin_stride, channel_stride = adjoint
+        flat, bin_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
+        if self._long:
+            spot = Spot(flat, base, bin_stride, channel_stride, self.temporal_bins, channels)
+            A, slope = read_long(spot, self.filter, x, active, steady)
+            return A, [s * (1 / self.bin_width_opl) for s in slope]
         A, slope = [mi.Float(0)] * channels, [mi.Float(0)] * channels
         first, taps = self.filter.weights(x)
         for offset, weight, dweight in taps:
@@ -184,7 +228,9 @@ class TransientHDRFilm(TimeResolvedFilm):
             inside = active & (k >= 0) & (k < self.temporal_bins)
             index = dr.fma(mi.UInt32(k), bin_stride, base)
             for c in range(channels):
-                a = dr.gather(mi.Float, flat, index + c * channel_stride, inside)
+                a = mi.Float(0) if steady is None else dr.select(inside, steady[c], 0)
+                if flat is not None:
+                    a += dr.gather(mi.Float, flat, index + c * channel_stride, inside)
                 A[c] = dr.fma(a, weight, A[c])
                 if self.filter.has_slope:
                     slope[c] = dr.fma(a, dweight * (1 / self.bin_width_opl), slope[c])
@@ -195,6 +241,11 @@ class TransientHDRFilm(TimeResolvedFilm):
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
         base = self.pixel_base(base, laser)
+        if self._long:
+            slopes = [v * (1 / self.bin_width_opl) for v in value_d_opl]
+            spot = Spot(cube, base, channels, 1, self.temporal_bins, channels)
+            put_long(spot, self.filter, x, d_value, slopes, active)
+            return
         first, taps = self.filter.weights(x)
         for offset, weight, dweight in taps:
             k = first + offset

@@ -7,9 +7,9 @@ has to carry along a path is in ``events``, which belongs to the loop.
 from __future__ import annotations
 
 import drjit as dr
-import mitsuba as mi
 
 from torchtransient.plugins.films.colour import mean_of
+from torchtransient.plugins.polarized import light_type
 
 
 class Lane:
@@ -53,8 +53,11 @@ class AdjointLane:
 
     def read(self, opl, active):
         """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
+        if not self.film.keeps_steady:
+            A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
+            return self.match.to_spectrum(A), self.match.to_spectrum(slope)
         if self.response is None:
-            return self.match.to_spectrum(self.steady), mi.UnpolarizedSpectrum(0)
+            return self.match.to_spectrum(self.steady), light_type()(0)
         A, slope = self.film.read(self.response, self.base, opl, active)
         A = [a + s for a, s in zip(A, self.steady, strict=True)]
         return self.match.to_spectrum(A), self.match.to_spectrum(slope)

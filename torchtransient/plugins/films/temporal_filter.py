@@ -43,6 +43,8 @@ class BoxFilter:
 
     name = "box"
     has_slope = False
+    # Bins before and after an arrival that it can reach.
+    reach = (0.0, 0.0)
 
     def weights(self, x):
         """Weights of one arrival.
@@ -58,6 +60,7 @@ class TentFilter:
 
     name = "tent"
     has_slope = True
+    reach = (-0.5, 0.5)
 
     def weights(self, x):
         first = dr.floor(x - 0.5)
@@ -75,6 +78,7 @@ class GaussianFilter:
         check_stddev(stddev)
         self.stddev = float(stddev)
         self.radius = math.ceil(CUT_STDDEVS * stddev)
+        self.reach = (-CUT_STDDEVS * self.stddev, CUT_STDDEVS * self.stddev)
 
     def weights(self, x):
         # The cumulative distribution, rescaled such that it is exactly 0 and 1 at the cut: the weights of an

@@ -10,10 +10,13 @@ import mitsuba as mi
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
+from torchtransient.plugins.integrators.media.media_facts import media_facts
 from torchtransient.plugins.integrators.push import settle_tangents, tangents
 from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
 from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.sensors.origin import length_to_sensor_origin
+from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
+from torchtransient.plugins.sensors.stokes_frame import sensor_turn
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -84,6 +87,9 @@ class TransientIntegrator(mi.CppADIntegrator):
             check_stddev(self.gaussian_stddev)
         self._distant = None
 
+    # Whether paths scatter in participating media; others refuse scenes that have them.
+    walks_through_media = False
+
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
@@ -101,34 +107,47 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not hasattr(film, "transient_bands"):
             raise SceneError(
-                f"transient integrators need a film of type transient_hdr_film or phasor_hdr_film, the sensor has "
-                f"{film.class_name()}; change the film's type in the scene."
+                "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
+                f"sensor has {film.class_name()}; change the film's type in the scene."
             )
         if film.exhaustive_scan:
             raise SceneError(
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
             )
-        if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
+        if not self.walks_through_media and media_facts(scene, sensor) is not None:
             raise SceneError(
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
-                "if they were empty. Remove the interior and exterior media of its shapes."
+                "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
+                "media of the scene's shapes and sensors."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
 
-    def facts(self, scene) -> SceneFacts:
-        """What the loops may leave out for this scene.
+    def facts(self, scene, sensor=None) -> SceneFacts:
+        """What the loops may leave out for this scene, seen by this sensor.
 
         The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the
         clock. The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes
         is, so that no later scene can be taken for this one because it got the same addresses.
         """
+        facts = scene_facts(scene, self.reference(scene))
+        if sensor is not None:
+            facts.window = sensor.film().arrivals()
+            facts.light_box = LightBox.of(scene, facts.bsdfs) if facts.window is not None else None
+        if self.walks_through_media:
+            facts.media = media_facts(scene, sensor)
+        if facts.media is not None:
+            facts.media.hide_emitters = bool(self.hide_emitters)
+        return facts
+
+    def reference(self, scene):
+        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
         shapes = scene.shapes()
         key = (scene.ptr, *(shape.ptr for shape in shapes))
         if self._distant is None or self._distant[0] != key:
             self._distant = (key, distant_reference(scene), shapes[:1])
-        return scene_facts(scene, self._distant[1])
+        return self._distant[1]
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel.
@@ -154,8 +173,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             p.seed = seed if len(result) == 1 else int(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0][0])
         return result, max(p.total for p in result)
 
-    def start(self, sensor, film, job: Pass):
-        """Seeded sampler, primary rays (attached to the sensor), ray weight and pixel indices of one pass."""
+    def start(self, scene, sensor, film, job: Pass):
+        """Seeded sampler, primary rays (attached to the sensor), ray weight, pixel indices and sensors of one pass."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -176,12 +195,18 @@ class TransientIntegrator(mi.CppADIntegrator):
         if sensor.shutter_open_time() > 0:
             time += sampler.next_1d() * sensor.shutter_open_time()
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        seen = views(sensor, position, lambda: self.reference(scene))
         with dr.resume_grad():
-            ray, ray_weight = sensor.sample_ray_differential(
-                time=time, sample1=wavelength, sample2=position, sample3=aperture
-            )
+            ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
+            if film.curves is not None:
+                ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
         scale = mi.Float(1 / job.total) if weight is None else weight / job.total
-        return sampler, ray, ray_weight, scale, row, column
+        return sampler, ray, ray_weight, scale, row, column, seen
+
+    def channel_match(self, seen, film, ray, ray_weight, scale):
+        """The map from samples of the primary rays to the film's channels, detached."""
+        turn = sensor_turn(seen, dr.detach(ray)) if mi.is_polarized else None
+        return ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves, turn)
 
     def lane_bases(self, film, job, row, column):
         """Index of a pixel's first bin in its band, and of the pixel in the film."""
@@ -216,21 +241,30 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _render_pass(self, scene, sensor, film, job):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match)
-        L, before, after = self.trace(scene, sampler, dr.detach(ray), self._first_opl(sensor, film, ray), lane)
-        for c, value in enumerate(match.to_channels(L)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        lane = film.lane(job, base, match, self.max_depth)
+        first = self._first_opl(seen, film, ray)
+        facts = self.facts(scene, sensor)
+        L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
+        self._add_steady(film, match.to_channels(L), pixel)
         if film.outside is not None:
             for side, value in enumerate((before, after)):
                 dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
         lane.finish()
 
-    def _first_opl(self, sensor, film, ray):
+    @staticmethod
+    def _add_steady(film, channels, pixel):
+        """Add to the steady image, unless the film makes it of its array."""
+        if film.keeps_steady:
+            for c, value in enumerate(channels):
+                index = pixel * film.channel_count() + c
+                dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index)
+
+    def _first_opl(self, seen, film, ray):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
-        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(sensor, ray))
+        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(seen, ray))
         return mi.Float64(length) - film.start_opl
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -246,7 +280,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-                facts = self.facts(scene).with_gradients(scene, sensor)
+                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
             self._check_differentiable(film, facts)
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:
@@ -260,8 +294,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                     dr.eval()
 
     def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         channels = film.channel_count()
         _, pixel = self.lane_bases(film, job, row, column)
         steady = [mi.Float(0)] * channels
@@ -273,13 +307,15 @@ class TransientIntegrator(mi.CppADIntegrator):
             base = row * strides[0] + column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
         lane = film.adjoint_lane(transient, base, steady, match)
-        first = self._first_opl(sensor, film, ray)
-        a_o, a_d, a_first = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
+        first = self._first_opl(seen, film, ray)
+        a_o, a_d, a_first, a_turn = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
             with dr.resume_grad():
                 objective = dr.dot(a_o, ray.o) + dr.dot(a_d, ray.d)
                 if not self.camera_unwarp:
-                    objective += a_first * length_to_sensor_origin(sensor, ray)
+                    objective += a_first * length_to_sensor_origin(seen, ray)
+                if mi.is_polarized:
+                    objective += a_turn * sensor_turn(seen, ray).angle()
                 dr.backward_from(objective)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -291,7 +327,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             with dr.resume_grad():
-                facts = self.facts(scene).with_gradients(scene, sensor)
+                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
                 settle_tangents(scene, facts)
             self._check_differentiable(film, facts)
             jobs, samples = self.passes(sensor, film, int(seed), int(spp))
@@ -303,21 +339,24 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _forward_pass(self, scene, sensor, film, job, facts):
-        sampler, ray, ray_weight, scale, row, column = self.start(sensor, film, job)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale)
+        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
+        match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, tangents=True)
-        first = self._first_opl(sensor, film, ray)
-        t_ray, d_first = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0)
+        lane = film.lane(job, base, match, self.max_depth, tangents=True)
+        first = self._first_opl(seen, film, ray)
+        t_ray, d_first, t_turn = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0), None
         if facts.sensor_moves:
             with dr.resume_grad():
-                length = length_to_sensor_origin(sensor, ray)
-                t_o, t_d, t_first = tangents([ray.o, ray.d, length])
+                length = length_to_sensor_origin(seen, ray)
+                attached = [ray.o, ray.d, length]
+                if mi.is_polarized:
+                    attached.append(sensor_turn(seen, ray).angle())
+                t_o, t_d, t_first, *t_angle = tangents(attached)
+                t_turn = t_angle[0] if mi.is_polarized else None
                 t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
                 d_first = mi.Float(0) if self.camera_unwarp else t_first
-        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first)
-        for c, value in enumerate(match.to_channels(dL)):
-            dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), pixel * film.channel_count() + c)
+        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first, t_turn)
+        self._add_steady(film, match.to_channels(dL), pixel)
         lane.finish()
 
     @staticmethod
@@ -336,8 +375,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if facts.geometry and not film.has_slope:
             raise GradientError(
                 "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
-                f"needs a temporal filter with a slope; the film has {film.temporal_filter!r}. Set temporal_filter to "
-                "'tent' or 'gaussian'."
+                f"needs a response over time with a slope; the film has {film.temporal_filter!r}. {film.slope_remedy}"
             )
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(

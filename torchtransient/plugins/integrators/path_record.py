@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.integrators.media.leg_record import allocate_legs, read_leg
+
 LIT, DELTA, CONTINUES = 1, 2, 4
 
 
@@ -26,7 +28,7 @@ def allocate(depth: int, facts) -> dict:
         "prim": dr.alloc_local(mi.UInt32, size),
         "shape": dr.alloc_local(mi.UInt32, size),
         "shape_index": dr.alloc_local(mi.UInt32, size),
-        "beta": dr.alloc_local(mi.UnpolarizedSpectrum, size),
+        "beta": dr.alloc_local(mi.Spectrum, size),
         "tau": dr.alloc_local(mi.Float64, size),
         "mis": dr.alloc_local(mi.Float, size),
         "rr": dr.alloc_local(mi.Float, size),
@@ -37,12 +39,19 @@ def allocate(depth: int, facts) -> dict:
     if facts.delta or facts.refracts:
         store["eta"] = dr.alloc_local(mi.Float, size)
         store["u_lobe"] = dr.alloc_local(mi.Float, size)
+    if facts.delays is not None:
+        store["u_late"] = dr.alloc_local(mi.Point2f, size)
+        if facts.delays.shifts:
+            store["wavelengths"] = dr.alloc_local(mi.UnpolarizedSpectrum, size)
     if facts.instances:
         store["instance"] = dr.alloc_local(mi.UInt32, size)
+    allocate_legs(store, size, facts)
     return store
 
 
-def write_vertex(store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_lobe, u_dir, lit, is_delta, goes_on):
+def write_vertex(
+    store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_lobe, u_dir, lit, is_delta, goes_on, u_late=None
+):
     """Write vertex ``k``."""
     store["o"].write(ray.o, k, active)
     store["d"].write(ray.d, k, active)
@@ -62,13 +71,17 @@ def write_vertex(store, k, active, facts, ray, pi, β, τ, η, mis, rr, u_em, u_
     if "eta" in store:
         store["eta"].write(η, k, active)
         store["u_lobe"].write(u_lobe, k, active)
+    if "u_late" in store:
+        store["u_late"].write(u_late, k, active)
+    if "wavelengths" in store:
+        store["wavelengths"].write(ray.wavelengths, k, active)
     if "instance" in store:
         store["instance"].write(dr.reinterpret_array(mi.UInt32, pi.instance), k, active)
 
 
 @dataclass
 class Vertex:
-    """One vertex read back from the record."""
+    """One vertex read back from the record. ``medium`` is None in scenes without media."""
 
     ray: Any
     pi: Any
@@ -83,10 +96,15 @@ class Vertex:
     lit: Any
     is_delta: Any
     goes_on: Any
+    scatter: Any
+    medium: Any
+    u_late: Any = None
 
 
 def read_vertex(store, k, active, time, wavelengths) -> Vertex:
     """Read vertex ``k``."""
+    if "wavelengths" in store:
+        wavelengths = store["wavelengths"].read(k, active)
     ray = mi.Ray3f(store["o"].read(k, active), store["d"].read(k, active), time, wavelengths)
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.t = store["t"].read(k, active)
@@ -101,6 +119,7 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
     if "instance" in store:
         pi.instance = dr.reinterpret_array(mi.ShapePtr, store["instance"].read(k, active))
     flags = store["flags"].read(k, active)
+    medium = read_leg(store, k, active)
     return Vertex(
         ray=ray,
         pi=pi,
@@ -115,4 +134,7 @@ def read_vertex(store, k, active, time, wavelengths) -> Vertex:
         lit=active & ((flags & LIT) != 0),
         is_delta=active & ((flags & DELTA) != 0),
         goes_on=active & ((flags & CONTINUES) != 0),
+        scatter=mi.Bool(False) if medium is None else active & (medium.t >= 0),
+        medium=medium,
+        u_late=store["u_late"].read(k, active) if "u_late" in store else None,
     )

@@ -11,9 +11,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.integrators.media.leg_sweep import after_leg, moving_points, push_legs, vertex_after
 from torchtransient.plugins.integrators.path_record import read_vertex
 from torchtransient.plugins.integrators.sweep import led_to, next_vertex
 from torchtransient.plugins.integrators.vertex import attach_ray, vertex_terms
+from torchtransient.plugins.polarized import column, light_type, product, turning_throughput
 
 
 def tangents(values):
@@ -41,11 +43,17 @@ def vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, t_ray, t_w):
             values += [x.seg, x.length_em * x.index_em, x.seg_out, x.out, x.step]
             if facts.delta:
                 values += [x.p_out, x.d_out]
+            if x.delay is not None:
+                values += [x.delay]
             if facts.emitter_shape_moves:
                 values += [x.E, x.length_E]
-        t = tangents(values)
+        points = moving_points(x, facts)
+        t = tangents(values + points)
+        x.t_points = t[len(values) :]
+        t = t[: len(values)]
+        x.inside = None
     for name, value in vars(x).items():
-        if value is not None:
+        if value is not None and name != "t_points":
             setattr(x, name, dr.detach(value))
     return x, t
 
@@ -55,6 +63,8 @@ def settle_tangents(scene, facts):
     attached = [value for _, value in mi.traverse(scene) if dr.grad_enabled(value)]
     if facts.refracts and dr.grad_enabled(facts.refraction.table):
         attached.append(facts.refraction.table)
+    if facts.delays is not None:
+        attached += facts.delays.attached()
     if not attached:
         return
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
@@ -65,50 +75,60 @@ def settle_tangents(scene, facts):
 
 
 @dr.syntax
-def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first):
+def push(integrator, scene, count, store, lane, facts, ray0, t_o, t_d, d_first, t_turn=None):
     """Write the derivative of the transient to ``lane`` and return that of the steady radiance.
 
-    ``t_o, t_d, d_first`` are the tangents of the primary ray and of the length before it.
+    ``t_o, t_d, d_first, t_turn`` are the tangents of the primary ray, of the length before it, and of twice the angle
+    of its Stokes frame.
     """
     ctx = mi.BSDFContext()
+    delay_index = 10 if facts.delta else 8
     k = mi.UInt32(0)
     live = k < count
-    dL = mi.UnpolarizedSpectrum(0)
-    dβ = mi.UnpolarizedSpectrum(0)
+    dL = light_type()(0)
+    dβ = turning_throughput(t_turn)
     dτ = mi.Float(d_first)
     dη = mi.Float(0)
-    t_o, t_d, t_w = mi.Vector3f(t_o), mi.Vector3f(t_d), mi.Vector3f(t_d)
+    t_o, t_d, t_w, t_x = mi.Vector3f(t_o), mi.Vector3f(t_d), mi.Vector3f(t_d), mi.Vector3f(t_o)
     events = lane.begin()
     while dr.hint(live, max_iterations=integrator.max_depth, label="transient_path forward mode"):
         v = read_vertex(store, k, live, ray0.time, ray0.wavelengths)
         follow = read_vertex(store, k + 1, v.goes_on, ray0.time, ray0.wavelengths)
-        si_next = follow.pi.compute_surface_interaction(follow.ray, mi.RayFlags.Minimal, v.goes_on)
-        nxt = next_vertex(store, k, si_next.p, si_next.n, follow.ray.d, si_next.is_valid() & v.goes_on, v, facts, ray0)
+        p_next, n_next, valid_next = vertex_after(follow, facts, v.goes_on)
+        nxt = next_vertex(store, k, p_next, n_next, follow.ray.d, valid_next, v, facts, ray0)
         led_here = led_to(store, k, live, facts)
         x, t = vertex_tangents(scene, ctx, v, nxt, facts, live, led_here, (t_o, t_d), t_w)
         Le, f, W = x.Le, x.f, x.W
+        legs = push_legs(scene, facts, v, x, nxt, x.t_points, t_x)
+        dβ = after_leg(v, dβ, legs)
         dτ_v, dτ_em, length_em = mi.Float(dτ), mi.Float(0), x.length_em * x.index_em
+        τ_em, d_delay = v.τ + mi.Float64(length_em * v.η), mi.Float(0)
+        if dr.hint(x.delay is not None, mode="scalar"):
+            τ_em += mi.Float64(x.delay)
+            if dr.hint(facts.geometry, mode="scalar"):
+                d_delay = mi.Float(t[delay_index])
         if dr.hint(facts.geometry, mode="scalar"):
             counted = mi.Float(1)
             if dr.hint(integrator.camera_unwarp, mode="scalar"):
                 counted = dr.select(k == 0, 0, counted)
             dτ_v += counted * (v.η * t[3] + dη * x.seg)
-            dτ_em = dτ_v + v.η * t[4] + dη * length_em
-        d_Le = dβ * Le + v.β * t[0]
-        d_f = dβ * f + v.β * t[1]
+            dτ_em = dτ_v + v.η * t[4] + dη * length_em + d_delay
+        d_Le = column(dβ) * Le + column(v.β) * t[0]
+        d_f = product(dβ, f) + product(v.β, t[1] + f * legs.connecting)
         dL += dr.select(live, d_Le + d_f, 0)
-        lane.put_slope(events, v.τ, d_Le, v.β * Le * dτ_v, x.hit)
-        lane.put_slope(events, v.τ + mi.Float64(length_em * v.η), d_f, v.β * f * dτ_em, v.lit)
+        lane.put_slope(events, v.τ, d_Le, column(v.β) * Le * dτ_v, x.hit)
+        lane.put_slope(events, τ_em, d_f, product(v.β, f) * dτ_em, v.lit)
         if dr.hint(facts.emitter_shape_moves, mode="scalar"):
             E = x.E
-            d_E = dβ * E + v.β * t[-2]
+            d_E = product(dβ, E) + product(v.β, t[-2] + E * legs.emitting)
             dL += dr.select(live, d_E, 0)
-            dτ_E = dτ_v + dη * x.step * x.length_E + follow.η * t[-1]
-            lane.put_slope(events, follow.τ, d_E, v.β * E * dτ_E, x.lit_ahead)
+            dτ_E = dτ_v + d_delay + dη * x.step * x.length_E + follow.η * t[-1]
+            lane.put_slope(events, follow.τ, d_E, product(v.β, E) * dτ_E, x.lit_ahead)
 
         # ------------------------------------------------------------------- to the next vertex
-        dβ = dβ * W + v.β * t[2]
-        dτ = dτ_v
+        dβ = product(dβ, W) + product(v.β, t[2])
+        dτ = dτ_v + d_delay
+        t_x = mi.Vector3f(legs.t_x)
         if dr.hint(facts.geometry, mode="scalar"):
             dτ += follow.η * t[5]
             dη = dη * x.step + v.η * t[7]

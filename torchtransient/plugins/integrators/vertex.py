@@ -12,6 +12,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.integrators.media.attached import evaluate, surface_or_medium
+from torchtransient.plugins.integrators.media.free_flight import closed_surface
+from torchtransient.plugins.polarized import scattered, scattering, turn_in, turn_out
+
 
 class Terms:
     """Attached values at one vertex; a plain object that only lives within one iteration."""
@@ -24,11 +28,15 @@ def mis_weight(pdf_a, pdf_b):
     return dr.select(dr.isfinite(w), w, 0)
 
 
-def solid_angle_over_area(p, q, n, active):
-    """``|cos| / distance^2``, the solid angle at ``p`` of an area at ``q`` with normal ``n``; 1 where inactive."""
+def solid_angle_over_area(p, q, n, active, volume=None):
+    """``|cos| / distance^2``, the solid angle at ``p`` of an area at ``q`` with normal ``n``; 1 where inactive. Where
+    ``volume``, that of an area across the direction.
+    """
     # The inactive side must not see a zero vector: its derivative would be NaN and poison the sum.
     v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
     d2 = dr.squared_norm(v)
+    if volume is not None:
+        n = dr.select(volume, dr.normalize(v), n)
     return dr.select(active, dr.abs_dot(n, v) * dr.rsqrt(d2) / d2, 1)
 
 
@@ -74,7 +82,7 @@ def attach_ray(v, facts, t_ray=None, t_w=None):
     return ray, o, d, w
 
 
-def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
+def emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts):
     """Next-event estimation: ``terms.f`` (per unit throughput), ``terms.length_em`` and index along the shadow ray."""
     with dr.suspend_grad():
         ds, weight = scene.sample_emitter_direction(dr.detach(si), v.u_em, False, v.lit)
@@ -99,7 +107,8 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
         p = dr.replace_grad(p, dr.select(cone, ds_cone.p, dr.detach(ds_cone.p)))
     if facts.emitter_shape_moves:
         ray_em = dr.detach(si).spawn_ray(ds.d)
-        pi_em = scene.ray_intersect_preliminary(ray_em, active=surface)
+        with dr.suspend_grad():
+            pi_em = closed_surface(scene, facts.media, ray_em, surface)
         si_em, area = material_point(pi_em, ray_em, surface & pi_em.is_valid())
         on_light = surface & pi_em.is_valid() & (dr.detach(si_em).emitter(scene) == ds.emitter)
         p = dr.select(on_light, dr.replace_grad(p, si_em.p), p)
@@ -120,9 +129,13 @@ def emitter_terms(terms, scene, ctx, si, bsdf, v, facts):
     em_weight = dr.replace_grad(weight, value)
 
     wo = si.to_local(d)
-    val, pdf = bsdf.eval_pdf(ctx, si, wo, v.lit)
+    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, d, v.lit)
+    val = facts.upright(bsdf, si, wo, val)
     mis = dr.select(ds.delta | cone, 1, mis_weight(ds.pdf, dr.detach(pdf)))
-    terms.f = dr.select(v.lit, mi.unpolarized_spectrum(val) * em_weight * mis, 0)
+    terms.f = dr.select(v.lit, scattered(val, turn) * em_weight * mis, 0)
+    if facts.media is not None:
+        terms.f *= v.medium.T_em
+        terms.p_em, terms.d_em, terms.far_em = p, mi.Vector3f(ds.d), far
     terms.length_em = length_to(facts, si.p, p, v.lit & ~far, d)
     terms.index_em = facts.index_towards(bsdf, si, wo, mi.Float(1))
 
@@ -139,9 +152,9 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
     terms = Terms()
     terms.onward = onward = v.goes_on & ~v.is_delta
     terms.mirrored = v.goes_on & v.is_delta
-    si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, live)
+    si, terms.inside = surface_or_medium(v, ray, w, facts, live)
     sid = dr.detach(si)
-    terms.si, terms.sid, terms.valid = si, sid, sid.is_valid()
+    terms.si, terms.sid, terms.valid, terms.live = si, sid, sid.is_valid(), live
     if facts.geometry:
         si.wi = dr.select(terms.valid, si.to_local(-w), -w)
     bsdf = sid.bsdf(v.ray)
@@ -155,35 +168,45 @@ def vertex_terms(scene, ctx, v, ray, w, nxt, facts, live, led_here):
         hit &= led_here | ~on_surface | ~is_sphere(sid.emitter(scene))
     terms.hit = hit
     terms.Le = dr.select(hit, v.mis * mi.unpolarized_spectrum(sid.emitter(scene).eval(si, hit)), 0)
-    emitter_terms(terms, scene, ctx, si, bsdf, v, facts)
+    turn = turn_out(si, w)
+    late = facts.answer(bsdf, v.u_late, v.ray.wavelengths)
+    bsdf, terms.delay = late.bsdf, late.delay
+    late.move(si)
+    emitter_terms(terms, scene, ctx, si, bsdf, turn, v, facts)
+
+    terms.f = late.scaled_light(terms.f)
 
     ahead = onward & nxt.valid
     out, J = mi.Vector3f(nxt.d), mi.Float(1)
     if facts.geometry:
         out = direction_to(si.p, nxt.p, ahead, out)
-        J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead))
+        J = dr.relative_grad(solid_angle_over_area(si.p, nxt.p, nxt.n, ahead, nxt.volume))
     wo = si.to_local(out)
-    val, pdf = bsdf.eval_pdf(ctx, si, wo, onward)
+    val, pdf = evaluate(terms.inside, ctx, bsdf, si, wo, out, onward, sampled=True)
+    val = facts.upright(bsdf, si, wo, val)
     inv_pdf = dr.select(onward & (dr.detach(pdf) > 0), v.rr / dr.detach(pdf), 0)
-    terms.W = dr.select(onward, mi.unpolarized_spectrum(val) * (inv_pdf * J), 0)
+    terms.W = dr.select(onward, scattering(val, turn, turn_in(si, wo, out, nxt.d)) * (inv_pdf * J), 0)
     terms.out, terms.ahead = out, ahead
     terms.step = dr.select(onward, facts.index_towards(bsdf, si, wo, mi.Float(1)), 1)
     if facts.delta:
         bs, weight = bsdf.sample(ctx, si, v.u_lobe, v.u_dir, terms.mirrored)
-        weight = mi.unpolarized_spectrum(weight) * (facts.unweighted(bsdf, bs) * v.rr)
-        terms.W = dr.select(terms.mirrored, weight, terms.W)
+        weight = facts.upright(bsdf, si, bs.wo, weight)
         terms.p_out, terms.d_out = si.p, si.to_world(bs.wo)
+        weight = scattering(weight, turn, turn_in(si, bs.wo, terms.d_out, nxt.d)) * (facts.unweighted(bsdf, bs) * v.rr)
+        terms.W = dr.select(terms.mirrored, weight, terms.W)
         terms.step = dr.select(terms.mirrored, bs.eta, terms.step)
     if facts.geometry:
         terms.seg = length_to(facts, ray.o, si.p, terms.valid, ray.d)
         terms.seg_out = dr.select(onward, length_to(facts, si.p, nxt.p, nxt.valid, nxt.d), 0)
+    terms.W = late.scaled(terms.W)
     terms.E = None
     if facts.emitter_shape_moves:
-        emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts)
+        emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts)
+        terms.E = late.scaled_light(terms.E)
     return terms
 
 
-def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
+def emission_ahead(terms, scene, ctx, si, bsdf, turn, nxt, inv_pdf, facts):
     """Emission found by BSDF sampling on a shape that moves: ``terms.E`` (per unit throughput), ``terms.length_E``.
 
     The light's point is a material point here, as it is for next-event estimation: both strategies must move their
@@ -198,8 +221,12 @@ def emission_ahead(terms, scene, ctx, si, bsdf, v, nxt, inv_pdf, facts):
     out = direction_to(si.p, si_e.p, lit, mi.Vector3f(nxt.d))
     si_e.wi = dr.select(lit, si_e.to_local(-out), dr.detach(si_e.wi))
     J = dr.relative_grad(solid_angle_over_area(si.p, si_e.p, si_e.n, lit)) * dr.relative_grad(dr.select(lit, area, 1))
-    val, _ = bsdf.eval_pdf(ctx, si, si.to_local(out), lit)
+    wo = si.to_local(out)
+    val = facts.upright(bsdf, si, wo, evaluate(terms.inside, ctx, bsdf, si, wo, out, lit)[0])
     Le = mi.unpolarized_spectrum(dr.detach(si_e).emitter(scene).eval(si_e, lit))
-    terms.E = dr.select(lit, mi.unpolarized_spectrum(val) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
+    terms.E = dr.select(lit, scattered(val, turn) * (inv_pdf * J * nxt.vertex.mis) * Le, 0)
     terms.length_E = dr.norm(dr.select(lit, si_e.p - si.p, mi.Vector3f(0, 0, 1)))
     terms.lit_ahead = lit
+    if facts.media is not None:
+        terms.E *= nxt.vertex.medium.walk
+        terms.p_E = si_e.p

@@ -2,19 +2,114 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
 
-def length_to_sensor_origin(sensor, ray):
+class View:
+    """One sensor, and the lanes that look through it: several for a ``batch``, whose children share a film.
+
+    ``reference`` is the sphere whose tangent plane stands for a sensor at infinity, None for other sensors. A plain
+    object, which Dr.Jit loops leave alone.
+    """
+
+    def __init__(self, sensor: Any, active: Any, reference: Any = None) -> None:
+        self.sensor, self.active, self.reference = sensor, active, reference
+
+    def length(self, ray: Any) -> Any:
+        """Distance in metres from the sensor's origin to ``ray.o``, attached where the sensor is."""
+        kind = self.sensor.class_name()
+        if is_distant(self.sensor):
+            # From the tangent plane that the wave reaches last to where Mitsuba happens to start the ray.
+            return self.reference.length(ray.o, -ray.d)
+        if kind in ("RadianceMeter", "IrradianceMeter"):
+            # Their rays start a little off the sensor.
+            return mi.math.RayEpsilon * dr.norm(ray.d)
+        near = getattr(self.sensor, "near_clip", None)
+        if near is None:
+            return mi.Float(0)
+        # The near clip plane in the world: an orthographic camera may be scaled along its axis.
+        axis = self.sensor.world_transform() @ mi.Vector3f(0, 0, 1)
+        return near() * dr.squared_norm(axis) / dr.dot(axis, ray.d)
+
+
+def is_distant(sensor: Any) -> bool:
+    """Whether the sensor sits at infinity."""
+    return sensor.class_name().startswith("DistantSensor")
+
+
+def views(sensor: Any, position: Any, reference: Any) -> list[View]:
+    """The sensors behind the film positions ``position`` in [0, 1]^2, each with the lanes that are its own.
+
+    ``reference()`` gives the sphere around the scene; it is only asked for when a sensor sits at infinity.
+    """
+
+    def view(one, active):
+        return View(one, active, reference() if is_distant(one) else None)
+
+    children = sensors_of(sensor)
+    if len(children) == 1:
+        return [view(children[0], True)]
+    # The same rounding as in the plugin, so that a ray at the border gets the length of the sensor that made it.
+    index = dr.minimum(mi.UInt32(position.x * len(children)), len(children) - 1)
+    return [view(child, index == n) for n, child in enumerate(children)]
+
+
+def sensors_of(sensor: Any) -> list[Any]:
+    """The children of a ``batch`` in their order on the film, or the sensor itself."""
+    if sensor.class_name() != "BatchSensor":
+        return [sensor]
+    found = []
+
+    class Callback(mi.TraversalCallback):
+        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            if isinstance(value, mi.Sensor):
+                found.append(value)
+
+        put_object = put
+        put_value = put
+
+    sensor.traverse(Callback())
+    return found
+
+
+def shapes_of_sensors(sensor: Any) -> list[Any]:
+    """The shape that each sensor sits on, None for those that stand alone."""
+    return [one.get_shape() for one in sensors_of(sensor)]
+
+
+def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, position: Any, aperture: Any) -> Any:
+    """Primary rays and their weights, attached to the sensor.
+
+    The children of a batch are asked one by one once one of them is attached: derivatives through the virtual call
+    that the plugin makes end the process in forward mode (Dr.Jit 1.5).
+    """
+    if len(seen) == 1 or not any(dr.grad_enabled(value) for _, value in mi.traverse(sensor)):
+        return sensor.sample_ray_differential(time=time, sample1=wavelength, sample2=position, sample3=aperture)
+    place = position.x * len(seen)
+    inner = mi.Point2f(place - mi.Float(mi.UInt32(place)), position.y)
+    rays, weights = None, None
+    for view in seen:
+        ray, weight = view.sensor.sample_ray_differential(
+            time=time, sample1=wavelength, sample2=inner, sample3=aperture, active=view.active
+        )
+        rays = ray if rays is None else dr.select(view.active, ray, rays)
+        weights = weight if weights is None else dr.select(view.active, weight, weights)
+    return rays, weights
+
+
+def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
     """Distance in metres from the sensor's origin to ``ray.o``.
 
     Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole
-    (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Other sensors
-    start rays where they are.
+    (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Radiance and
+    irradiance meters lift the start off themselves by a little. Light for a sensor at infinity arrives when its wave
+    front leaves the sphere around the scene, as it starts there when it comes from infinity. Other sensors start rays
+    where they are.
     """
-    near = getattr(sensor, "near_clip", None)
-    if near is None:
-        return mi.Float(0)
-    axis = sensor.world_transform() @ mi.Vector3f(0, 0, 1)
-    return near() / dr.dot(dr.normalize(axis), ray.d)
+    length = seen[0].length(ray)
+    for view in seen[1:]:
+        length = dr.select(view.active, view.length(ray), length)
+    return length

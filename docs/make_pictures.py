@@ -1,0 +1,110 @@
+"""Render and draw the figures of docs/pictures.md: `python docs/make_pictures.py [PART ...]`, minutes on two cores.
+
+Everything is a render, of a Cornell box or of two balls; nothing is drawn by hand.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import torchtransient as tt
+from torchtransient.scenes.transforms import look_at, scale, translate
+from torchtransient.vis.files import enlarge, save_image
+
+OUT = Path(__file__).parent / "images" / "pictures"
+AXIS = {"num_bins": 200, "start_opl": 3.6, "bin_width_opl": 0.03}
+
+
+def surfaces() -> None:
+    """Pictures of intensity over time."""
+    scene = tt.load(tt.scenes.cornell_box(resolution=128, mirror=True, sampler="multijitter", **AXIS), "llvm_ad_rgb")
+    with torch.no_grad():
+        out = tt.render(scene, spp=2048, seed=0)
+    tt.vis.peak_time_picture(out, OUT / "peak_time.png")
+    styles = [
+        tt.vis.rainbow(out),
+        tt.vis.rainbow(out, style="fusion"),
+        tt.vis.rainbow(out, period_opl=0.5),
+    ]
+    gap = np.full((128, 3, 3), 255, np.uint8)
+    row = np.concatenate([styles[0], gap, styles[1], gap, styles[2]], axis=1)
+    save_image(enlarge(row, 2), OUT / "rainbow.png", "make_pictures")
+    tt.vis.streak(out, OUT / "streak.png", row=84)
+    figure = tt.vis.frame_grid(out, count=8)
+    figure.savefig(OUT / "frames.png", dpi=90)
+    tt.vis.histogram(out, OUT / "histogram.png", pixels=[(52, 84), (110, 40)], log=True)
+    small = torch.nn.functional.avg_pool2d(out.transient.transpose(0, 1), 2).transpose(0, 1)
+    tt.vis.video(small, OUT / "light.gif", axis=out.axis, scale=4, every=5, fps=10)
+
+
+def polarization() -> None:
+    """A ball of plastic and one of metal on a plastic floor, under a uniform sky that is not polarized."""
+    camera = look_at([0.0, -4.0, 1.6], [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])
+    film = {"type": "transient_hdr_film", "width": 128, "height": 96, "rfilter": {"type": "box"}, "temporal_bins": 64}
+    plastic = {"type": "pplastic", "diffuse_reflectance": 0.05, "alpha": 0.05}
+    description = {
+        "type": "scene",
+        "integrator": {"type": "transient_path", "max_depth": 4},
+        "sensor": {"type": "perspective", "fov": 36.0, "to_world": camera, "film": {**film, "bin_width_opl": 1.0}},
+        "sky": {"type": "constant"},
+        "floor": {"type": "rectangle", "to_world": scale(4.0), "bsdf": plastic},
+        "plastic": {"type": "sphere", "center": [-0.6, 0.0, 0.5], "radius": 0.5, "bsdf": plastic},
+        "metal": {
+            "type": "sphere",
+            "center": [0.6, 0.0, 0.5],
+            "radius": 0.5,
+            "bsdf": {"type": "roughconductor", "material": "Cr", "alpha": 0.05},
+        },
+    }
+    with torch.no_grad():
+        out = tt.render(tt.load(description, "llvm_ad_mono_polarized"), spp=512, seed=0)
+    tt.vis.polarization_picture(out, OUT / "polarization.png")
+
+
+def phasors() -> None:
+    """Waves of modulated light."""
+    scene = tt.load(tt.scenes.cornell_box(resolution=96, **AXIS), "llvm_ad_mono")
+    axis = tt.FrequencyAxis((0.5, 2.0))
+    with torch.no_grad():
+        out = tt.render(scene, spp=512, seed=0, frequencies=axis)
+    tt.vis.phasor_picture(out, OUT / "phasors.png", which=(0, 1), show=("real", "phase", "domain"))
+
+
+def gradients() -> None:
+    """What the picture of all times, and that of one moment, does when the back wall moves away."""
+    key = "back.to_world"
+    scene = tt.load(tt.scenes.cornell_box(resolution=96, max_depth=4, sampler="multijitter", **AXIS), "llvm_ad_mono")
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=1024)
+    start = renderer.values[key].detach()
+    away = torch.as_tensor(translate([0.0, 0.0, -1.0]), dtype=torch.float32)
+    direction = (away - torch.eye(4)) @ start
+
+    def render(to_world: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        out = renderer({key: to_world}, seed=0)
+        return out.steady, out.transient
+
+    _, (steady, transient) = torch.func.jvp(render, (start,), (direction,))
+    moment = renderer.axis.bin_index(6.3).item()
+    name = f"between {renderer.axis.edges_opl[moment]:.2f} m and {renderer.axis.edges_opl[moment + 4]:.2f} m"
+    pictures = {"gradient_steady.png": ("of all times", steady)}
+    pictures["gradient_moment.png"] = (name, transient[:, moment : moment + 4].sum(1))
+    for file, (title, values) in pictures.items():
+        figure = tt.vis.gradient_picture(values, title=title, label="radiance per metre")
+        figure.savefig(OUT / file, dpi=80)
+
+
+PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients)}
+
+if __name__ == "__main__":
+    OUT.mkdir(parents=True, exist_ok=True)
+    for name in sys.argv[1:] or PARTS:
+        part = PARTS[name]
+        print(part.__name__, flush=True)
+        part()
+    sizes = {path.name: path.stat().st_size for path in sorted(OUT.iterdir())}
+    print(*(f"{name}: {size / 1e3:.0f} kB" for name, size in sizes.items()), sep="\n")
+    print(f"together {sum(sizes.values()) / 1e6:.2f} MB")

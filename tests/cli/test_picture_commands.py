@@ -1,0 +1,133 @@
+"""Pictures and videos from the command line: the same as from the library, and errors before the work."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from click.testing import CliRunner
+from PIL import Image
+
+import torchtransient as tt
+from torchtransient.cli.main import main
+from torchtransient.data.result_file import write_result
+
+VARIANT = "llvm_ad_rgb"  # what the commands take when none is active, as in a process of their own
+SCENE = """<scene version="3.0.0">
+  <integrator type="transient_path"><integer name="max_depth" value="2"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="transient_hdr_film">
+      <integer name="width" value="8"/><integer name="height" value="8"/>
+      <integer name="temporal_bins" value="12"/>
+      <float name="start_opl" value="5"/><float name="bin_width_opl" value="0.5"/>
+    </film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <shape type="rectangle"/>
+  <emitter type="point"><point name="position" x="0" y="1" z="3"/><rgb name="intensity" value="5"/></emitter>
+</scene>"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box.xml").write_text(SCENE, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def result(folder):
+    with torch.no_grad():
+        return write_result(folder / "box.h5", tt.render("box.xml", seed=0))
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def test_render_with_every_picture(folder):
+    pictures = ("--video", "v.gif", "--peak-time", "p.png", "--rainbow", "r.png")
+    done = run("render", "box.xml", *pictures, "--quiet")
+    assert done.exit_code == 0, done.output
+    assert Image.open("v.gif").n_frames == 12
+    assert Image.open("r.png").size == (8, 8)
+    assert Image.open("p.png").size[0] > 300
+    for line in ("v.gif: 12 frames", "p.png: arrival of the peak", "r.png: hue by arrival"):
+        assert line in done.stdout
+    # the file that was written beside them gives the same picture
+    again = run("picture", "box.h5", "r2.png", "--kind", "rainbow")
+    assert again.exit_code == 0, again.output
+    assert (folder / "r.png").read_bytes() == (folder / "r2.png").read_bytes()
+
+
+def test_video_options(folder, result):
+    done = run("video", "box.h5", "v.gif", "--fps", 10, "--every", 4, "--accumulate", "--no-stamp", "--scale", 2)
+    assert done.exit_code == 0, done.output
+    image = Image.open("v.gif")
+    assert image.size == (16, 16)
+    durations = []
+    for index in range(image.n_frames):  # the last two are equal, and become one of twice the length
+        image.seek(index)
+        durations.append(image.info["duration"])
+    assert sum(durations) == 300
+    assert "3/3" in done.stderr
+    done = run("video", "box.h5", "v.mp4", "--curve", "log", "--exposure", 3, "--quiet")
+    assert done.exit_code == 0, done.output
+    assert b"ftyp" in (folder / "v.mp4").read_bytes()[:16]
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [
+        ("overview", ("--pixel", 3, 4)), ("peak-time", ()), ("rainbow", ()), ("fusion", ()), ("streak", ("--row", 2)),
+        ("streak", ("--column", 2)), ("frames", ()), ("histogram", ("--pixel", 3, 4)),
+    ],
+)  # fmt: skip
+def test_kinds_of_pictures(folder, result, kind, more):
+    done = run("picture", "box.h5", "out.png", "--kind", kind, *more)
+    assert done.exit_code == 0, done.output
+    assert Image.open("out.png").size[0] >= 8
+
+
+def test_polarization_and_phasors_from_files(folder, result):
+    import numpy as np
+
+    values = torch.rand(4, 1, 3, 5, 5).numpy()
+    np.savez("polarized.npz", transient=values)
+    np.savez("phasor.npz", phasor=(values[0] + 1j * values[1]).astype(np.complex64))
+    for name, kind in (("polarized.npz", "polarization"), ("phasor.npz", "phasor")):
+        done = run("picture", name, f"{kind}.png", "--kind", kind)
+        assert done.exit_code == 0, done.output
+        assert Image.open(f"{kind}.png").size[0] > 300
+        wrong = run("picture", "box.h5", "none.png", "--kind", kind)
+        assert wrong.exit_code == 2 and "error: " in wrong.stderr
+    assert not (folder / "none.png").exists()
+
+
+def test_phasors_become_a_wave(folder):
+    done = run("render", "box.xml", "--frequencies", "0.5,1", "--video", "wave.gif", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert Image.open("wave.gif").n_frames == 48
+    done = run("render", "box.xml", "--frequencies", "0.5,1", "--rainbow", "r.png", "--quiet")
+    assert done.exit_code == 2 and "--rainbow shows a histogram over time" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("video", "missing.h5", "v.gif"), "does not exist"),
+        (("video", "box.h5", "v.avi"), ".mp4 or .gif"),
+        (("video", "box.h5", "nowhere/v.gif"), "'nowhere' does not exist"),
+        (("video", "box.xml", "v.gif"), ".npy"),
+        (("picture", "box.h5", "nowhere/a.png"), "'nowhere' does not exist"),
+        (("picture", "box.h5", "a.png", "--kind", "histogram"), "needs --pixel"),
+        (("picture", "box.h5", "a.png", "--kind", "rainbow", "--row", "1"), "--row has no effect"),
+        (("picture", "box.h5", "a.png", "--kind", "streak", "--row", "99"), "outside of an image"),
+    ],
+)
+def test_errors(folder, result, arguments, message):
+    done = run(*arguments)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr

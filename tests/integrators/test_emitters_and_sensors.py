@@ -1,0 +1,409 @@
+"""Every emitter and every sensor: when its light arrives and how much of it, in closed form and against Mitsuba."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from lights_and_sensors import (
+    HALF,
+    LIGHTS,
+    RHO,
+    SENSORS,
+    SPHERE,
+    T,
+    bright_texel,
+    facing_down,
+    film,
+    from_above,
+    looking_down,
+    plane,
+    scene,
+)
+
+from torchtransient import plugins
+from torchtransient.testing.statistics import two_sample_z_test
+
+VARIANT = "llvm_ad_rgb"  # the sky of Mitsuba knows no monochromatic variant
+# Half a bin, and what float32 makes of lengths of ten metres.
+HALF_BIN = 5.1e-4
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant(VARIANT)
+    plugins.sync()
+
+
+def load(description):
+    with plugins.plugin_errors():
+        return mi.load_dict(description, optimize=False)
+
+
+def arrivals(loaded, spp=16, seed=0):
+    """Bins (H, W, T) and their centres; nothing may fall outside of the window."""
+    camera_film = loaded.sensors()[0].film()
+    bins = np.array(loaded.integrator().render(loaded, spp=spp, seed=seed)[1], dtype=float)[..., 0]
+    assert camera_film.energy_before == 0.0 and camera_film.energy_after == 0.0
+    return bins, camera_film.start_opl + (np.arange(bins.shape[-1]) + 0.5) * camera_film.bin_width_opl
+
+
+def one_arrival(loaded, spp=16, seed=0):
+    """Mean arrival, total, and width of what a film of one pixel sees."""
+    bins, centers = arrivals(loaded, spp, seed)
+    bins = bins[0, 0]
+    lit = np.flatnonzero(bins)
+    return centers @ bins / bins.sum(), bins.sum(), centers[lit[-1]] - centers[lit[0]]
+
+
+# -------------------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_light_on_a_plane(name):
+    light = LIGHTS[name]
+    loaded = load(scene(SENSORS["perspective"].make(film()), light.make()))
+    spp = 1 << 14 if name in ("constant", "envmap", "sunsky") else 64
+    opl, radiance, width = one_arrival(loaded, spp)
+    assert opl == pytest.approx(light.opl + 4.0, abs=HALF_BIN)
+    # One moment: O is the centre of the sphere, which the waves of all directions reach at once.
+    assert width < 2.5e-3
+    if not math.isnan(light.radiance):
+        assert radiance == pytest.approx(light.radiance, rel=light.tolerance)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_sensor_over_a_plane(name):
+    sensor = SENSORS[name]
+    for light in (LIGHTS["point"], LIGHTS["directional"]):
+        opl, radiance, width = one_arrival(load(scene(sensor.make(film()), light.make())), 256)
+        assert opl == pytest.approx(light.opl + sensor.opl, abs=HALF_BIN)
+        assert radiance == pytest.approx(light.radiance * sensor.weight, rel=1e-3)
+        assert width < 2.5e-3
+
+
+def test_start_of_meters_is_on_the_sensor():
+    """Mitsuba lifts the rays of these meters off by 8.9e-5 m, which bins of 1e-5 m can see."""
+    sharp = film(start=4.9, bins=20000, width=1e-5)
+    loaded = load(scene(SENSORS["radiancemeter"].make(sharp), LIGHTS["point"].make()))
+    assert one_arrival(loaded)[0] == pytest.approx(5.0, abs=6e-6)
+
+
+def meter(size=1e-3, height=1.0, **arguments):
+    """An irradiance meter that looks down on the plane."""
+    return facing_down(height, size, {"meter": {"type": "irradiancemeter", "film": film(**arguments)}})
+
+
+def test_irradiance_meter_over_a_lit_plane():
+    """Light beside the meter: E(tau) = I rho h^3 / r^6 dtau with r = tau / 2, bin by bin (a plane of 3 m cuts it)."""
+    height, intensity, runs = 0.5, 2.0, 8
+    description = {
+        "type": "scene",
+        "integrator": {"type": "transient_path", "max_depth": 2},
+        "meter": meter(height=height, bins=60, width=0.05, start=0.975),
+        # a hair below the meter, which would hide it otherwise
+        "light": {"type": "point", "position": [0, 0, height - 1e-5], "intensity": intensity},
+        "plane": {**plane(), "to_world": T().scale(50.0)},
+    }
+    loaded = load(description)
+    edges = np.maximum((0.975 + 0.05 * np.arange(61)) / 2, height)
+    expected = 2 * intensity * RHO * height**3 / 5 * (edges[:-1] ** -5 - edges[1:] ** -5)
+    samples = np.array([
+        np.array(loaded.integrator().render(loaded, seed=s, spp=1 << 14)[1], dtype=float)[0, 0, :, 0]
+        for s in range(runs)
+    ])  # fmt: skip
+    error = samples.std(axis=0, ddof=1) / np.sqrt(runs)
+    deviates = (samples.mean(0) - expected)[expected > 1e-3 * expected.max()]
+    # the light hangs 1e-5 below the meter: 2e-5 of the height, six times that of the energy
+    allowed = 5.5 * error[expected > 1e-3 * expected.max()] + 1.2e-4 * expected.max()
+    assert (np.abs(deviates) < allowed).all()
+    assert abs(samples.sum(1).mean() - expected.sum()) < 5 * samples.sum(1).std(ddof=1) / np.sqrt(runs) + 2e-4
+
+
+def test_irradiance_meter_sees_light_directly():
+    """A lamp of 1 cm above an upward meter: E = L A cos cos / d^2, after the distance and nothing else."""
+    up = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(1e-3),
+          "meter": {"type": "irradiancemeter", "film": film(bins=4000)}}  # fmt: skip
+    description = {
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 2}, "meter": up,
+        "lamp": facing_down(1.4, 0.2, {"emitter": {"type": "area", "radiance": 3.0}}),
+    }  # fmt: skip
+    values = [one_arrival(load(description), 1 << 15, seed) for seed in range(6)]
+    totals = np.array([v[1] for v in values])
+    # a small patch under a square of half side a at height h: E = 4 L a / s * atan(a / s) with s = sqrt(h^2 + a^2)
+    a, h = 0.2, 0.4
+    s = math.hypot(a, h)
+    expected = 4 * 3.0 * a / s * math.atan(a / s)
+    assert abs(totals.mean() - expected) < 4.5 * totals.std(ddof=1) / np.sqrt(6) + 1e-4 * expected
+    bins, centers = arrivals(load(description), 1 << 12)
+    lit = centers[np.flatnonzero(bins[0, 0])]
+    assert lit[0] == pytest.approx(0.4, abs=1.5e-3)
+    assert lit[-1] <= math.sqrt(0.4**2 + 2 * 0.201**2) + 1e-3
+
+
+# ---------------------------------------------------------------------------------------------- where paths begin
+
+
+def test_orthographic_rays_start_on_the_plane_of_the_camera():
+    """All pixels see the plane at the same distance, also those far from the axis."""
+    sensor = {
+        "type": "orthographic", "near_clip": 0.5, "far_clip": 100.0, "film": film(size=(5, 1)),
+        "to_world": T().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]) @ T().scale([2, 2, 2]),
+    }  # fmt: skip
+    bins, centers = arrivals(load(scene(sensor, LIGHTS["directional"].make())), 512)
+    means = (bins @ centers / bins.sum(-1))[0]
+    # five columns of 0.8 m; +x of the camera is to the left; each pixel averages over its columns
+    x = -np.array([-1.6, -0.8, 0.0, 0.8, 1.6])
+    np.testing.assert_allclose(np.sort(means), np.sort(4.0 + SPHERE - 0.6 * x), atol=0.03)
+
+
+def test_thin_lens_light_arrives_at_the_sampled_point_of_the_aperture():
+    """Focus on the light's image: paths over the rim of the lens are longer than those through its middle."""
+    radius, near = 0.5, 1.0
+    sensor = {
+        "type": "thinlens", "fov": 0.01, "near_clip": near, "aperture_radius": radius, "focus_distance": 4.0,
+        "film": film(bins=8000), **looking_down(4.0),
+    }  # fmt: skip
+    bins, centers = arrivals(load(scene(sensor, LIGHTS["point"].make())), 4096)
+    lit = centers[np.flatnonzero(bins[0, 0])]
+    assert lit[0] == pytest.approx(1.0 + 4.0, abs=2e-3)
+    assert lit[-1] == pytest.approx(1.0 + math.hypot(4.0, radius), abs=2e-3)
+    mean = centers @ bins[0, 0] / bins.sum()
+    # uniform over the disk: the mean of sqrt(16 + r^2)
+    expected = 2 / (3 * radius**2) * ((16 + radius**2) ** 1.5 - 64)
+    assert mean == pytest.approx(1.0 + expected, abs=1e-3)
+
+
+def test_batch_counts_the_near_clip_plane_of_each_child():
+    children = {
+        "first": SENSORS["perspective"].make(film(steady=True)),
+        "second": {
+            "type": "perspective", "fov": 0.01, "near_clip": 0.2, "film": film(steady=True), **looking_down(3.0),
+        },
+        "third": SENSORS["radiancemeter"].make(film(steady=True)),
+    }  # fmt: skip
+    sensor = {"type": "batch", "film": film(size=(3, 1)), **children}
+    bins, centers = arrivals(load(scene(sensor, LIGHTS["point"].make())))
+    means = (bins @ centers / bins.sum(-1))[0]
+    np.testing.assert_allclose(means, [1.0 + 4.0, 1.0 + 3.0, 1.0 + 4.0], atol=HALF_BIN)
+    np.testing.assert_allclose(bins.sum(-1)[0], LIGHTS["point"].radiance, rtol=1e-3)
+
+
+def test_batch_reports_polarization_in_the_frame_of_each_child():
+    """A mirror under a uniform sky has no noise: a camera in a batch sees what it sees alone, upright or turned."""
+    mi.set_variant("llvm_ad_mono_polarized")
+    plugins.sync()
+    ups = ([0, 0, 1], [0, 1, 1], [1, 1, 0])
+    cameras = [
+        {"type": "perspective", "fov": 0.01, "to_world": T().look_at(origin=[0, 3, 2], target=[0, 0, 0], up=up)}
+        for up in ups
+    ]
+    objects = {
+        "mirror": {**plane(), "bsdf": {"type": "conductor", "material": "Cr"}},
+        "sky": {"type": "constant"},
+        "integrator": {"type": "transient_path", "max_depth": 3},
+    }
+
+    def seen(sensor):
+        loaded = load({"type": "scene", "sensor": sensor, **objects})
+        return np.array(loaded.integrator().render(loaded, spp=16)[0], float)[0]
+
+    alone = np.concatenate([seen({**camera, "film": film()}) for camera in cameras])
+    children = {f"c{n}": {**camera, "film": film(steady=True)} for n, camera in enumerate(cameras)}
+    together = seen({"type": "batch", "film": film(size=(3, 1)), **children})
+    np.testing.assert_allclose(together, alone, atol=1e-5)
+    assert np.ptp(alone[:, 1]) > 0.05  # the frames do differ
+
+
+@pytest.mark.parametrize("target", ["point", "shape", "scene"])
+def test_a_distant_sensor_sees_a_plane_wave(target):
+    """Parts of a slanted surface that lie further along the view arrive later by that much, wherever rays start."""
+    direction = np.array([-0.6, 0.0, -0.8])  # the sensor looks along it
+    sensor = {
+        "type": "distant", "film": film(),
+        "to_world": T().look_at(origin=[0, 0, 0], target=list(direction), up=[0, 1, 0]),
+    }  # fmt: skip
+    if target == "point":
+        sensor["target"] = [1.0, 0.5, 0.0]
+    elif target == "shape":
+        sensor["target"] = {"type": "rectangle", "to_world": T().translate([1.0, 0.5, 0.0]).scale(0.2)}
+    bins, centers = arrivals(load(scene(sensor, LIGHTS["directional"].make())), 1 << 14)
+    bins = bins[0, 0]
+    lit = centers[np.flatnonzero(bins)]
+    # sun and sensor in the same direction u: x is reached after SPHERE - dot(x, u), and again that long on its way back
+    half = {"point": 0.0, "shape": 0.2, "scene": HALF}[target]
+    middle = 0.0 if target == "scene" else 1.0
+    expected = 2 * (SPHERE - 0.6 * (middle + np.array([half, -half])))
+    np.testing.assert_allclose([lit[0], lit[-1]], expected, atol=0.03 if target == "scene" else 3e-3)
+
+
+# ----------------------------------------------------------------------------------------------- spots and beams
+
+
+def test_spot_of_a_projector_lights_a_wall_and_the_wall_a_floor():
+    """A laser spot: the floor is lit by a point of the wall, at the sum of three known lengths."""
+    lamp, spot, seen = np.array([1.0, 0, 1.5]), np.array([0.0, 0, 1.0]), np.array([1.0, 0, 0.0])
+    field = 2.0
+    beam = {
+        "type": "projector", "scale": 1e3, "fov": field,
+        "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32)), "raw": True},
+        "to_world": T().look_at(origin=list(lamp), target=list(spot), up=[0, 1, 0]),
+    }  # fmt: skip
+    wall = {
+        "type": "rectangle", "to_world": T().rotate([0, 1, 0], 90).scale(HALF),
+        "bsdf": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": RHO}},
+    }  # fmt: skip
+    sensor = {"type": "radiancemeter", "film": film(),
+              "to_world": T().look_at(origin=[1, 0, 2], target=list(seen), up=[0, 1, 0])}  # fmt: skip
+    loaded = load(scene(sensor, beam, depth=3, wall=wall))
+    # the spot is found by chance, by some hundred paths of a million
+    runs = np.array([one_arrival(loaded, 1 << 20, seed) for seed in range(8)])
+    lengths = [np.linalg.norm(a) for a in (lamp - spot, spot - seen)]
+    # the spot is 4 cm wide: single paths differ by that, and their mean by its square
+    assert runs[:, 2].max() < 0.1
+    error = runs.std(axis=0, ddof=1) / math.sqrt(len(runs))
+    assert abs(runs[:, 0].mean() - sum(lengths) - 2.0) < 4.5 * error[0] + 1e-3
+    # the flux in the field leaves the wall as from a point
+    flux = math.pi * 1e3 * (2 * math.tan(math.radians(field / 2))) ** 2
+    cos_out, cos_in = (seen - spot) @ [1, 0, 0] / lengths[1], (spot - seen) @ [0, 0, 1] / lengths[1]
+    expected = flux * RHO / math.pi * cos_out * cos_in / lengths[1] ** 2 * RHO / math.pi
+    assert abs(runs[:, 1].mean() - expected) < 4.5 * error[1] + 2e-3 * expected
+    assert error[1] < 0.1 * expected
+
+
+def test_one_texel_of_an_environment_map():
+    """Light of one direction, which the map's texels define, arrives as the plane wave of that direction."""
+    image = bright_texel()
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": T().rotate([1, 0, 0], 90)}
+    sensor = {**SENSORS["radiancemeter"].make(film(bins=9000)),
+              "to_world": T().look_at(origin=[1, 0.5, 3], target=[1, 0.5, 0], up=[0, 1, 0])}  # fmt: skip
+    loaded = load(scene(sensor, sky))
+    # where the map is brightest, according to the map itself
+    theta, phi = (np.arange(2000) + 0.5) / 2000 * math.pi, (np.arange(4000) + 0.5) / 4000 * 2 * math.pi
+    th, ph = (mi.Float(v.ravel().astype(np.float32)) for v in np.meshgrid(theta, phi))
+    d = mi.Vector3f(dr.sin(th) * dr.cos(ph), dr.sin(th) * dr.sin(ph), dr.cos(th))
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
+    si.wi = -d
+    brightness = np.array(mi.luminance(loaded.emitters()[0].eval(si), si.wavelengths))
+    weight = brightness * np.sin(np.array(th)) * np.maximum(np.array(d)[2], 0)
+    towards = np.array(d)
+    mean = (towards * weight).sum(1) / weight.sum()
+    expected = SPHERE - mean @ np.array([1, 0.5, 0]) + 3.0
+    assert weight.sum() > 0
+    opl, _, width = one_arrival(loaded, 1 << 14)
+    assert opl == pytest.approx(expected, abs=5e-3)
+    assert 0.02 < width < 0.4  # a texel is 0.1 wide on either side, of 1.1 m from the axis
+
+
+def test_sun_slants_over_the_plane():
+    """The sun's light reaches one side of the plane before the other."""
+    sun = LIGHTS["sunsky"].make()
+    u = from_above()
+    for x in (-2.0, 2.0):
+        sensor = {**SENSORS["radiancemeter"].make(film()),
+                  "to_world": T().look_at(origin=[x, 0, 3], target=[x, 0, 0], up=[0, 1, 0])}  # fmt: skip
+        opl, _, width = one_arrival(load(scene(sensor, sun)), 4096)
+        assert opl == pytest.approx(SPHERE - x * u[0] + 3.0, abs=2e-3)
+        assert width < 4 * 2.0 * math.radians(0.5338)
+
+
+def test_directionalarea_shines_on_nothing_that_is_traced_backwards():
+    """Mitsuba's `directionalarea` cannot be found from the sensor: dark here, as in Mitsuba's own path tracer."""
+    lamp = facing_down(2.0, 0.5, {"emitter": {"type": "directionalarea", "radiance": 5.0}})
+    loaded = load(scene(SENSORS["perspective"].make(film()), lamp))
+    steady, transient = loaded.integrator().render(loaded, spp=64)
+    assert np.array(steady).sum() == 0.0 and np.array(transient).sum() == 0.0
+    twin = load(scene(SENSORS["perspective"].make(film(steady=True)), lamp, integrator="path"))
+    assert np.array(mi.render(twin, spp=64)).sum() == 0.0
+
+
+# ------------------------------------------------------------------------------------ sum over time, every pair
+
+
+def wide(kind, transient):
+    """Sensors with a wide view of the plane and the light."""
+    f = film(size=(4, 2), bins=8, width=10.0, start=-5.0, steady=not transient)
+    point = film(bins=8, width=10.0, start=-5.0, steady=not transient)
+    slanted = {"to_world": T().look_at(origin=[2, -3, 4], target=[0, 0, 0], up=[0, 0, 1])}
+    inner = {"type": "perspective", "fov": 40.0, "film": film(steady=True), **slanted}
+    return {
+        "perspective": {"type": "perspective", "fov": 50.0, "film": f, **slanted},
+        "thinlens": {
+            "type": "thinlens", "fov": 50.0, "aperture_radius": 0.3, "focus_distance": 3.0, "film": f, **slanted,
+        },
+        "orthographic": {"type": "orthographic", "film": f, "to_world": slanted["to_world"] @ T().scale([2, 2, 1])},
+        "radiancemeter": {"type": "radiancemeter", "film": point, **slanted},
+        "irradiancemeter": facing_down(0.7, 0.2, {"meter": {"type": "irradiancemeter", "film": point}}),
+        "distant": {"type": "distant", "film": point, **slanted},
+        "batch": {"type": "batch", "film": f, "a": inner, "b": {**inner, "fov": 20.0}},
+    }[kind]  # fmt: skip
+
+
+def pair(sensor, light, integrator):
+    white = {"type": "diffuse", "reflectance": 0.7}
+    ball = {"type": "sphere", "center": [-1.0, 0.5, 0.4], "radius": 0.3, "bsdf": white}
+    made = LIGHTS[light].make()
+    if light == "sunsky":
+        made["sky_scale"] = 1.0
+    transient = integrator != "path"
+    return load(scene(wide(sensor, transient), made, integrator, depth=4, ball=ball))
+
+
+KINDS = ("perspective", "thinlens", "orthographic", "radiancemeter", "irradiancemeter", "distant", "batch")
+PAIRS = list(itertools.product(KINDS, LIGHTS))
+QUICK = [(sensor, "area") for sensor in KINDS] + [("perspective", light) for light in LIGHTS if light != "area"]
+
+
+def check_pair(sensor, light, count=6, spp=512):
+    ours, theirs = pair(sensor, light, "transient_path"), pair(sensor, light, "path")
+    sums = []
+    for k in range(count):
+        steady, transient = ours.integrator().render(ours, seed=k, spp=spp)
+        steady, transient = np.array(steady, float), np.array(transient, float)
+        np.testing.assert_allclose(transient.sum(2), steady, rtol=1e-4, atol=1e-6 * max(steady.max(), 1e-3))
+        sums.append(transient.sum(2))
+    images = np.array([np.array(mi.render(theirs, seed=900 + k, spp=spp), float) for k in range(count)])
+    assert images.max() > 0
+    result = two_sample_z_test(np.array(sums), images, rounding=1e-5 * images.max())
+    assert result.passed, str(result)
+
+
+@pytest.mark.parametrize(("sensor", "light"), QUICK)
+def test_sum_over_time_is_what_mitsuba_renders(sensor, light):
+    check_pair(sensor, light)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sensor", "light"), [p for p in PAIRS if p not in QUICK])
+def test_sum_over_time_of_the_other_pairs(sensor, light):
+    check_pair(sensor, light)
+
+
+# ---------------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("name", [name for name, light in LIGHTS.items() if light.key])
+def test_gradient_of_the_intensity(name):
+    """Light is proportional to its intensity: with the same samples, intensity times derivative is the light itself."""
+    light = LIGHTS[name]
+    loaded = load(scene(wide("perspective", True), light.make(), depth=3))
+    params = mi.traverse(loaded)
+    keys = [k for k in params.keys() if k.endswith(light.key.split(".", 1)[1])]  # noqa: SIM118 (not a mapping)
+    assert len(keys) == 1, list(params.keys())
+    key = keys[0]
+    integrator = loaded.integrator()
+    weights = np.linspace(0.5, 1.5, 2 * 4 * 8 * 3).reshape(2, 4, 8, 3).astype(np.float32)
+    value = type(params[key])(params[key])
+    _, transient = integrator.render(loaded, seed=5, spp=256)
+    expected = float((np.array(transient, float) * weights).sum())
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    integrator.render_backward(loaded, params, (None, mi.TensorXf(weights)), seed=5, spp=256)
+    assert expected > 0
+    product = (np.array(dr.grad(value)).ravel() * np.array(dr.detach(value)).ravel()).sum()
+    assert product == pytest.approx(expected, rel=1e-3)

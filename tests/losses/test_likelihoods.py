@@ -1,0 +1,203 @@
+"""Likelihoods against torch.distributions, photons one by one, and their own minima; values and gradients at zero."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses import (
+    FirstPhotonNLL,
+    FreeRunningNLL,
+    PoissonNLL,
+    ReadNoiseNLL,
+    first_photon_nll,
+    free_running_nll,
+    poisson_nll,
+    read_noise_nll,
+)
+from torchtransient.losses.likelihoods import armed_periods
+from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD, coates
+
+BINS = 20
+CYCLES = 400
+
+
+def rates(total=1.5, bins=BINS):
+    t = torch.arange(bins, dtype=torch.float64)
+    shape = 0.3 / bins + torch.exp(-0.5 * ((t - 0.6 * bins) / 2) ** 2) / 5
+    return (total * shape / shape.sum()).view(1, -1, 1, 1)
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+# name, loss(counts, rate), a draw of counts at `rate`
+CASES = {
+    "poisson": (
+        lambda n, r, **k: poisson_nll(n, 100 * r, **k),
+        lambda r, g: torch.poisson(100 * r, generator=g),
+    ),
+    "first photon": (
+        lambda n, r, **k: first_photon_nll(n, r, CYCLES, **k),
+        lambda r, g: SynchronousSPAD(CYCLES).sample(r, g),
+    ),
+    "first photon with dead time": (
+        lambda n, r, **k: first_photon_nll(n, r, CYCLES, dead_bins=4.5, **k),
+        lambda r, g: SynchronousSPAD(CYCLES, dead_time_s=4.5e-10, bin_width_s=1e-10).sample(r, g),
+    ),
+    "read noise": (
+        lambda n, r, **k: read_noise_nll(n, 100 * r, 5.0, **{a: b for a, b in k.items() if a != "floor"}),
+        lambda r, g: 100 * r + (25 + 100 * r).sqrt() * torch.randn(r.shape, dtype=r.dtype, generator=g),
+    ),
+}
+each = pytest.mark.parametrize("loss, draw", CASES.values(), ids=CASES.keys())
+
+
+@each
+def test_gradcheck_with_zero_counts(loss, draw):
+    n = draw(rates(0.3), seeded())
+    n[0, 3] = 0
+    x = rates(0.3).requires_grad_()
+    assert torch.autograd.gradcheck(lambda r: loss(n, r, floor=1e-3, reduction="none"), x)
+
+
+@each
+def test_the_score_has_mean_zero_at_the_truth(loss, draw):
+    repeats = 4000
+    x = rates().unsqueeze(0).expand(repeats, 1, BINS, 1, 1).clone().requires_grad_()
+    n = draw(x.detach(), seeded(1))
+    loss(n, x, floor=0.0, reduction="sum").backward()
+    z = x.grad.mean(0) / (x.grad.std(0) / repeats**0.5)
+    assert float(z.abs().max()) < 4.5
+
+
+@each
+def test_finite_for_no_light_and_no_counts(loss, draw):
+    for n_value, r_value in ((0.0, 0.0), (0.0, 0.3), (3.0, 0.0), (3.0, 1e-30)):
+        n = torch.full((1, 4, 1, 1), n_value)
+        r = torch.full((1, 4, 1, 1), r_value, requires_grad=True)
+        value = loss(n, r, floor=1e-4)
+        value.backward()
+        assert bool(torch.isfinite(value)) and bool(torch.isfinite(r.grad).all())
+        default = loss(n, r) if r_value > 1e-20 or n_value == 0 else None
+        assert default is None or bool(torch.isfinite(default))
+
+
+@each
+def test_reductions_and_dtype(loss, draw):
+    n, r = draw(rates(), seeded()), rates()
+    each_bin = loss(n, r, reduction="none")
+    assert each_bin.shape == r.shape
+    torch.testing.assert_close(loss(n, r, reduction="sum"), each_bin.sum())
+    torch.testing.assert_close(loss(n, r), each_bin.mean())
+    single = loss(n.float(), r.float(), reduction="none")
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), each_bin, rtol=1e-4, atol=1e-3)
+    with pytest.raises(ShapeError, match="reduction"):
+        loss(n, r, reduction="median")
+    with pytest.raises(ShapeError, match="one shape"):
+        loss(n[:, 1:], r)
+
+
+def test_poisson_value():
+    n = torch.tensor([0.0, 3, 0, 12], dtype=torch.float64)
+    m = torch.tensor([0.5, 2, 1, 10], dtype=torch.float64)
+    wanted = -torch.distributions.Poisson(m).log_prob(n)
+    torch.testing.assert_close(poisson_nll(n, m, floor=0, constant=True, reduction="none"), wanted)
+    assert float(poisson_nll(torch.tensor([3.0]), torch.tensor([0.0]), floor=0)) == float("inf")
+    with pytest.raises(UnitError, match="negative"):
+        poisson_nll(n, -m)
+
+
+def test_default_floor_keeps_gradients_usable():
+    """A count where the model is dark: with an absolute floor of 1e-8 the gradient is 3e8."""
+    n = torch.tensor([3.0, 100.0, 100.0])
+    m = torch.tensor([0.0, 100.0, 100.0], requires_grad=True)
+    poisson_nll(n, m, reduction="sum").backward()
+    assert 1 < float(m.grad[0].abs()) < 100
+
+
+@pytest.mark.parametrize("dead_bins", [None, 4.5])
+def test_first_photon_is_least_at_coates(dead_bins):
+    spad = SynchronousSPAD(CYCLES, dead_time_s=None if dead_bins is None else dead_bins * 1e-10, bin_width_s=1e-10)
+    n = spad.sample(rates(2.0), seeded(3))
+    best = coates(n, CYCLES, dead_bins).rate
+    least = first_photon_nll(n, best, CYCLES, dead_bins=dead_bins, floor=0.0, reduction="none")
+    for factor in (0.9, 1.1):
+        other = first_photon_nll(n, best * factor, CYCLES, dead_bins=dead_bins, floor=0.0, reduction="none")
+        assert bool((other >= least - 1e-9).all())
+
+
+@pytest.mark.parametrize("dead_bins", [7.5, 26.5, 33.2])
+def test_free_running(dead_bins):
+    """At the expectation, the best rate is the true one; on samples the score vanishes on average."""
+    spad = FreeRunningSPAD(50_000, dead_bins * 1e-10, bin_width_s=1e-10)
+    n = spad(rates())
+    r = rates().requires_grad_()
+    free_running_nll(n, r, 50_000, dead_bins, floor=0.0, reduction="sum").backward()
+    assert float(r.grad.abs().max()) < 1e-6 * 50_000
+    fire = n / armed_periods(n, 50_000, dead_bins)
+    torch.testing.assert_close(-torch.log1p(-fire), rates(), rtol=1e-9, atol=1e-12)
+    assert torch.autograd.gradcheck(
+        lambda v: free_running_nll(n, v, 50_000, dead_bins, floor=1e-3, reduction="none"), rates().requires_grad_()
+    )
+    with pytest.raises(UnitError, match="fit into"):
+        free_running_nll(n, rates(), 5_000, dead_bins)
+
+
+def test_free_running_at_zero():
+    r = torch.zeros(1, 8, 1, 1, requires_grad=True)
+    value = free_running_nll(torch.zeros(1, 8, 1, 1), r, 100, 3.5)
+    value.backward()
+    assert bool(torch.isfinite(r.grad).all()) and float(value) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_read_noise_value():
+    y, m = torch.tensor([3.0, -2.0, 40.0], dtype=torch.float64), torch.tensor([1.0, 0.0, 50.0], dtype=torch.float64)
+    wanted = -torch.distributions.Normal(m, (4 + m).sqrt()).log_prob(y)
+    torch.testing.assert_close(read_noise_nll(y, m, 2.0, reduction="none"), wanted)
+    plain = -torch.distributions.Normal(m, torch.full_like(m, 2.0)).log_prob(y)
+    torch.testing.assert_close(read_noise_nll(y, m, 2.0, shot_noise=False, reduction="none"), plain)
+    sigma = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: read_noise_nll(y, m, s), sigma)
+    with pytest.raises(UnitError, match="read_noise > 0"):
+        read_noise_nll(y, m, 0.0)
+
+
+def test_modules_are_the_functions():
+    n, r = SynchronousSPAD(CYCLES).sample(rates(), seeded()), rates()
+    pairs = [
+        (PoissonNLL(), poisson_nll(n, r)),
+        (FirstPhotonNLL(CYCLES), first_photon_nll(n, r, CYCLES)),
+        (FreeRunningNLL(CYCLES, 2.5), free_running_nll(n, r, CYCLES, 2.5)),
+        (ReadNoiseNLL(3.0), read_noise_nll(n, r, 3.0)),
+    ]
+    for module, wanted in pairs:
+        assert torch.equal(pickle.loads(pickle.dumps(module))(n, r), wanted)
+
+
+def test_fit_by_likelihood_beats_the_raw_histogram():
+    """A pulse's position from a high-flux histogram: pile-up pulls the raw mean early, the likelihood does not."""
+    t = torch.arange(BINS, dtype=torch.float64).view(1, -1, 1, 1)
+
+    def model(position):
+        return 0.01 + 1.5 * torch.exp(-0.5 * ((t - position) / 2) ** 2)
+
+    n = SynchronousSPAD(5000).sample(model(torch.tensor(11.3)), seeded(2))
+    position = torch.tensor(9.0, dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([position], line_search_fn="strong_wolfe")
+
+    def closure():
+        optimiser.zero_grad()
+        value = first_photon_nll(n, model(position), 5000, floor=0.0)
+        value.backward()
+        return value
+
+    for _ in range(5):
+        optimiser.step(closure)
+    assert float(position.detach()) == pytest.approx(11.3, abs=0.1)
+    assert float((n * t).sum() / n.sum()) < 10.0

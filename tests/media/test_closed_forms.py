@@ -1,0 +1,184 @@
+"""Light in a medium against what is known exactly: moments of the random walk, ballistic and single-scattered light."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from media_scenes import T, film, homogeneous, load, rgb, runs, volume
+
+from torchtransient.plugins.integrators.path_record import read_vertex
+from torchtransient.testing.statistics import z_test
+
+VARIANT = "llvm_ad_mono"
+
+
+def infinite(medium, sensor, **objects):
+    """A scene filled with a medium that no surface bounds."""
+    return {"fog": medium, **objects}, {**sensor, "medium": {"type": "ref", "id": "fog"}}
+
+
+def radiance_meter(direction, **arguments):
+    return {
+        "type": "radiancemeter", "origin": [0, 0, 0], "direction": list(direction), "film": film(1, 1, **arguments),
+    }  # fmt: skip
+
+
+def vertices(scene, lanes, seed):
+    """Positions (lanes, depth, 3), optical lengths and throughputs (lanes, depth) of the paths that are traced; the
+    ones of a path that has ended are infinitely far in time.
+    """
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    facts = integrator.facts(scene, sensor).with_gradients(scene, sensor)
+    sampler = sensor.sampler().clone()
+    sampler.seed(seed, lanes)
+    with dr.suspend_grad():
+        ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
+        ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
+        count, store = integrator.trace(scene, sampler, ray, mi.Float64(0), None, facts, record=True)
+        points, lengths, weights = [], [], []
+        for k in range(integrator.max_depth):
+            there = mi.UInt32(k) < count
+            v = read_vertex(store, mi.UInt32(k), there, ray.time, ray.wavelengths)
+            points.append(v.ray(v.medium.t))
+            lengths.append(dr.select(there, v.τ, dr.inf))
+            weights.append(v.β[0])
+        dr.eval(points, lengths, weights)
+    stack = [np.array(p).T for p in points], [np.array(x) for x in lengths], [np.array(x) for x in weights]
+    return [np.stack(x, axis=1) for x in stack]
+
+
+def positions_at(time, points, lengths):
+    """Where the photons of :func:`vertices` are at a time, (lanes, 3)."""
+    starts = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
+    times = np.concatenate([np.zeros_like(lengths[:, :1]), lengths], axis=1)
+    k = (times <= time).sum(1) - 1
+    lane = np.arange(len(k))
+    a, b = starts[lane, k], starts[lane, k + 1]
+    fraction = (time - times[lane, k]) / (times[lane, k + 1] - times[lane, k])
+    return a + fraction[:, None] * (b - a)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5, 0.8])
+def test_moments_of_the_random_walk(g):
+    """<z> = l (1 - exp(-t/l)) and <r^2> = 2 l t - 2 l^2 (1 - exp(-t/l)), with l the transport mean free path."""
+    μ_s = 1.3
+    objects, sensor = infinite(homogeneous(μ_s, 1.0, g), radiance_meter((0, 0, 1)))
+    scene = load(objects, sensor, max_depth=30)
+    points, lengths, _ = vertices(scene, 40_000, seed=3)
+    length = 1 / (μ_s * (1 - g))
+    for time in (0.3, 1.0, 4.0):
+        p = positions_at(time, points, lengths)
+        fall = 1 - np.exp(-time / length)
+        expected = np.array([length * fall, 2 * length * time - 2 * length**2 * fall])
+        measured = np.stack([p[:, 2], (p**2).sum(1)], axis=1)
+        result = z_test(measured, expected)
+        assert result.passed, (time, str(result))
+
+
+def test_energy_falls_with_absorption():
+    """The energy in a medium is exp(-mu_a t): throughputs at a time, averaged over all paths."""
+    objects, sensor = infinite(homogeneous(1.5, 0.6), radiance_meter((0, 0, 1)))
+    scene = load(objects, sensor, max_depth=30)
+    _, lengths, β = vertices(scene, 40_000, seed=5)
+    for time in (0.5, 2.0, 4.0):
+        # The throughput on the way to vertex k is what is left after k collisions.
+        collisions = (lengths <= time).sum(1)
+        result = z_test(0.6**collisions, np.exp(-1.5 * 0.4 * time))
+        assert result.passed, (time, str(result))
+        poisson = z_test(
+            np.stack([collisions, collisions.astype(float) ** 2], 1), [1.5 * time, 1.5 * time * (1.5 * time + 1)]
+        )
+        assert poisson.passed, (time, str(poisson))
+    first = β[:, 1] / β[:, 0]
+    np.testing.assert_allclose(first[np.isfinite(lengths[:, 1])], 0.6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
+def test_ballistic_light(kind):
+    """exp(-mu_t r) / r^2 from a point light to a wall and on to the camera, at tau = r and nowhere else."""
+    grid = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume(np.full((2, 2, 2), 0.4), -10.0, 20.0)}
+    medium = homogeneous(0.4, 0.0) if kind == "homogeneous" else grid
+    sensor = radiance_meter((0, 0, 1), bins=100, bin_width=0.1)
+    light = {"type": "point", "position": [1.5, 0, 1.0], "intensity": 3.0}
+    wall = {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(5)}
+    fog = {"type": "ref", "id": "fog"}
+    wall |= {"exterior": fog, "interior": fog, "bsdf": {"type": "diffuse", "reflectance": 0.7}}
+    objects, sensor = infinite(medium, sensor, light=light, wall=wall)
+    _, transient = runs(load(objects, sensor, max_depth=2), count=8, spp=4096)
+    leg = np.hypot(1.5, 2.0)
+    expected = 0.7 / np.pi * 3.0 * (2.0 / leg) / leg**2 * np.exp(-0.4 * (leg + 3.0))
+    histogram = transient.reshape(8, -1)
+    k = int((leg + 3.0) / 0.1)
+    assert histogram.sum() == pytest.approx(histogram[:, k].sum())
+    # A homogeneous medium still loses camera rays by chance on the way to the wall.
+    result = z_test(histogram[:, k], expected)
+    assert result.passed, str(result)
+
+
+def single_scattering(radius, cosine, μ_s, μ_t, edges):
+    """Radiance per bin of once-scattered light of an isotropic point source of unit intensity at ``radius``, seen from
+    the origin at an angle from the source: the scattering point at distance s gives the length s + d(s).
+    """
+    s = np.linspace(0, 30, 400_001)
+    s = 0.5 * (s[1:] + s[:-1])
+    d = np.sqrt(radius**2 + s**2 - 2 * radius * s * cosine)
+    value = μ_s / (4 * np.pi) * np.exp(-μ_t * (s + d)) / d**2 * (30 / 400_000)
+    return np.histogram(s + d, edges, weights=value)[0]
+
+
+def test_single_scattering_formula():
+    """The radiance above, integrated over all directions, is the energy density of Sato's formula."""
+    radius, μ_s = 1.5, 0.7
+    edges = np.linspace(2.0, 4.0, 11)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    total = sum(
+        2 * np.pi * w * single_scattering(radius, c, μ_s, μ_s, edges) for c, w in zip(nodes, weights, strict=True)
+    )
+    τ = np.linspace(2.0, 4.0, 10_001)
+    density = μ_s / (radius * τ) * np.exp(-μ_s * τ) * np.log((τ + radius) / (τ - radius))
+    expected = np.histogram(0.5 * (τ[1:] + τ[:-1]), edges, weights=0.5 * (density[1:] + density[:-1]) * (τ[1] - τ[0]))[
+        0
+    ]
+    # Four pi: the formula is for a source of unit power, this one has unit intensity.
+    np.testing.assert_allclose(total, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.5, 2.5])
+def test_single_scattering(angle):
+    radius, μ_s, μ_a = 1.5, 0.7, 0.2
+    direction = (np.sin(angle), 0, np.cos(angle))
+    sensor = radiance_meter(direction, bins=30, bin_width=0.2)
+    light = {"type": "point", "position": [0, 0, radius], "intensity": 1.0}
+    objects, sensor = infinite(homogeneous(μ_s + μ_a, μ_s / (μ_s + μ_a)), sensor, light=light)
+    _, transient = runs(load(objects, sensor, max_depth=2), count=10, spp=8192)
+    edges = np.arange(31) * 0.2
+    result = z_test(
+        transient.reshape(10, -1), single_scattering(radius, np.cos(angle), μ_s, μ_s + μ_a, edges), rounding=2e-7
+    )
+    assert result.passed, str(result)
+    assert result.entries > 15 and result.chi2_z < 4
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb"])
+def test_furnace(variant):
+    """A medium that absorbs nothing cannot be seen before a sky of one radiance. Without connections to the sky every
+    single path says so, since colours share their samples in proportion to what they carry.
+    """
+    mi.set_variant(variant)
+    grey = variant == "llvm_ad_mono"
+    σ_t = 0.7 if grey else rgb(0.2, 0.9, 0.5)
+    medium = homogeneous(σ_t, 1.0, 0.6, scale=3.0, sample_emitters=False)
+    objects = {
+        "sky": {"type": "constant", "radiance": 1.0},
+        "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium},
+    }
+    scene = load(objects, max_depth=-1)
+    steady, _ = runs(scene, count=2, spp=64)
+    # One channel, or the mean of all, without any noise.
+    np.testing.assert_allclose(steady.mean(-1), 1.0, rtol=2e-5)
+    connected = load(
+        objects | {"ball": objects["ball"] | {"interior": medium | {"sample_emitters": True}}}, max_depth=-1
+    )
+    steady, _ = runs(connected, count=8, spp=64)
+    result = z_test(steady, 1.0, rounding=1e-5)
+    assert result.passed, str(result)

@@ -1,0 +1,297 @@
+"""`gated_hdr_film`, and histograms without a steady image: weights, adjoint, renders against full ones, torch."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient import plugins
+from torchtransient.data.result_file import read_result, write_result
+from torchtransient.errors import GradientError, SceneError
+from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
+from torchtransient.testing.statistics import two_sample_z_test
+
+VARIANT = "llvm_ad_rgb"
+START = 2.0
+SMOOTH = "gaussian 6 0.7; tabulated 5:0 5.3:1 7.5:0.2 8:0; gaussian 11 0.2"
+SETS = {
+    "one": "rectangular 4 6.5",
+    "overlapping": SMOOTH,
+    "with gaps": "rectangular 3 3.5; rectangular 9 9.01; gaussian 20 1",
+    "a sweep": "; ".join(f"tabulated {k * 0.3}:0 {k * 0.3 + 0.4}:1 {k * 0.3 + 0.8}:0" for k in range(60)),
+}
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant(VARIANT)
+    plugins.sync()
+
+
+def make_film(gates, **arguments):
+    node = {"type": "gated_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"}, "gates": gates}
+    with plugins.plugin_errors():
+        return mi.load_dict({**node, "start_opl": START, **arguments})
+
+
+def arrivals(n=700):
+    return np.random.default_rng(4).uniform(-1, 25, n)
+
+
+def expected(film, x):
+    return np.stack([gate.value(x) for gate in film.gates], axis=1)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_weights_are_those_of_the_gates(name):
+    film, x = make_film(SETS[name]), arrivals()
+    size = film.entries_per_pixel()
+    cube = dr.zeros(mi.Float, len(x) * size)
+    value = [mi.Float(1), mi.Float(2), mi.Float(-1)]
+    film.put(cube, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), value, mi.Bool(x < 22))
+    got = np.array(cube, dtype=float).reshape(len(x), -1, 3)
+    want = expected(film, x) * (x < 22)[:, None]
+    np.testing.assert_allclose(got[..., 0], want, atol=1e-4)
+    np.testing.assert_allclose(got, got[..., :1] * np.array([1, 2, -1]), atol=1e-6)
+    assert want.max() > 0.5
+
+
+@pytest.mark.parametrize("steady", [False, True])
+@pytest.mark.parametrize("layout", ["film", "channels first"])
+@pytest.mark.parametrize("name", SETS)
+def test_read_is_the_transpose_of_put(name, layout, steady):
+    film, x = make_film(SETS[name]), arrivals()
+    rng, pixels, gates = np.random.default_rng(1), 5, film.gate_count()
+    n = len(x)
+    pixel, value = rng.integers(0, pixels, n), rng.normal(size=(3, n))
+    g, g_steady = rng.normal(size=(pixels, gates, 3)), rng.normal(size=(pixels, 3)) * steady
+    active, opl = mi.Bool(rng.random(n) > 0.1), mi.Float64(x - START)
+    cube = dr.zeros(mi.Float, pixels * gates * 3)
+    film.put(cube, mi.UInt32(pixel) * (gates * 3), opl, [mi.Float(v) for v in value], active)
+    if layout == "film":
+        adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (gates * 3)
+    else:
+        adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, gates * pixels), mi.UInt32(pixel)
+    A, _ = film.read(adjoint, base, opl, active, [mi.Float(g_steady[pixel, c]) for c in range(3)] if steady else None)
+    stored = np.array(cube, dtype=float).reshape(g.shape)
+    total = (stored * (g + g_steady[:, None])).sum()
+    read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
+    assert abs(total - read) < 2e-6 * np.abs(stored * g).sum()
+
+
+def test_slopes():
+    film, x = make_film(SMOOTH), arrivals()
+    assert film.has_slope and not make_film(SETS["one"]).has_slope
+    g = np.random.default_rng(2).normal(size=(3, 3))
+    adjoint, h = (mi.Float(g.ravel()), 3, 1), 1e-3
+
+    def read(shift):
+        return film.read(adjoint, mi.UInt32(0), mi.Float64(x - START + shift), mi.Bool(True))
+
+    _, slope = read(0.0)
+    difference = (np.array(read(h)[0][1]) - np.array(read(-h)[0][1])) / (2 * h)
+    error = np.abs(np.array(slope[1]) - difference)
+    # but for the few arrivals at a kink
+    assert np.sort(error)[-8] < 0.03 * np.abs(difference).max()
+    df, fdtau = np.random.default_rng(3).normal(size=(2, 3, len(x)))
+    cube = dr.zeros(mi.Float, 9)
+    lists = [mi.Float(v) for v in df], [mi.Float(v) for v in fdtau]
+    film.put_slope(cube, mi.UInt32(0), mi.Float64(x - START), *lists, mi.Bool(True))
+    A, slope = read(0.0)
+    want = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * fdtau[c]).sum() for c in range(3))
+    assert (np.array(cube).reshape(3, 3) * g).sum() == pytest.approx(want, rel=1e-4)
+
+
+def test_a_pulse_opens_a_gate_softly():
+    film = make_film("rectangular 6 7", pulse="gaussian", pulse_fwhm_opl=0.2)
+    assert film.has_slope
+    size = film.entries_per_pixel()
+    x = np.array([5.9, 6.0, 6.1, 6.5, 7.0])
+    cube = dr.zeros(mi.Float, len(x) * size)
+    film.put(cube, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), [mi.Float(1)] * 3, mi.Bool(True))
+    weights = np.array(cube).reshape(len(x), 3)[:, 0]
+    # half maximum of the density is at 1.177 standard deviations
+    np.testing.assert_allclose(weights, [0.1195, 0.5, 0.8805, 1.0, 0.5], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [({"gates": "round 1 2"}, "kind out of"), ({"gates": "rectangular 2 1"}, "start before")],
+)
+def test_errors(arguments, message):
+    with pytest.raises(SceneError, match=message):
+        make_film(**arguments)
+
+
+def test_gates_are_needed():
+    with pytest.raises(SceneError, match="expected gates"), plugins.plugin_errors():
+        mi.load_dict({"type": "gated_hdr_film"})
+
+
+# ------------------------------------------------------------------------------------------------ in renders
+
+GATES = (tt.Gate.gaussian(8.0, 0.2), tt.Gate.tabulated([8.2, 8.3, 9.5], [0, 1, 0]), tt.Gate.rectangular(9.0, 10.0))
+FINE = tt.TimeAxis(7.0, 0.005, 700)
+
+
+def mirrored():
+    """The small room with a second wall, so that some light takes a long way."""
+    room = make_room()
+    room["integrator"]["max_depth"] = 6
+    room["integrator"]["rr_depth"] = 100
+    room["back"] = {**make_room()["wall"], "to_world": np.diag([-4.0, 4.0, -4.0, 1.0])}
+    room["back"]["to_world"][2, 3] = 5.0
+    return room
+
+
+def runs(renderer, count=8):
+    outs = [renderer(seed=k) for k in range(count)]
+    return [torch.stack([getattr(out, name) for out in outs]).double().numpy() for name in ("transient", "steady")]
+
+
+def test_gated_render_is_the_full_one_gated_afterwards():
+    scene = tt.load(mirrored(), variant=VARIANT)
+    gated, steady = runs(tt.TransientRenderer(scene, gates=GATES, spp=512))
+    full, _ = runs(tt.TransientRenderer(scene, time_axis=FINE, spp=512))
+    profiles = np.stack([gate.value(FINE.centers_opl) for gate in GATES])
+    afterwards = np.einsum("kcthw,gt->kcghw", full, profiles)
+    result = two_sample_z_test(gated.mean((-1, -2)), afterwards.mean((-1, -2)), rounding=2e-3 * afterwards.max())
+    assert result.passed and gated.shape == (8, 3, 3, 3, 4), str(result)
+    assert np.all(gated.mean((0, 1, 3, 4)) > 0)
+    np.testing.assert_allclose(steady, gated.sum(2), rtol=1e-5)
+
+
+def test_a_histogram_without_steady_image():
+    scene = tt.load(mirrored(), variant=VARIANT)
+    axis = tt.TimeAxis(8.0, 0.1, 12)
+    cut, steady = runs(tt.TransientRenderer(scene, time_axis=axis, spp=512, steady=False))
+    full, complete = runs(tt.TransientRenderer(scene, time_axis=axis, spp=512))
+    # the same paths, some of them shorter
+    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
+    assert full.mean() > 0
+    np.testing.assert_allclose(steady, cut.sum(2), rtol=1e-5)
+    # there is light that the window misses, and the cut render does not speak of it
+    assert complete.mean() > 1.05 * steady.mean()
+
+
+@pytest.mark.parametrize("name, stddev", [("tent", 0.5), ("gaussian", 2.0)])
+def test_cut_windows_keep_what_filters_spread_into_them(name, stddev):
+    room = mirrored()
+    room["integrator"]["gaussian_stddev"] = stddev
+    scene = tt.load(room, variant=VARIANT)
+    axis = tt.TimeAxis(8.0, 0.1, 12)
+    settings = {"time_axis": axis, "spp": 512, "temporal_filter": name}
+    cut, _ = runs(tt.TransientRenderer(scene, steady=False, **settings))
+    full, _ = runs(tt.TransientRenderer(scene, **settings))
+    # the same paths, some of them shorter
+    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
+    assert full.mean() > 0
+
+
+def test_cut_windows_with_a_pulse():
+    scene = tt.load(mirrored(), variant=VARIANT)
+    settings = {"time_axis": tt.TimeAxis(8.5, 0.1, 8), "spp": 512, "pulse": tt.Pulse.gaussian(0.8, 0.3)}
+    cut, _ = runs(tt.TransientRenderer(scene, steady=False, **settings))
+    full, _ = runs(tt.TransientRenderer(scene, **settings))
+    # the same paths, some of them shorter
+    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
+    assert full.mean() > 0
+
+
+def test_derivatives_through_torch():
+    scene = tt.load(mirrored(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[GREY], gates=GATES[:2], spp=256, grad_seed="same")
+    weights = torch.tensor([1.0, -0.5])
+
+    def loss(value):
+        out = renderer({GREY: value}, seed=3)
+        return ((out.transient.sum((0, 2, 3)) * weights).sum() + 0.3 * out.steady.sum()).double()
+
+    x = renderer.values[GREY].detach()
+    gradient = torch.autograd.functional.jacobian(loss, x)
+    tangent = torch.ones_like(x)
+    forward = torch.func.jvp(loss, (x,), (tangent,))[1]
+    torch.testing.assert_close(forward, (gradient * tangent).sum().double(), rtol=1e-4, atol=0)
+    h = 0.02
+    difference = (loss(x + h * tangent) - loss(x - h * tangent)) / (2 * h)
+    assert float(forward) == pytest.approx(float(difference), rel=0.03)
+
+
+def test_a_rectangular_gate_has_no_derivative_in_time():
+    renderer = tt.TransientRenderer(
+        tt.load(make_room(), variant=VARIANT), parameters=[WALL_POSE], gates=[tt.Gate.rectangular(7, 8)], spp=4
+    )
+    with pytest.raises(GradientError, match=r"rectangular gate.*rise from zero"):
+        renderer(seed=0).transient.sum().backward()
+
+
+def test_output_and_file(tmp_path):
+    scene = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, gates=GATES, spp=4)
+    out = renderer(seed=0)
+    assert out.axis is None and out.phasor is None and out.gates == GATES
+    assert out.transient.shape == (3, 3, 3, 4) and "gates=3" in repr(renderer)
+    assert out.stats.energy_before == out.stats.energy_after == (0.0,)
+    for name in ("a.h5", "a.npz"):
+        back = read_result(write_result(tmp_path / name, out))
+        assert back.gates == GATES and back.axis is None and torch.equal(back.transient, out.transient)
+
+
+def test_arguments():
+    scene = tt.load(make_room(), variant=VARIANT)
+    with pytest.raises(SceneError, match="give one of them"):
+        tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
+    with pytest.raises(SceneError, match=r"tt\.Gate objects"):
+        tt.TransientRenderer(scene, gates=[3.0])
+    with pytest.raises(SceneError, match="steady=False"):
+        tt.TransientRenderer(scene, gates=GATES, steady=False)
+    with pytest.raises(SceneError, match="gated film has none"):
+        tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")
+    pulsed = tt.load({**make_room(), "sensor": {**make_room()["sensor"], "film": _pulsed()}}, variant=VARIANT)
+    with pytest.raises(SceneError, match="would lose"):
+        tt.TransientRenderer(pulsed, frequencies=[1.0])
+    assert tt.TransientRenderer(pulsed, gates=GATES, spp=1)(seed=0).gates == GATES
+
+
+def _pulsed():
+    return {**make_room()["sensor"]["film"], "pulse": "gaussian", "pulse_fwhm_opl": 0.2}
+
+
+@pytest.mark.parametrize("kind", ["area light", "glass", "sky"])
+def test_pruning_leaves_every_counted_event(kind):
+    """Paths that cannot reach a light in time end early; what is left is the full render, path by path."""
+    room = mirrored()
+    if kind == "glass":
+        room["box"]["bsdf"] = {"type": "diff_dielectric", "int_ior": 1.2, "ext_ior": 1.5}
+    elif kind == "area light":
+        pose = np.diag([0.3, 0.3, -0.3, 1.0])
+        pose[:3, 3] = -0.5, 0.25, 4.0
+        room["light"] = {
+            "type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 9}}
+        }  # fmt: skip
+    else:
+        room["light"] = {"type": "constant"}
+    scene = tt.load(room, variant=VARIANT)
+    axis = tt.TimeAxis(8.5, 0.1, 30) if kind == "sky" else tt.TimeAxis(7.5, 0.1, 15)
+    cut, _ = runs(tt.TransientRenderer(scene, time_axis=axis, spp=256, steady=False), 2)
+    full, _ = runs(tt.TransientRenderer(scene, time_axis=axis, spp=256), 2)
+    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
+    assert np.count_nonzero(full.sum((0, 1, 3, 4))) > 10
+
+
+def test_light_box():
+    with mi.variant_context(VARIANT):
+        plugins.sync()
+        lamp = {"type": "sphere", "center": [0, 0, 3], "radius": 0.5, "emitter": {"type": "area"}}
+        scene = mi.load_dict({"type": "scene", "lamp": lamp, "spot": {"type": "point", "position": [2, 0, 3]}})
+        p = mi.Point3f([0, 1, -1, 4], [0, 0, 0, 4], [0, 3, 3, 3])
+        box = LightBox.of(scene, [])
+        np.testing.assert_allclose(box.distance(p), [2.5, 0, 0.5, np.hypot(2, 3.5)], rtol=2e-5)
+        glass = mi.load_dict({"type": "dielectric"})
+        assert LightBox.of(scene, [glass]) is None
+        assert LightBox.of(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None

@@ -1,0 +1,167 @@
+"""Every sensing module keeps the same promises; a module inherits these tests by one entry."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import entries_cameras
+import entries_counting
+import pytest
+import torch
+from contract import LOOSE, expected, parts, pickled, through_state_dict
+
+from torchtransient.sensing import ScoreFunction
+
+ENTRIES = [*entries_counting.ENTRIES, *entries_cameras.ENTRIES]
+each = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: e.name)
+each_random = pytest.mark.parametrize("entry", [e for e in ENTRIES if e.random], ids=lambda e: e.name)
+each_policy = pytest.mark.parametrize(
+    "entry, policy", [(e, p) for e in ENTRIES if e.random for p in e.policies], ids=lambda v: getattr(v, "name", v)
+)
+
+
+def test_names_are_unique():
+    names = [e.name for e in ENTRIES]
+    assert len(names) == len(set(names))
+
+
+@each
+def test_batch_invariance(entry):
+    module, x = entry.module(), entry.x()
+    whole = parts(expected(module, x))
+    for i in range(x.shape[0]):
+        for together, alone in zip(whole, parts(expected(module, x[i])), strict=True):
+            torch.testing.assert_close(together[i], alone, rtol=1e-10, atol=1e-12)
+
+
+@each
+def test_dtype_and_device_are_kept(entry):
+    reference = parts(expected(entry.module(), entry.x()))
+    for dtype in entry.dtypes:
+        found = parts(expected(entry.module(dtype), entry.x(dtype)))
+        for value, exact in zip(found, reference, strict=True):
+            assert value.device == exact.device
+            assert value.dtype == (dtype.to_complex() if exact.is_complex() else dtype)
+            error = (value.to(exact.dtype) - exact).abs().max()
+            assert error <= LOOSE[dtype] * (exact.abs().max() + 1e-12)
+
+
+@each
+def test_buffers_move_with_the_module(entry):
+    module = entry.module().to("meta")
+    assert all(t.is_meta for t in [*module.parameters(), *module.buffers()])
+
+
+@pytest.mark.gpu
+@each
+def test_cuda_gives_the_same(entry):
+    x = entry.x()
+    reference = parts(expected(entry.module(), x))
+    module = entry.module().cuda()
+    for value, exact in zip(parts(expected(module, x.cuda())), reference, strict=True):
+        assert value.is_cuda
+        torch.testing.assert_close(value.cpu(), exact, rtol=1e-9, atol=1e-10)
+    with torch.no_grad():
+        for value in parts(module(x.cuda(), generator=torch.Generator("cuda").manual_seed(0))):
+            assert value.is_cuda
+
+
+@each
+def test_gradcheck_of_the_expectation(entry):
+    module, x = entry.module(), entry.x()[:1].requires_grad_()
+    learnable = [p for p in module.parameters() if p.requires_grad]
+
+    def f(x, *_):
+        return tuple(p for p in parts(expected(module, x)) if p.is_floating_point() or p.is_complex())
+
+    assert torch.autograd.gradcheck(f, (x, *learnable), atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True)
+
+
+@each
+def test_non_contiguous_input(entry):
+    module, x = entry.module(), entry.x()
+    strided = x.movedim(-3, -1).contiguous().movedim(-1, -3)
+    assert not strided.is_contiguous()
+    for a, b in zip(parts(expected(module, x)), parts(expected(module, strided)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+@each
+def test_input_is_left_alone(entry):
+    module, x = entry.module(), entry.x()
+    before = x.clone()
+    module(x, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(x, before)
+
+
+@each
+def test_copies_give_the_same(entry):
+    module, x = entry.module(), entry.x()
+    wanted = parts(expected(module, x))
+    for copy in (deepcopy(module), pickled(module), through_state_dict(entry, module)):
+        for a, b in zip(wanted, parts(expected(copy, x)), strict=True):
+            assert torch.equal(a, b)
+    assert repr(module)
+
+
+@pytest.mark.parametrize("entry", [e for e in ENTRIES if e.conserves], ids=lambda e: e.name)
+def test_conservation(entry):
+    module, x = entry.module(), entry.x()
+    torch.testing.assert_close(
+        entry.conserves(parts(expected(module, x))[0]), entry.conserves(x), rtol=1e-9, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "call, error", [pytest.param(*pair, id=f"{e.name}-{i}") for e in ENTRIES for i, pair in enumerate(e.errors)]
+)
+def test_errors(call, error):
+    with pytest.raises(error, match=r"\w+: .*(expected|needs|not supported).*"):
+        call()
+
+
+@each_policy
+def test_generator_reproduces(entry, policy):
+    module, x = entry.module(grad=policy), entry.x()
+
+    def draw(seed):
+        with ScoreFunction():
+            return parts(module(x, generator=torch.Generator().manual_seed(seed)))
+
+    for a, b, c in zip(draw(5), draw(5), draw(6), strict=True):
+        assert torch.equal(a, b)
+        assert torch.equal(a, c) == (policy == "expected")
+    with torch.no_grad():
+        torch.manual_seed(3)
+        first = parts(module(x))
+        torch.manual_seed(3)
+        assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
+
+
+@each_random
+def test_mean_and_dtype_of_samples(entry):
+    """The mean of many draws is the expectation, within 5 standard errors everywhere (and rounding)."""
+    module = entry.module()
+    x = entry.x()[:1]
+    g = torch.Generator().manual_seed(11)
+    draws = module.sample(x.expand(2000, *x.shape[1:]), g)
+    exact = parts(expected(module, x))
+    for values, mean in zip(parts(draws), exact, strict=True):
+        assert values.dtype == mean.dtype
+        assert not values.requires_grad
+        error = (values.mean(0) - mean[0]).abs()
+        standard_error = values.std(0) / 2000**0.5
+        assert bool((error <= 5 * standard_error + 0.004).all())
+
+
+@each_policy
+def test_gradients_are_finite_at_zero(entry, policy):
+    module = entry.module(grad=policy)
+    x = torch.zeros(entry.shape, dtype=torch.float64, requires_grad=True)
+    with ScoreFunction() as score:
+        (y, *_) = parts(module(x, generator=torch.Generator().manual_seed(0)))
+        loss = y.square().sum()
+    if policy == "score":
+        loss = score.surrogate(loss)
+    loss.backward()
+    assert x.grad is not None and bool(torch.isfinite(x.grad).all())

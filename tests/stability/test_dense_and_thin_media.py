@@ -1,0 +1,158 @@
+"""Hard case: media so dense that their transmittance underflows, so thin that hardly anything collides, black ones,
+phase functions that are almost delta functions, and grids of no density at all.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from media_scenes import block, camera, clouds, film, homogeneous, load, runs, volume
+
+from torchtransient.testing.statistics import z_test
+
+VARIANT = "llvm_ad_mono"
+
+
+def meter():
+    return {"type": "radiancemeter", "origin": [0, 0, 4], "direction": [0, 0, -1], "film": film(1, 1, filter="tent")}
+
+
+def loss_weights(shape):
+    return np.broadcast_to(np.sin(0.3 * np.arange(shape[2]))[:, None], shape)
+
+
+def value(scene, seed, spp):
+    _, transient = scene.integrator().render(scene, seed=seed, spp=spp)
+    transient = np.array(transient, dtype=float)
+    return (transient * loss_weights(transient.shape)).sum()
+
+
+def gradient(scene, key, seed, spp):
+    """Reverse mode: the derivative of :func:`value` by a parameter."""
+    params = mi.traverse(scene)
+    leaf = params[key]
+    dr.enable_grad(leaf)
+    params[key] = leaf
+    params.update()
+    adjoint = loss_weights(scene.sensors()[0].film().cube_shape()).astype(np.float32)
+    scene.integrator().render_backward(scene, params, (None, mi.TensorXf(adjoint)), seed=seed, spp=spp)
+    result = np.array(dr.grad(params[key]), dtype=float)
+    dr.disable_grad(params[key])
+    return result
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "null"}, {"type": "diff_rough_dielectric", "alpha": 0.3}])
+@pytest.mark.parametrize("sigma_t", [100.0, 1e4])
+def test_dense(sigma_t, bsdf):
+    """Optical depths of 200 and 20000: transmittances are zero in single precision, which must stay a number."""
+    scene = load(block(homogeneous(sigma_t, 0.9), bsdf), camera(bins=60, filter="tent"))
+    steady, transient = runs(scene, count=2, spp=64)
+    assert np.isfinite(steady).all() and np.isfinite(transient).all() and steady.sum() > 0
+    for key in ("sigma_t.value.value", "albedo.value.value"):
+        assert np.isfinite(gradient(scene, f"block.interior_medium.{key}", 1, 64)).all()
+
+
+def test_dense_absorber_is_black():
+    scene = load(block(homogeneous(1e3, 0.0)), camera(bins=60))
+    steady, transient = runs(scene, count=2, spp=64)
+    through = steady[:, 1:3, 1:3]
+    assert through.max() == 0 and transient[:, 1:3, 1:3].max() == 0
+
+
+@pytest.mark.parametrize("sigma_t", [0.0, 1e-12, 1e-6])
+def test_thin(sigma_t):
+    """A medium of no density is air, in time and in brightness."""
+    _, a = runs(load(block(homogeneous(sigma_t, 0.9)), camera()), count=8)
+    air = block(homogeneous())
+    del air["block"]
+    _, b = runs(load(air, camera(), integrator="transient_path"), count=8, seed=50)
+    result = z_test(a.sum((1, 2, 3)), b.sum((1, 2, 3)).mean(0), rounding=3 * b.sum((1, 2, 3)).std() / np.sqrt(8))
+    assert result.passed, str(result)
+    lit = [x.sum((0, 1, 2, 4)) > 0 for x in (a, b)]
+    assert np.array_equal(*[np.flatnonzero(x)[[0, -1]] for x in lit])
+
+
+@pytest.mark.parametrize("grid", [None, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 1.0))])
+def test_gradient_by_a_density_of_zero(grid):
+    """The first medium to come: one-sided differences of second order, since there is nothing on the other side."""
+
+    def scene(density):
+        if grid is None:
+            return load(block(homogeneous(density, 0.9)), meter(), max_depth=4)
+        # Among empty cells there may be dense ones, which set the rate of collisions.
+        cells = np.zeros((3, 3, 3))
+        cells[::2, :, 1] = grid
+        cloud = clouds(sigma_t=volume(cells + density), scale=1.0, albedo=0.9)
+        return load(block(cloud), meter(), max_depth=4)
+
+    key = "block.interior_medium.sigma_t." + ("value.value" if grid is None else "data")
+    empty = scene(0.0)
+    reverse = np.array([gradient(empty, key, 10 + seed, 1 << 14).sum() for seed in range(6)])
+    h, seeds = 0.02, range(8)
+    steps = [[value(s, seed, 1 << 17) for seed in seeds] for s in (empty, scene(h), scene(2 * h))]
+    at = np.array(steps)
+    differences = (-3 * at[0] + 4 * at[1] - at[2]) / (2 * h)
+    error = np.sqrt(reverse.var(ddof=1) / 6 + differences.var(ddof=1) / 8)
+    assert abs(reverse.mean() - differences.mean()) < 3 * error
+    assert error < 0.15 * abs(differences.mean())
+
+
+def test_gradients_of_an_empty_grid_reach_every_cell():
+    cloud = clouds(sigma_t=volume(np.zeros((3, 3, 3))), scale=1.0)
+    scene = load(block(cloud), camera(filter="tent"))
+    derivative = gradient(scene, "block.interior_medium.sigma_t.data", 3, 256)
+    assert np.isfinite(derivative).all() and (derivative != 0).all()
+
+
+@pytest.mark.parametrize("albedo", [0.0, 1e-8])
+def test_black_medium(albedo):
+    """Black scattering is silent and its derivative is not: once-scattered light per unit of albedo."""
+    sensor = {**meter(), "medium": {"type": "ref", "id": "fog"}}
+    light = {"type": "point", "position": [0, 1, 2], "intensity": 10.0}
+
+    def fog(value):
+        return load({"fog": homogeneous(0.5, value), "light": light}, sensor, max_depth=2)
+
+    key = "sensor.medium.albedo.value.value"
+    reverse = np.array([gradient(fog(albedo), key, seed, 4096).sum() for seed in range(6)])
+    # Single scattering is linear in the albedo.
+    grey = np.array([value(fog(0.5), 20 + seed, 4096) / 0.5 for seed in range(6)])
+    error = np.sqrt((reverse.var(ddof=1) + grey.var(ddof=1)) / 6)
+    assert abs(reverse.mean() - grey.mean()) < 3 * error
+    assert error < 0.1 * abs(grey.mean())
+
+
+@pytest.mark.parametrize("g", [0.999, -0.999, 0.99999, -0.99999])
+def test_narrow_phase_functions(g):
+    """Almost a delta function forwards or backwards: numbers, and in a furnace the right ones."""
+    objects = {
+        "sky": {"type": "constant", "radiance": 1.0},
+        "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": homogeneous(2.0, 1.0, g)},
+    }
+    scene = load(objects, camera(bins=60, filter="tent"), max_depth=60)
+    steady, transient = runs(scene, count=6, spp=256)
+    assert np.isfinite(transient).all()
+    result = z_test(steady.mean((1, 2)), 1.0, rounding=2e-3)
+    assert result.passed, str(result)
+    assert np.isfinite(gradient(scene, "ball.interior_medium.phase_function.g", 1, 64)).all()
+
+
+def test_grid_that_touches_its_majorant():
+    """Where the density is the majorant, nothing is let through by chance and the derivative is still there."""
+    density = np.zeros((2, 2, 2))
+    density[:, :, 1] = 1.0
+    cloud = clouds(sigma_t=volume(density) | {"filter_type": "nearest"}, scale=1.0, albedo=0.0)
+    objects = block(cloud)
+    objects["floor"]["emitter"] = {"type": "area", "radiance": 1.0}
+    del objects["lamp"]
+    ray = {"origin": [0.5, 0.3, 4], "direction": [0, 0, -1]}
+    scene = load(objects, {"type": "radiancemeter", **ray, "film": film(1, 1, bins=80, filter="tent")}, max_depth=2)
+    params = mi.traverse(scene)
+    key = "block.interior_medium.sigma_t.data"
+    dr.enable_grad(params[key])
+    params.update()
+    adjoint = mi.TensorXf(np.ones(scene.sensors()[0].film().cube_shape(), dtype=np.float32))
+    scene.integrator().render_backward(scene, params, (None, adjoint), seed=1, spp=1 << 14)
+    derivative = np.array(dr.grad(params[key])).reshape(-1)
+    # Two cells are crossed, each over a length of one.
+    assert derivative.sum() == pytest.approx(-2 * np.exp(-2.0), rel=0.08)

@@ -1,0 +1,180 @@
+"""Gradients through matrices that have no inverse: depolarisers, polarizers, absorbers, and frames that coincide."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from gradient_cases import Case, Problem, film, move, room, rotate, set_color, transform
+
+VARIANT = "llvm_ad_mono_polarized"
+
+
+def problem(scene, apply, value, step=0.05, spp=256):
+    return Problem(Case("singular", "", scene, apply, value, step, VARIANT, spp=spp, fd_spp=spp))
+
+
+def check(p, seeds=(1, 2), rel=3e-3, smallest=1e-4):
+    """Reverse and forward mode against central differences with Richardson's correction, on the same paths."""
+    h, x = p.case.step, p.case.value
+    for seed in seeds:
+        near, far = ((p.loss(x + s, seed) - p.loss(x - s, seed)) / (2 * s) for s in (h / 2, h))
+        expected = (4 * near - far) / 3
+        assert abs(expected) > smallest
+        assert p.reverse(seed) == pytest.approx(expected, rel=rel)
+        assert p.forward(seed) == pytest.approx(expected, rel=rel)
+
+
+def bench(*elements, lamp_angle=0.0):
+    """Thin elements square to the parallel rays of an orthographic camera, before a diffuse wall that a lamp lights.
+
+    Every direction is the normal, every frame coincides with the next one or is turned by the angle of an element.
+    """
+    scene = room(sensor={
+        "type": "orthographic",
+        "to_world": transform().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]).scale(0.2),
+        "film": film(size=2, start=6.0),
+    })  # fmt: skip
+    scene["wall"]["to_world"] = transform().scale(3)
+    scene["light"]["position"] = [1.5, 0.0, 2.0]
+    for number, element in enumerate(elements):
+        place = transform().translate([0, 0, 2.0 + 0.5 * number]).scale(0.5)
+        scene[f"element_{number}"] = {"type": "rectangle", "to_world": place, "bsdf": element}
+    return scene
+
+
+def polarizer(angle):
+    return {"type": "diff_polarizer", "theta": angle}
+
+
+@pytest.mark.parametrize("albedo", [0.0, 1e-8, 0.5])
+def test_albedo_behind_two_polarizers(albedo):
+    """Guards against the light beyond a vertex being recovered by an inverse matrix: a diffuse wall forgets the
+    polarization and a polarizer half of the light, neither can be undone. At albedo zero nothing is left at all.
+    """
+
+    def scene():
+        parts = bench(polarizer(10.0), polarizer(50.0))
+        parts["wall"]["bsdf"] = {"type": "diffuse", "reflectance": albedo}
+        return parts
+
+    check(problem(scene, set_color("wall.bsdf.reflectance.value"), albedo))
+
+
+@pytest.mark.parametrize("angle", [0.0, 45.0, 90.0, 30.0])
+def test_angle_of_a_polarizer_in_a_chain(angle):
+    """Guards against NaN where two frames coincide (0 and 90 degrees, at normal incidence) and against stopping at a
+    product that is zero: between crossed polarizers the middle one decides whether there is light.
+    """
+    scene = lambda: bench(polarizer(0.0), polarizer(angle), polarizer(90.0))  # noqa: E731
+    p = problem(scene, set_color("element_1.bsdf.theta.value"), angle, step=2.0)
+    if angle in (0.0, 90.0, 45.0):
+        # The light goes as sin(2 theta)^2: no slope at these angles, but a finite number.
+        for mode in (p.reverse, p.forward):
+            assert mode(1) == pytest.approx(0, abs=2e-6)
+    else:
+        check(p, smallest=1e-5)
+
+
+@pytest.mark.parametrize("theta", [0.0, 90.0])
+def test_last_polarizer_before_the_camera(theta):
+    """S2 has its steepest slope by the angle where S1 has none, with all frames in line."""
+    check(problem(lambda: bench(polarizer(theta)), set_color("element_0.bsdf.theta.value"), theta, step=2.0), rel=5e-3)
+
+
+@pytest.mark.parametrize("delta", [0.0, 90.0, 180.0])
+def test_delay_of_a_wave_plate(delta):
+    plate = {"type": "diff_retarder", "theta": 45.0, "delta": delta}
+    scene = lambda: bench(polarizer(0.0), plate)  # noqa: E731
+    check(problem(scene, set_color("element_1.bsdf.delta.value"), delta, step=2.0), smallest=1e-5)
+
+
+def mirror_square_to_the_rays(bsdf):
+    """An orthographic camera looks straight into a mirror beside itself: exactly normal incidence."""
+    scene = bench()
+    scene["wall"]["bsdf"] = bsdf
+    scene["behind"] = {
+        "type": "rectangle",
+        "to_world": transform().translate([0, 0, 5]).rotate([0, 1, 0], 180).scale(3),
+        "bsdf": {"type": "diffuse", "reflectance": 0.5},
+    }
+    scene["sensor"]["film"]["start_opl"] = 11.0
+    del scene["side"]
+    return scene
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "diff_conductor", "eta": 0.5, "k": 2.0},
+        {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+    ],
+    ids=lambda b: b["type"],
+)
+@pytest.mark.parametrize(
+    ("apply", "step"), [(move("wall.to_world", (0, 0, 1)), 4e-3), (rotate("wall.to_world", (0, 1, 0)), 0.1)]
+)
+def test_mirror_at_normal_incidence(bsdf, apply, step):
+    """Guards against the plane of incidence that a ray along the normal does not have."""
+    p = problem(lambda: mirror_square_to_the_rays(bsdf), apply, 0.0, step=step, spp=4096)
+    reverse = np.array([p.reverse(s) for s in range(8)])
+    forward = np.array([p.forward(s) for s in range(2)])
+    differences = np.array([(p.loss(step, s) - p.loss(-step, s)) / (2 * step) for s in range(8)])
+    assert np.isfinite(reverse).all() and np.isfinite(forward).all()
+    np.testing.assert_allclose(forward, reverse[:2], rtol=2e-3)
+    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / 8)
+    assert abs(reverse.mean() - differences.mean()) < 3 * error
+    assert error < 0.15 * abs(differences.mean())
+
+
+@pytest.mark.parametrize("index", [1.0, 1.0 + 1e-6, 1.5])
+@pytest.mark.parametrize("angle_deg", [0.0, 33.690068, 41.810315, 56.309932, 89.9])
+def test_interface_matrices_are_finite(index, angle_deg):
+    """Guards against sqrt'(0) at Brewster's angle and at the critical angle, and against 0 / 0 without an interface."""
+    import drjit as dr
+
+    mi.set_variant(VARIANT)
+    from torchtransient import plugins
+
+    plugins.sync()
+    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": index, "ext_ior": 1.0})
+    params = mi.traverse(bsdf)
+    theta = np.radians(angle_deg)
+    for side in (1, -1):
+        for lobe in (1e-6, 1 - 1e-6):
+            eta = mi.Float(index)
+            dr.enable_grad(eta)
+            params["eta"] = eta
+            params.update()
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            wi = mi.Vector3f(float(np.sin(theta)), 0.0, float(side * np.cos(theta)))
+            dr.enable_grad(wi)
+            si.wi, si.sh_frame = wi, mi.Frame3f(mi.Normal3f(0, 0, 1))
+            _, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(lobe), mi.Point2f(0.5), True)
+            total = sum(weight[i, j][0] * (1 + i - 0.3 * j) for i in range(4) for j in range(4))
+            dr.backward(total, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            for value in (total, dr.grad(eta), *dr.grad(wi)):
+                assert np.isfinite(np.array(value)).all()
+
+
+def test_black_and_clear():
+    """A wall behind an element that lets nothing through has no gradient, one in front of it has, both finite."""
+    blocked = bench({"type": "diff_polarizer", "theta": 0.0, "transmittance": 0.0})
+    p = problem(lambda: blocked, set_color("wall.bsdf.reflectance.value"), 0.5)
+    assert p.reverse(1) == 0 and p.forward(1) == 0
+    p = problem(lambda: blocked, set_color("element_0.bsdf.transmittance.value"), 0.0)
+    check(p)
+
+
+def test_camera_rolls_before_a_polarizer():
+    """The sensor's own frame turns: S1 and S2 change into each other at twice the angle. Rays along the normal of
+    everything, where a rotation has no other effect.
+    """
+    scene = lambda: bench(polarizer(0.0))  # noqa: E731
+    p = problem(scene, rotate("sensor.to_world", (0, 0, 1)), 0.0, step=2.0, spp=1024)
+    reverse = np.array([p.reverse(s) for s in range(8)])
+    differences = np.array([(p.loss(2.0, s) - p.loss(-2.0, s)) / 4 for s in range(8)])
+    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / 8)
+    assert abs(reverse.mean() - differences.mean()) < 3 * error
+    assert error < 0.15 * abs(differences.mean())
+    np.testing.assert_allclose([p.forward(s) for s in range(2)], reverse[:2], rtol=2e-3)

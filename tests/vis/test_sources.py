@@ -1,0 +1,111 @@
+"""Arrays, results and files: the same picture from each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cubes import AXIS, sweep
+
+import torchtransient as tt
+from torchtransient.data.result_file import read_result, write_result
+from torchtransient.errors import ShapeError, StorageError
+from torchtransient.vis.sources import phasor_of, steady_of, stokes_of, transient_of
+
+
+@dataclass
+class Output:
+    """What the pictures need of a RenderOutput."""
+
+    transient: Any = None
+    steady: Any = None
+    phasor: Any = None
+    axis: Any = None
+    frequencies: Any = None
+    polarized: bool = False
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """The same render as a RenderOutput and as files."""
+    folder = tmp_path_factory.mktemp("results")
+    scene = tt.load(tt.scenes.cornell_box(resolution=4, num_bins=8, bin_width_opl=1.0, spp=4, max_depth=3))
+    with torch.no_grad():
+        output = tt.render(scene, seed=0)
+    return output, [write_result(folder / name, output) for name in ("a.h5", "a.npz")]
+
+
+def test_files_hold_what_was_rendered(stored):
+    output, paths = stored
+    for source in (output, *paths, *map(str, paths), *map(read_result, paths)):
+        cube, axis = transient_of(source)
+        assert torch.equal(cube, output.transient)
+        assert axis == output.axis
+        assert torch.equal(steady_of(source), output.steady)
+
+
+def test_arrays(tmp_path):
+    cube = sweep()
+    np.save(tmp_path / "a.npy", cube.numpy())
+    for source in (cube, cube.numpy(), cube.half(), cube.double(), tmp_path / "a.npy", cube.clone().requires_grad_()):
+        got, axis = transient_of(source, AXIS)
+        assert torch.equal(got.float(), cube)
+        assert axis == AXIS and not got.requires_grad
+    assert torch.equal(steady_of(cube), cube.sum(1))
+    assert torch.equal(steady_of(cube.sum(1)), cube.sum(1))
+
+
+def test_polarized_sources():
+    stokes = torch.rand(4, 3, 10, 2, 5)
+    assert torch.equal(transient_of(stokes)[0], stokes[0])
+    assert torch.equal(stokes_of(stokes, 3), stokes[:, :, 3])
+    assert torch.equal(stokes_of(stokes), stokes.sum(2))
+    output = Output(stokes, stokes.sum(2), axis=AXIS, polarized=True)
+    assert torch.equal(stokes_of(output), stokes.sum(2))
+    assert torch.equal(stokes_of(output, 9), stokes[:, :, 9])
+    assert torch.equal(steady_of(output), stokes.sum(2)[0])
+    with pytest.raises(ShapeError, match="expected Stokes vectors"):
+        stokes_of(sweep())
+    with pytest.raises(ShapeError, match="bin 10 of 10"):
+        stokes_of(stokes, 10)
+
+
+def test_a_batch_of_four_is_not_polarization(tmp_path):
+    batch = torch.rand(4, 3, 10, 2, 5)
+    with pytest.raises(ShapeError, match="batch"):
+        transient_of(Output(batch, batch.sum(2), axis=AXIS))
+    note = '{"stats": {"variant": "llvm_ad_rgb"}}'
+    np.savez(tmp_path / "a.npz", transient=batch.numpy(), metadata=np.array(note))
+    with pytest.raises(ShapeError, match="batch"):
+        transient_of(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", transient=batch.numpy(), metadata=np.array(note.replace("rgb", "mono_polarized")))
+    assert torch.equal(transient_of(tmp_path / "b.npz")[0], batch[0])
+
+
+def test_phasors():
+    values = torch.randn(3, 2, 4, 5, dtype=torch.complex64)
+    got, frequencies = phasor_of(Output(phasor=values, frequencies=tt.FrequencyAxis((1.0, 2.0))))
+    assert torch.equal(got, values) and frequencies == (1.0, 2.0)
+    assert torch.equal(phasor_of(values.numpy())[0], values)
+    with pytest.raises(ShapeError, match="expected complex"):
+        phasor_of(values.real)
+    with pytest.raises(ShapeError, match="holds no phasor"):
+        phasor_of(Output(sweep()))
+
+
+def test_broken_files(tmp_path, stored):
+    for name in ("a.h5", "a.npz", "a.npy"):
+        (tmp_path / name).write_bytes(b"nonsense")
+        with pytest.raises(StorageError, match="cannot be read"):
+            transient_of(tmp_path / name)
+    with pytest.raises(StorageError, match="does not exist"):
+        transient_of(tmp_path / "b.h5")
+    np.savez(tmp_path / "c.npz", other=np.zeros(3))
+    with pytest.raises(StorageError, match="none of transient"):
+        transient_of(tmp_path / "c.npz")
+    np.save(tmp_path / "d.npy", np.array(["text"]))
+    with pytest.raises(ShapeError, match="expected numbers"):
+        transient_of(tmp_path / "d.npy")

@@ -1,0 +1,202 @@
+"""Gates of a time-gated camera: how sensitive it is to light by the time that it arrives.
+
+Optical path length in metres from the moment when the light leaves the emitter. No Mitsuba and no torch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
+from torchtransient.units import seconds_to_opl
+
+Array = NDArray[np.float64]
+
+KINDS = ("rectangular", "gaussian", "tabulated")
+# A profile that is not straight is handed to a film as straight lines between this many points.
+NODES = 2049
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Sensitivity over the arrival of light: what arrives at ``opl`` counts ``value(opl)`` times.
+
+    Make one with :meth:`rectangular`, :meth:`gaussian` or :meth:`tabulated`. Metres of optical path. Frozen, hashable,
+    picklable. Raises UnitError for an end before its start, a width that is not positive, or values that are negative,
+    not finite or zero everywhere; ShapeError for tables of different lengths.
+    """
+
+    kind: str
+    start_opl: float
+    end_opl: float
+    opl: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UnitError(f"Gate: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+        start, end = float(self.start_opl), float(self.end_opl)
+        if not (math.isfinite(start) and math.isfinite(end) and start < end):
+            raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
+        object.__setattr__(self, "start_opl", start)
+        object.__setattr__(self, "end_opl", end)
+
+    # ------------------------------------------------------------------------------------------- constructors
+
+    @classmethod
+    def rectangular(cls, start_opl: float, end_opl: float) -> Gate:
+        """Fully open in ``[start_opl, end_opl)``, else closed. It has no slope, hence no gradient in time."""
+        return cls("rectangular", start_opl, end_opl)
+
+    @classmethod
+    def gaussian(cls, center_opl: float, fwhm_opl: float) -> Gate:
+        """Fully open at ``center_opl``; closes like a Gaussian, to zero at four standard deviations."""
+        if not fwhm_opl > 0:
+            raise UnitError(f"Gate.gaussian: expected fwhm_opl > 0 metres, got {fwhm_opl!r}.")
+        center, fwhm = float(center_opl), float(fwhm_opl)
+        half = CUT_STDDEVS * fwhm / FWHM_PER_STDDEV
+        # Center and width are kept too: start and end would give them back with a rounding error.
+        return cls("gaussian", center - half, center + half, (center, fwhm))
+
+    @classmethod
+    def tabulated(cls, opl: Sequence[float], values: Sequence[float]) -> Gate:
+        """A measured profile: linear between ``values`` at the lengths ``opl`` (rising), zero outside them."""
+        lengths = np.asarray(opl, dtype=np.float64).ravel()
+        heights = np.asarray(values, dtype=np.float64).ravel()
+        if lengths.size != heights.size or lengths.size < 2:
+            raise ShapeError(
+                f"Gate.tabulated: expected two or more lengths and as many values, got {lengths.size} and "
+                f"{heights.size}."
+            )
+        if not (np.all(np.isfinite(lengths)) and np.all(np.diff(lengths) > 0)):
+            raise UnitError("Gate.tabulated: expected finite lengths in rising order.")
+        if not np.all(np.isfinite(heights)) or heights.min() < 0 or heights.max() == 0:
+            raise UnitError(
+                "Gate.tabulated: expected finite values, none negative and not all zero, got values between "
+                f"{heights.min():g} and {heights.max():g}."
+            )
+        table = tuple(lengths.tolist()), tuple(heights.tolist())
+        return cls("tabulated", table[0][0], table[0][-1], *table)
+
+    @classmethod
+    def rectangular_s(cls, start_s: float, end_s: float) -> Gate:
+        """As :meth:`rectangular`, in seconds."""
+        return cls.rectangular(seconds_to_opl(start_s), seconds_to_opl(end_s))
+
+    @classmethod
+    def gaussian_s(cls, center_s: float, fwhm_s: float) -> Gate:
+        """As :meth:`gaussian`, in seconds."""
+        return cls.gaussian(seconds_to_opl(center_s), seconds_to_opl(fwhm_s))
+
+    def shifted(self, opl: float) -> Gate:
+        """The same gate, opened ``opl`` metres later."""
+        if self.kind == "gaussian":
+            return Gate.gaussian(self.opl[0] + opl, self.opl[1])
+        moved = tuple(length + opl for length in self.opl)
+        return Gate(self.kind, self.start_opl + opl, self.end_opl + opl, moved, self.values)
+
+    def sequence(self, step_opl: float, count: int) -> tuple[Gate, ...]:
+        """``count`` gates of this shape, each ``step_opl`` metres after the one before."""
+        return tuple(self.shifted(k * step_opl) for k in range(count))
+
+    # ------------------------------------------------------------------------------------------------ the profile
+
+    def value(self, opl: Any) -> Array:
+        """Sensitivity to light that arrives at ``opl``, in double precision."""
+        x = np.asarray(opl, dtype=np.float64)
+        inside = (x >= self.start_opl) & (x < self.end_opl)
+        if self.kind == "rectangular":
+            return np.asarray(inside, dtype=np.float64)
+        if self.kind == "tabulated":
+            return np.where(inside, np.interp(x, self.opl, self.values), 0.0)
+        u = (x - 0.5 * (self.start_opl + self.end_opl)) * (2 * CUT_STDDEVS / (self.end_opl - self.start_opl))
+        floor = math.exp(-0.5 * CUT_STDDEVS**2)
+        return np.where(inside, np.maximum((np.exp(-0.5 * u * u) - floor) / (1 - floor), 0.0), 0.0)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether the profile rises from zero and falls to zero without a jump, so that it has a slope."""
+        if self.kind == "tabulated":
+            return self.values[0] == 0 and self.values[-1] == 0
+        return self.kind == "gaussian"
+
+    def nodes(self) -> Array:
+        """The profile (N,) at equal distances from start to end, straight in between; exact for straight ones."""
+        if self.kind == "rectangular":
+            return np.ones(2)
+        if self.kind == "tabulated" and np.allclose(np.diff(self.opl), self.opl[1] - self.opl[0], rtol=1e-9, atol=0):
+            return np.array(self.values)
+        x = np.linspace(self.start_opl, self.end_opl, NODES)
+        values = self.value(x)
+        values[-1] = self.values[-1] if self.kind == "tabulated" else 0.0
+        return values
+
+    def spread(self, pulse: Pulse) -> Gate:
+        """The gate as a pulsed light sees it: an arrival is spread over the pulse before the gate is asked."""
+        low, high = pulse.support_opl
+        at = np.linspace(self.start_opl - high, self.end_opl - low, NODES)
+        if self.kind == "rectangular":
+            values = pulse.cumulative(self.end_opl - at) - pulse.cumulative(self.start_opl - at)
+        else:
+            # On one grid for both: the pulse's shares of each step, the profile at the steps' centres.
+            step = (at[-1] - at[0]) / (NODES - 1)
+            count = max(1, math.ceil((high - low) / step))
+            shares = np.diff(pulse.cumulative(low + step * np.arange(count + 1)))
+            profile = self.value(at[0] + low + step * (np.arange(NODES + count - 1) + 0.5))
+            values = np.correlate(profile, shares, mode="valid")
+        values[[0, -1]] = 0.0
+        return Gate.tabulated(at.tolist(), np.maximum(values, 0.0).tolist())
+
+    # --------------------------------------------------------------------------------------------------- as text
+
+    def __str__(self) -> str:
+        """The gate in the notation of scene files, see :func:`gates_from_text`."""
+        if self.kind == "tabulated":
+            pairs = zip(self.opl, self.values, strict=True)
+            return "tabulated " + " ".join(f"{length!r}:{value!r}" for length, value in pairs)
+        if self.kind == "gaussian":
+            return f"gaussian {self.opl[0]!r} {self.opl[1]!r}"
+        return f"rectangular {self.start_opl!r} {self.end_opl!r}"
+
+
+def gates_to_text(gates: Sequence[Gate]) -> str:
+    """Gates in the notation of scene files."""
+    return "; ".join(map(str, gates))
+
+
+def gates_from_text(text: str) -> tuple[Gate, ...]:
+    """Gates separated by semicolons, each one of::
+
+        rectangular START END        gaussian CENTER FWHM        tabulated OPL:VALUE OPL:VALUE ...
+
+    Metres of optical path. Raises UnitError for anything else.
+    """
+    gates = []
+    for part in filter(None, (p.strip() for p in str(text).split(";"))):
+        kind, *rest = part.replace(",", " ").split()
+        try:
+            if kind == "tabulated":
+                pairs = [entry.split(":") for entry in rest]
+                gates.append(Gate.tabulated([float(a) for a, _ in pairs], [float(b) for _, b in pairs]))
+                continue
+            first, second = (float(number) for number in rest)
+        except ValueError as error:
+            if isinstance(error, (UnitError, ShapeError)):
+                raise
+            raise UnitError(
+                "gates: expected 'rectangular START END', 'gaussian CENTER FWHM' or 'tabulated OPL:VALUE ...', "
+                f"separated by semicolons, got {part!r}."
+            ) from None
+        if kind not in KINDS:
+            raise UnitError(f"gates: expected a kind out of {', '.join(KINDS)}, got {kind!r}.")
+        gates.append(Gate.rectangular(first, second) if kind == "rectangular" else Gate.gaussian(first, second))
+    if not gates:
+        raise UnitError("gates: expected at least one gate, got none.")
+    return tuple(gates)

@@ -1,0 +1,214 @@
+"""Which BSDFs of a scene answer late, looked up by their number in Dr.Jit's registry.
+
+A path chooses at each such surface, once for everything that it does there, whether it takes part in the elastic or in
+the delayed scattering; from then on it sees the BSDF of that part alone, by a pointer of its own. So nothing has to be
+told to a BSDF's methods, and surfaces without a delay are left as they are.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError
+from torchtransient.plugins.polarized import faded
+
+DECAY_NODES = 4097
+# Both parts are drawn at least this often, so that the derivative by a yield of zero is there.
+LEAST_PROBABILITY = 0.1
+
+_created = 0
+
+
+def note_creation():
+    """A plugin of this kind exists: before that, no scene needs to be searched for it."""
+    global _created
+    _created += 1
+
+
+class Answer:
+    """How a surface answers a path: ``bsdf`` in its stead, the factor ``weight``, the ``delay`` in metres and the
+    ``wavelengths`` beyond the surface; None where nothing changes. A plain object that lives within one iteration.
+    """
+
+    def __init__(self, bsdf, weight=None, delay=None, wavelengths=None):
+        self.bsdf, self.weight, self.delay, self.wavelengths = bsdf, weight, delay, wavelengths
+
+    def after(self, τ):
+        """A path length, later by the delay."""
+        return τ if self.delay is None else τ + mi.Float64(dr.detach(self.delay))
+
+    def scaled(self, value):
+        """A BSDF's value or weight times the factor."""
+        return value if self.weight is None else faded(value, self.weight)
+
+    def scaled_light(self, light):
+        """Light that was scattered here times the factor."""
+        return light if self.weight is None else light * self.weight
+
+    def scaled_both(self, sampled):
+        """Value and weight in the result of ``BSDF.eval_pdf_sample``."""
+        value, pdf, bs, weight = sampled
+        return self.scaled(value), pdf, bs, self.scaled(weight)
+
+    def move(self, *interactions):
+        """Give interactions the wavelengths beyond the surface."""
+        if self.wavelengths is not None:
+            for interaction in interactions:
+                interaction.wavelengths = self.wavelengths
+
+
+class SpectralShift:
+    """From the wavelength that a path left a surface with to the one that it was excited by.
+
+    With photons per nanometre ``emission`` (normalised) and absorptance ``excitation``, the radiance at L is
+    ``emission(L) / L`` times the integral of ``excitation(l) l`` times the radiance at l; l is drawn in proportion to
+    the excitation.
+    """
+
+    def __init__(self, excitation, emission):
+        self.excitation = _distribution(excitation, "excitation")
+        self.emission = _distribution(emission, "emission")
+
+    def draw(self, u, wavelengths):
+        """(wavelengths absorbed, factor of the radiance) for wavelengths emitted and one uniform number."""
+        numbers = mi.sample_shifted(u)
+        absorbed, factor = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
+        for k in range(len(wavelengths)):
+            absorbed[k] = self.excitation.sample(numbers[k])
+            share = self.emission.eval_pdf_normalized(wavelengths[k]) * self.excitation.integral()
+            factor[k] = share * absorbed[k] / wavelengths[k]
+        return absorbed, factor
+
+
+def _distribution(curve, name):
+    low, high = (float(edge) for edge in curve.wavelength_range())
+    step = float(curve.spectral_resolution())
+    count = 471 if step <= 0 else min(max(math.ceil((high - low) / step) + 1, 65), 4096)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wavelengths = mi.UnpolarizedSpectrum(dr.linspace(mi.Float, low, high, count))
+    values = np.broadcast_to(np.array(mi.unpolarized_spectrum(curve.eval(si))[0], dtype=float), count)
+    if not np.all(np.isfinite(values)) or values.min() < 0 or values.max() == 0:
+        raise SceneError(
+            f"delayed: {name} must be finite, nowhere negative and not zero everywhere, got values between "
+            f"{values.min():g} and {values.max():g}."
+        )
+    return mi.ContinuousDistribution(mi.ScalarVector2f(low, high), mi.Float(values.astype(np.float32)))
+
+
+class DelayTable:
+    """Lifetimes, yields and parts of the delayed BSDFs of a scene; attached where their parameters are.
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """
+
+    def __init__(self, bsdfs):
+        numbers = [_number(bsdf) for bsdf in bsdfs]
+        rows = np.zeros(max(numbers) + 1, dtype=np.uint32)
+        rows[numbers] = 1 + np.arange(len(bsdfs))
+        self._rows = mi.UInt32(rows)
+        self._late = mi.UInt32([_number(bsdf.nested) for bsdf in bsdfs])
+        self._at_once = mi.UInt32([_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
+        probabilities, decays = [], []
+        for bsdf in bsdfs:
+            elastic, late = (float(dr.slice(dr.detach(weight), 0)) for weight in bsdf.weights())
+            p = late / (elastic + late) if elastic + late > 0 else 0.5
+            p = min(max(p, LEAST_PROBABILITY), 1 - LEAST_PROBABILITY)
+            probabilities.append(1.0 if bsdf.at_once is None else p)
+            decays.append(0 if bsdf.decay is None else 1 + sum(d > 0 for d in decays) * DECAY_NODES)
+        self._probability = mi.Float(probabilities)
+        tables = [bsdf.decay for bsdf in bsdfs if bsdf.decay is not None]
+        self._decay_start = mi.UInt32(decays) if tables else None
+        self._decay = mi.Float(np.concatenate(tables).astype(np.float32)) if tables else None
+        self._shifts = [(row, bsdf.shift) for row, bsdf in enumerate(bsdfs) if bsdf.shift is not None]
+        with dr.resume_grad():
+            self.lifetimes = _gathered([bsdf.lifetime for bsdf in bsdfs])
+            self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in bsdfs])
+            self.late_weights = _gathered([bsdf.weights()[1] for bsdf in bsdfs])
+        dr.make_opaque(self._rows, self._late, self._at_once, self._probability, self._decay_start, self._decay)
+
+    @property
+    def shifts(self) -> bool:
+        """Whether wavelengths change along a path."""
+        return bool(self._shifts)
+
+    def attached(self) -> list:
+        """The tables that carry derivatives."""
+        return [t for t in (self.lifetimes, self.elastic_weights, self.late_weights) if dr.grad_enabled(t)]
+
+    def answer(self, bsdf, u, wavelengths) -> Answer:
+        """How surfaces with BSDFs ``bsdf`` answer, for two uniform numbers ``u``."""
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        known = number < dr.width(self._rows)
+        row = dr.gather(mi.UInt32, self._rows, number, known)
+        there = known & (row > 0)
+        row = dr.select(there, row - 1, 0)
+        p = dr.gather(mi.Float, self._probability, row, there)
+        late = there & (u.x < p)
+        pointer = dr.select(late, dr.gather(mi.UInt32, self._late, row, late), number)
+        pointer = dr.select(there & ~late, dr.gather(mi.UInt32, self._at_once, row, there), pointer)
+        late_weight = dr.gather(mi.Float, self.late_weights, row, late) * dr.rcp(dr.select(late, p, 1))
+        once_weight = dr.gather(mi.Float, self.elastic_weights, row, there) * dr.rcp(dr.select(late | ~there, 1, 1 - p))
+        weight = dr.select(late, late_weight, dr.select(there, once_weight, 1))
+        lifetime = dr.gather(mi.Float, self.lifetimes, row, late)
+        delay = dr.select(late, lifetime * self._delay(u.x / dr.select(late, p, 1), row, late), 0)
+        beyond = None
+        if self._shifts:
+            weight, beyond = mi.UnpolarizedSpectrum(weight), mi.UnpolarizedSpectrum(wavelengths)
+            for number, shift in self._shifts:
+                chosen = late & (row == number)
+                absorbed, factor = shift.draw(u.y, wavelengths)
+                weight = dr.select(chosen, weight * factor, weight)
+                beyond = dr.select(chosen, absorbed, beyond)
+        return Answer(dr.reinterpret_array(mi.BSDFPtr, pointer), weight, delay, beyond)
+
+    def _delay(self, v, row, active):
+        """Delay in units of the lifetime for uniform numbers in [0, 1)."""
+        v = dr.minimum(v, dr.one_minus_epsilon(mi.Float))
+        unit = -dr.log(1 - v)
+        if self._decay is None:
+            return unit
+        start = dr.gather(mi.UInt32, self._decay_start, row, active)
+        measured = active & (start > 0)
+        x = v * (DECAY_NODES - 1)
+        i = dr.minimum(mi.UInt32(x), DECAY_NODES - 2)
+        at = dr.select(measured, start - 1, 0) + i
+        a, b = dr.gather(mi.Float, self._decay, at, measured), dr.gather(mi.Float, self._decay, at + 1, measured)
+        return dr.select(measured, dr.lerp(a, b, x - mi.Float(i)), unit)
+
+
+def _gathered(values):
+    """Numbers side by side, attached where they are."""
+    table = dr.zeros(mi.Float, len(values))
+    for i, value in enumerate(values):
+        dr.scatter(table, value, mi.UInt32(i))
+    return table
+
+
+def _number(bsdf) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
+
+
+def delays_of(bsdfs):
+    """(BSDFs that paths can meet, table of delays): delayed BSDFs are replaced by their parts; the table is None where
+    there are none. Raises SceneError for one inside another BSDF.
+    """
+    if _created == 0:
+        return bsdfs, None
+    met, delayed = [], []
+    for bsdf in bsdfs:
+        if type(bsdf).__name__ == "DelayedBSDF":
+            delayed.append(bsdf)
+            met += [part for part in (bsdf.nested, bsdf.elastic) if part is not None]
+        else:
+            met.append(bsdf)
+    for bsdf in met:
+        if "DelayedBSDF[" in str(bsdf):
+            raise SceneError(
+                f"BSDF '{bsdf.id()}' has a delayed BSDF inside; expected it outermost: put {bsdf.class_name()} into "
+                "the delayed one."
+            )
+    return met, DelayTable(delayed) if delayed else None

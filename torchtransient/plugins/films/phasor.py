@@ -1,0 +1,185 @@
+"""``phasor_hdr_film``: the light behind every pixel at chosen frequencies, without a histogram."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.films.base import TimeResolvedFilm
+from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventLane, events_at_most, rotation
+from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
+
+# The events of one kernel launch wait in memory until the next kernel sums them up; larger jobs take several launches.
+MAX_EVENT_BYTES = 2**28
+
+
+class Table:
+    """Phasors (or their adjoint) and their frequencies. A plain object: its arrays must not become loop state."""
+
+    def __init__(self, flat, frequencies, count, channels):
+        self.flat, self.frequencies, self.count, self.channels = flat, frequencies, count, channels
+
+    def add(self, value, index, active):
+        """Add single-precision values, also to an array of doubles."""
+        dr.scatter_reduce(dr.ReduceOp.Add, self.flat, type(self.flat)(value), index, active)
+
+
+@dr.syntax
+def add_event(table, base, opl, value, slope, active):
+    """Add one event to every frequency; ``slope`` is None or the contribution times the derivative of its length."""
+    f = mi.UInt32(0)
+    live = mi.Bool(active)
+    while dr.hint(live & (f < table.count), label="phasor put"):
+        ν = dr.gather(mi.Float64, table.frequencies, f, live)
+        cos, sin = rotation(ν * opl)
+        for c in range(table.channels):
+            re, im = value[c] * cos, -value[c] * sin
+            if dr.hint(slope is not None, mode="scalar"):
+                ω = mi.Float(2 * math.pi * ν)
+                re -= slope[c] * ω * sin
+                im -= slope[c] * ω * cos
+            index = base + (f * table.channels + c) * 2
+            table.add(re, index, live)
+            table.add(im, index + 1, live)
+        f += 1
+
+
+@dr.syntax
+def read_event(table, base, stride, entry, opl, active):
+    """``A`` and its slope for one event, over all frequencies."""
+    A = [mi.Float(0) for _ in range(table.channels)]
+    slope = [mi.Float(0) for _ in range(table.channels)]
+    f = mi.UInt32(0)
+    live = mi.Bool(active)
+    while dr.hint(live & (f < table.count), label="phasor read"):
+        ν = dr.gather(mi.Float64, table.frequencies, f, live)
+        cos, sin = rotation(ν * opl)
+        ω = mi.Float(2 * math.pi * ν)
+        for c in range(table.channels):
+            index = base + f * stride + 2 * c * entry
+            a = dr.gather(mi.Float, table.flat, index, live)
+            b = dr.gather(mi.Float, table.flat, index + entry, live)
+            A[c] += a * cos - b * sin
+            slope[c] -= ω * (a * sin + b * cos)
+        f += 1
+    return A, slope
+
+
+class PhasorHDRFilm(TimeResolvedFilm):
+    r"""Phasor film (:monosp:`phasor_hdr_film`): ``P(nu) = sum of radiance * exp(-2 pi i nu (opl - start_opl))``.
+
+    Parameters beside those of ``hdrfilm`` (size, crop, ``rfilter``) say which frequencies are kept, in cycles per metre
+    of optical path (one over the wavelength). Give one of these sets:
+
+    ``frequencies`` (string of numbers with commas, or an array)
+        Any frequencies, zero and negative ones too.
+    ``frequency_first``, ``frequency_step`` (float), ``frequency_count`` (int)
+        A uniform grid.
+    ``wl_mean`` (float, 100), ``wl_sigma`` (float, 1000), ``temporal_bins`` (int, 4096), ``bin_width_opl`` (0.003)
+        As in mitransient 1.x, also when nothing is given: the frequencies of the discrete Fourier transform of that
+        many bins that lie within ``1 / wl_mean +- 3 sigma``, ``sigma = 1 / (6 wl_sigma)``, and not below zero.
+
+    ``start_opl`` (float, 0)
+        Where the phase is zero, in metres of optical path: at 0, when the light leaves the emitter.
+
+    A uniform grid, however it is given, is faster than other lists: one complex multiplication for each step.
+
+    nested spectra (spectral variants)
+        Response curves of the sensor's channels, see :mod:`.response`.
+
+    A phasor is integrated over time: its value at frequency zero is the steady image, and nothing is lost outside a
+    window. It is what a histogram's transform would be with infinitely narrow bins. ``develop()`` returns steady
+    ``(H, W, C)`` and phasors ``(H, W, F, 2 C)`` of the crop window: real and imaginary part for every channel in turn,
+    C = 1 in monochromatic variants, the number of response curves where there are some, and 3 otherwise (linear sRGB
+    in spectral variants).
+
+    Phases are counted in double precision, in whole turns and a rest; the rest is good to 1e-6 cycles. Path lengths
+    come from single-precision positions: at 1 km a coordinate is good to 3e-5 m, 3e-3 cycles of a wavelength of 1 cm.
+
+    The film is smooth in time: gradients through the path length need no temporal filter, and filter settings of an
+    integrator are ignored. The spatial filter and double precision above 2^16 samples per pixel are as in
+    ``transient_hdr_film``.
+
+    Memory: the phasors, and up to 256 MB of events of the kernel in flight (twice that in forward mode); never a
+    histogram.
+
+    Not supported: alpha channel, half precision, exhaustive scans.
+    """
+
+    plugin = "phasor_hdr_film"
+    measures = "phasor"
+    has_window = False
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.frequencies = frequencies_of(props)
+        self.step = step_of(self.frequencies)
+        # In memory, so that kernels do not depend on their values and number.
+        self.frequency_array = mi.Float64(self.frequencies)
+        self.frequency_total = mi.UInt32(len(self.frequencies))
+        dr.make_opaque(self.frequency_array, self.frequency_total)
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        cb.put("start_opl", self.start_opl, mi.ParamFlags.NonDifferentiable)
+
+    # ---------------------------------------------------------------------------------------- storage
+
+    def frequency_count(self) -> int:
+        """F, the number of frequencies."""
+        return len(self.frequencies)
+
+    def cube_shape(self) -> tuple[int, ...]:
+        """Shape of the phasors: (H, W, F, 2 C), real and imaginary part in turn."""
+        size = self.crop_size()
+        return int(size[1]), int(size[0]), self.frequency_count(), 2 * self.channel_count()
+
+    def entries_per_pixel(self) -> int:
+        """Floats behind one pixel."""
+        return self.frequency_count() * 2 * self.channel_count()
+
+    def lanes_at_most(self, depth: int) -> int | None:
+        per_path = events_at_most(depth, tangents=False) * (EVENT_BYTES + 4 * self.channel_count())
+        return max(1, MAX_EVENT_BYTES // per_path)
+
+    # ----------------------------------------------------------------------------------- splat and read
+
+    def lane(self, job, base, match, depth, tangents=False):
+        return EventLane(self, self.bands[job.band], base, match, job, depth, tangents)
+
+    def _table(self, flat):
+        return Table(flat, self.frequency_array, self.frequency_total, self.channel_count())
+
+    def put(self, cube, base, opl_from_start, value, active):
+        """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the phasors that begin at ``base``.
+
+        One event, frequency by frequency: the plain form of what :class:`EventLane` does for many events at once.
+        """
+        add_event(self._table(cube), base, opl_from_start, value, None, active)
+        return mi.Float(0), mi.Float(0)
+
+    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active):
+        """Forward mode: add ``k df + f k' dtau`` to the derivative of the phasors; arguments as for :meth:`put`."""
+        add_event(self._table(cube), base, opl_from_start, d_value, value_d_opl, active)
+
+    def read(self, adjoint, base, opl_from_start, active):
+        """``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival: lists over channels.
+
+        ``adjoint`` is ``(flat array, frequency stride, entry stride)`` and ``base`` the index of the pixel's first
+        value in it.
+        """
+        flat, stride, entry = adjoint
+        return read_event(self._table(flat), base, stride, entry, opl_from_start, active)
+
+    def to_string(self):
+        return (
+            f"PhasorHDRFilm[\n  size = {self.size()},\n  crop = {self.crop_size()} at {self.crop_offset()},\n"
+            f"  frequencies = {self.frequency_count()} from {self.frequencies.min():g} to {self.frequencies.max():g} "
+            f"per metre,\n  start_opl = {self.start_opl}\n]"
+        )
+
+
+register("film", "phasor_hdr_film", PhasorHDRFilm)

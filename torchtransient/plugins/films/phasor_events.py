@@ -1,0 +1,191 @@
+"""From the events of many paths to phasors, with two kernels instead of a histogram.
+
+The kernel that traces paths writes every event (optical path length, channel values) into memory of its path. A second
+kernel takes a block of frequencies of a pixel each, walks the events of that pixel and keeps its sums in registers: no
+two of its threads write to the same place as long as a pixel has few samples, and a uniform grid of frequencies costs
+one complex multiplication for each event and step. Summing inside of the first kernel would need one atomic addition
+for each path, frequency and channel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.films.lane import Lane
+
+# Events of a path that are kept; what exceeds them is added one by one, which is slower.
+MAX_EVENTS = 16
+# Bytes of an event besides its channel values.
+EVENT_BYTES = 8
+# Samples of a pixel that one thread of the second kernel sums up.
+GROUP = 64
+# Frequencies that one thread of the second kernel sums up, for one channel value. In a grid each block starts from a
+# phase in double precision, so that rounding does not build up.
+BLOCK = 16
+
+
+def events_at_most(depth: int, tangents: bool) -> int:
+    """Events kept for a path of ``depth`` segments: emission found, next-event estimation, emission ahead."""
+    return min((3 if tangents else 2) * max(depth, 1), MAX_EVENTS)
+
+
+def rotation(turns):
+    """Cosine and sine of ``2 pi turns``: whole turns are taken off a double before single precision takes over."""
+    angle = mi.Float(turns - dr.round(turns)) * (2 * math.pi)
+    sin, cos = dr.sincos(angle)
+    return cos, sin
+
+
+class EventLane(Lane):
+    """Keeps the events of each path of one pass and sums them up in ``finish``."""
+
+    def __init__(self, film, band, base, match, job, depth, tangents):
+        self.first_row, _, cube = band
+        super().__init__(film, cube, base, match)
+        self.job, self.tangents = job, tangents
+        self.slots = events_at_most(depth, tangents)
+        self.overflows = (3 if tangents else 2) * depth > self.slots
+        self.width = int(film.crop_size()[0])
+        self.paths = self.width * job.rows * job.spp
+        numbers = film.channel_count() * (2 if tangents else 1)
+        self.count = dr.empty(mi.UInt32, self.paths)
+        self.opl = dr.empty(mi.Float64, self.slots * self.paths)
+        self.values = [dr.empty(mi.Float, self.slots * self.paths) for _ in range(numbers)]
+
+    def begin(self):
+        return {"count": mi.UInt32(0), "path": dr.arange(mi.UInt32, self.paths)}
+
+    def put(self, events, opl, value, active):
+        channels = self.match.to_channels(value)
+        more = self._store(events, opl, channels, active)
+        if self.overflows:
+            self.film.put(self.cube, self.base, opl, channels, more)
+        return mi.Float(0), mi.Float(0)
+
+    def put_slope(self, events, opl, d_value, value_d_opl, active):
+        d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
+        more = self._store(events, opl, d + slope, active)
+        if self.overflows:
+            self.film.put_slope(self.cube, self.base, opl, d, slope, more)
+
+    def _store(self, events, opl, values, active):
+        """Append an event to its path; returns where there was no room left."""
+        largest = dr.abs(values[0])
+        for value in values[1:]:
+            largest = dr.maximum(largest, dr.abs(value))
+        some = active & (largest > 0)
+        n = events["count"]
+        fits = some & (n < self.slots)
+        # Events of the same number lie side by side: those that few paths reach are memory that is never touched.
+        index = dr.fma(n, self.paths, events["path"])
+        dr.scatter(self.opl, opl, index, fits)
+        for target, value in zip(self.values, values, strict=True):
+            dr.scatter(target, value, index, fits)
+        events["count"] = n + dr.select(fits, mi.UInt32(1), 0)
+        return some & ~fits
+
+    def end(self, events):
+        dr.scatter(self.count, events["count"], events["path"])
+
+    def finish(self):
+        # The first kernel: everything that the integrator has asked for in this pass.
+        dr.eval(self.count, self.opl, *self.values, self.cube, self.film.steady)
+        job, film = self.job, self.film
+        groups = -(-job.spp // GROUP)
+        per_block = max(1, BLOCK // len(self.values))
+        blocks = -(-film.frequency_count() // per_block)
+        index = dr.arange(mi.UInt32, self.width * job.rows * groups * blocks)
+        rest = index // dr.opaque(mi.UInt32, blocks)
+        block = index - rest * dr.opaque(mi.UInt32, blocks)
+        pixel = rest // dr.opaque(mi.UInt32, groups)
+        group = rest - pixel * dr.opaque(mi.UInt32, groups)
+        spp = dr.opaque(mi.UInt32, job.spp)
+        first = pixel * spp + group * GROUP
+        last = dr.minimum(first + GROUP, (pixel + 1) * spp)
+        base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_pixel()
+        start = block * per_block
+        frequencies = FrequencyBlock(film, start, per_block)
+        re, im = sum_events(self, frequencies, first, last)
+        self._add_block(frequencies, base, re, im, conflicts=groups > 1)
+
+    def _add_block(self, block, base, re, im, conflicts):
+        channels = self.film.channel_count()
+        mode = dr.ReduceMode.Auto if conflicts else dr.ReduceMode.NoConflicts
+        real = type(self.cube)
+        for j in range(block.size):
+            f = block.start + j
+            inside = f < block.count
+            for c in range(channels):
+                x, y = re[j][c], im[j][c]
+                if self.tangents:
+                    ω = mi.Float(2 * math.pi * block.frequency(j))
+                    x += ω * im[j][channels + c]
+                    y -= ω * re[j][channels + c]
+                index = base + (f * channels + c) * 2
+                dr.scatter_reduce(dr.ReduceOp.Add, self.cube, real(x), index, inside, mode)
+                dr.scatter_reduce(dr.ReduceOp.Add, self.cube, real(y), index + 1, inside, mode)
+
+
+class FrequencyBlock:
+    """``size`` frequencies from number ``start`` on; a plain object, its arrays are constant in loops."""
+
+    def __init__(self, film, start, size):
+        self.start, self.size = start, size
+        self.count = film.frequency_total
+        self.step = None
+        if film.step is not None:
+            self.first = dr.opaque(mi.Float64, float(film.frequencies[0]))
+            self.step = dr.opaque(mi.Float64, film.step)
+        else:
+            numbers = [start + j for j in range(size)]
+            self.values = [dr.gather(mi.Float64, film.frequency_array, k, k < self.count) for k in numbers]
+
+    def frequency(self, j):
+        """Frequency number ``j`` of the block, a double."""
+        if self.step is None:
+            return self.values[j]
+        return self.first + mi.Float64(self.start + j) * self.step
+
+    def rotations(self, opl):
+        """(cos, sin) of the phase at every frequency of the block."""
+        if self.step is None:
+            return [rotation(ν * opl) for ν in self.values]
+        z = rotation(self.frequency(0) * opl)
+        result = [z]
+        if self.size > 1:
+            w = rotation(self.step * opl)
+            for _ in range(1, self.size):
+                z = dr.fma(z[0], w[0], -z[1] * w[1]), dr.fma(z[0], w[1], z[1] * w[0])
+                result.append(z)
+        return result
+
+
+@dr.syntax
+def sum_events(lane, block, first, last):
+    """Sums of ``value * exp(-2 pi i nu opl)`` over the events of the paths from ``first`` to ``last``.
+
+    Returns real and imaginary parts, each a list over the frequencies of the block of lists over the event's values.
+    """
+    numbers = len(lane.values)
+    re = [[mi.Float(0) for _ in range(numbers)] for _ in range(block.size)]
+    im = [[mi.Float(0) for _ in range(numbers)] for _ in range(block.size)]
+    path, n = mi.UInt32(first), mi.UInt32(0)
+    count = dr.gather(mi.UInt32, lane.count, path)
+    while dr.hint(path < last, label="phasor sums"):
+        live = n < count
+        index = dr.fma(n, lane.paths, path)
+        opl = dr.gather(mi.Float64, lane.opl, index, live)
+        values = [dr.gather(mi.Float, array, index, live) for array in lane.values]
+        for j, (cos, sin) in enumerate(block.rotations(opl)):
+            for c in range(numbers):
+                re[j][c] = dr.fma(values[c], cos, re[j][c])
+                im[j][c] = dr.fma(-values[c], sin, im[j][c])
+        n += 1
+        over = n >= count
+        path += dr.select(over, mi.UInt32(1), 0)
+        n = dr.select(over, 0, n)
+        count = dr.select(over, dr.gather(mi.UInt32, lane.count, path, over & (path < last)), count)
+    return re, im

@@ -1,0 +1,91 @@
+"""Which frequencies a phasor film keeps, read from its parameters."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchtransient.errors import SceneError
+
+LIST = ("frequencies",)
+GRID = ("frequency_first", "frequency_step", "frequency_count")
+WAVELENGTHS = ("wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl")
+
+
+def frequencies_of(props) -> np.ndarray:
+    """The frequencies that a film's properties ask for: float64, cycles per metre. Raises ``SceneError``."""
+    given = [names for names in (LIST, GRID, WAVELENGTHS) if any(name in props for name in names)]
+    if len(given) > 1:
+        sets = " and ".join(", ".join(name for name in names if name in props) for names in given)
+        raise SceneError(f"phasor_hdr_film: {sets} exclude each other; give one of the sets.")
+    if given == [LIST]:
+        return parse_list(props["frequencies"])
+    if given == [GRID]:
+        missing = [name for name in GRID if name not in props]
+        if missing:
+            raise SceneError(
+                f"phasor_hdr_film: a uniform grid needs {', '.join(GRID)}; {', '.join(missing)} is missing."
+            )
+        count = int(props["frequency_count"])
+        if count < 1:
+            raise SceneError(f"phasor_hdr_film: frequency_count must be at least 1, got {count}.")
+        return checked(float(props["frequency_first"]) + np.arange(count) * float(props["frequency_step"]))
+    return transform_bins(
+        float(props.get("wl_mean", 100.0)),
+        float(props.get("wl_sigma", 1000.0)),
+        int(props.get("temporal_bins", 4096)),
+        float(props.get("bin_width_opl", 0.003)),
+    )
+
+
+def parse_list(given) -> np.ndarray:
+    """Numbers from a string with commas or spaces, or from an array of any kind."""
+    try:
+        if isinstance(given, str):
+            values = [float(word) for word in given.replace(",", " ").split()]
+        else:
+            values = np.array(given, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise SceneError(f"phasor_hdr_film: frequencies: expected numbers, got {given!r}.") from None
+    return checked(values)
+
+
+def checked(values) -> np.ndarray:
+    """Finite, and at least one."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.size < 1:
+        raise SceneError("phasor_hdr_film: frequencies: expected at least one, got none.")
+    if not np.isfinite(values).all():
+        raise SceneError(f"phasor_hdr_film: frequencies: expected finite numbers, got {values.tolist()}.")
+    return values
+
+
+def transform_bins(wl_mean: float, wl_sigma: float, bins: int, width: float) -> np.ndarray:
+    """The frequencies of a discrete Fourier transform of ``bins`` bins within three sigma of ``1 / wl_mean``.
+
+    The rules of mitransient 1.3, which include the Nyquist frequency with its negative sign for even ``bins``.
+    """
+    for name, value in (("wl_mean", wl_mean), ("wl_sigma", wl_sigma), ("bin_width_opl", width)):
+        if not (math.isfinite(value) and value > 0):
+            raise SceneError(f"phasor_hdr_film: {name} must be a positive length in metres, got {value}.")
+    if bins < 1:
+        raise SceneError(f"phasor_hdr_film: temporal_bins must be at least 1, got {bins}.")
+    window = bins * width
+    mean, sigma = window / wl_mean, window / (6 * wl_sigma)
+    first, last = max(0, math.floor(mean - 3 * sigma)), min(bins // 2, math.ceil(mean + 3 * sigma))
+    if first > last:
+        raise SceneError(
+            f"phasor_hdr_film: wl_mean = {wl_mean} m lies beyond the shortest wavelength of {bins} bins of {width} m, "
+            f"{2 * width} m; use narrower bins or give frequencies."
+        )
+    index = np.arange(first, last + 1)
+    return np.where((index == bins // 2) & (bins % 2 == 0), -index, index) / window
+
+
+def step_of(frequencies: np.ndarray) -> float | None:
+    """The step of a uniform grid, None for other lists. Deviations that no phase could show are taken as rounding."""
+    count = len(frequencies)
+    step = (frequencies[-1] - frequencies[0]) / (count - 1) if count > 1 else 0.0
+    deviation = np.abs(frequencies - (frequencies[0] + np.arange(count) * step)).max()
+    return float(step) if deviation <= 1e-14 * np.abs(frequencies).max() else None

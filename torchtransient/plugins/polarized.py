@@ -1,0 +1,231 @@
+"""What light is made of along a path: numbers per colour, or Stokes vectors and Mueller matrices in polarized variants.
+
+Every function looks at the active variant while a kernel is traced; in unpolarized variants they reduce to the plain
+products, so that those kernels do not change.
+
+Frames. A Stokes vector belongs to a segment of the path, and light runs against the ray. Mitsuba's BSDFs give their
+matrices between the implicit frames of the two *local* directions. Here every segment has one fixed vector instead,
+computed from the ray's own direction: both of its ends see the same bits, so that no rounding can turn the frame over
+between them (Mitsuba's implicit frame jumps where a direction crosses the plane z = 0). Where directions are attached,
+the frame is the projection of that vector across the direction: a function of the direction alone, so what the two ends
+of a segment lose or gain by its turning cancels as it must.
+
+All rotations come from sines and cosines of twice the angle by products, without the angle: they are cheap, and have
+derivatives everywhere.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def light_type():
+    """Type of what one event contributes: a spectrum, or in polarized variants a Stokes vector of spectra."""
+    return mi.SpectrumEntry if mi.is_polarized else mi.UnpolarizedSpectrum
+
+
+def intensity(light):
+    """The power of light as a spectrum, whatever its polarization."""
+    return light[0] if mi.is_polarized else light
+
+
+def transported(β, weight, x):
+    """``β x`` scaled by ``weight``, where ``x`` is light or a throughput."""
+    if not mi.is_polarized:
+        return β * weight * x
+    return product(β, x) * weight
+
+
+def faded(β, T):
+    """A throughput times a spectrum ``T`` that acts on all of its components alike."""
+    if not mi.is_polarized:
+        return β * T
+    return mi.Spectrum(*[β[i, j] * T for i in range(4) for j in range(4)])
+
+
+def product(a, b):
+    """``a b``: of two spectra, two Mueller matrices, or a Mueller matrix and a Stokes vector."""
+    if not mi.is_polarized:
+        return a * b
+    if isinstance(b, mi.Spectrum):
+        return a @ b
+    return mi.SpectrumEntry(*[sum(a[i, k] * b[k] for k in range(1, 4)) + a[i, 0] * b[0] for i in range(4)])
+
+
+def column(matrix):
+    """What a throughput makes of unpolarized light of power one; Mitsuba's emitters emit no other."""
+    if not mi.is_polarized:
+        return matrix
+    return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
+
+
+# ------------------------------------------------------------------------------------------------------- adjoints
+#
+# Every event of a path has its own adjoint A, a vector in polarized variants, and the throughput stands between it and
+# the light f: A^T β f. What lies beyond a vertex is therefore kept as the matrix f A^T per unit throughput, so that the
+# number is trace(β f A^T); no matrix is ever inverted.
+
+
+def matched(A, light):
+    """``f A^T``: an event and its adjoint without the throughput. ``light`` may be a spectrum: unpolarized emission."""
+    if not mi.is_polarized:
+        return A * light
+    if isinstance(light, mi.SpectrumEntry):
+        return mi.Spectrum(*[light[i] * A[j] for i in range(4) for j in range(4)])
+    none = mi.UnpolarizedSpectrum(0)
+    return mi.Spectrum(*[light * A[j] for j in range(4)], *[none] * 12)
+
+
+def traced(β, beyond):
+    """The number that events contribute: ``trace(β S)`` over the matrices of :func:`matched`, summed over colours."""
+    return dr.sum(traced_colours(β, beyond))
+
+
+def traced_colours(β, beyond):
+    """``traced`` for each colour."""
+    if not mi.is_polarized:
+        return β * beyond
+    return sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4))
+
+
+def traced_attached(β, A_e, Le, A_n, f, W, S):
+    """``traced`` of emission, next-event estimation and scattering ``W`` into ``S``, attached to ``Le``, ``f``, ``W``.
+
+    What stands before an attached factor is multiplied out first: that keeps the derivatives' graph small.
+    """
+    if not mi.is_polarized:
+        return dr.sum(β * (A_e * Le + A_n * f + W * S))
+    before_e = sum(β[i, 0] * A_e[i] for i in range(4))
+    before_n = [sum(β[i, k] * A_n[i] for i in range(4)) for k in range(4)]
+    before_w = S @ β
+    total = before_e * Le
+    for k in range(4):
+        total += before_n[k] * f[k]
+        for j in range(4):
+            total += before_w[j, k] * W[k, j]
+    return dr.sum(total)
+
+
+def whole(beyond):
+    """``traced`` for a throughput of one."""
+    if not mi.is_polarized:
+        return dr.sum(beyond)
+    return dr.sum(sum(beyond[i, i] for i in range(4)))
+
+
+def turning(beyond):
+    """Derivative of :func:`traced` by twice the angle by which the frame in front of it turns, at no turn."""
+    return dr.sum(beyond[2, 1] - beyond[1, 2])
+
+
+def turning_throughput(t_turn):
+    """Tangent of a throughput of one whose frame turns by half of ``t_turn``; None leaves it as it is."""
+    if t_turn is None:
+        return mi.Spectrum(0)
+    zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_turn)
+    return mi.Spectrum(*[zero] * 6, t, *[zero] * 2, -t, *[zero] * 6)
+
+
+# --------------------------------------------------------------------------------------------------------- frames
+
+
+class Turn:
+    """Rotation of a Stokes frame by its cosine and sine of twice the angle, counter-clockwise for the receiver."""
+
+    def __init__(self, c, s):
+        self.c, self.s = c, s
+
+    def angle(self):
+        """Zero with the derivative of twice the angle."""
+        return dr.detach(self.c) * self.s - dr.detach(self.s) * self.c
+
+
+def turn_between(forward, current, target):
+    """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
+
+    ``forward`` is the direction in which light travels, ``current`` a vector across it of any length. No rotation where
+    ``target`` is parallel to the direction.
+    """
+    return turn_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
+
+
+def turn_along(c, s):
+    """The rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
+    n = c * c + s * s
+    there = n > 0
+    scale = dr.rcp(dr.select(there, n, 1))
+    return Turn(dr.select(there, (c - s) * (c + s) * scale, 1), dr.select(there, 2 * c * s * scale, 0))
+
+
+def segment_frame(d):
+    """The vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
+    return mi.coordinate_system(-dr.detach(d))[0]
+
+
+def turn_out(si, d):
+    """From the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in direction ``d`` found.
+
+    None in unpolarized variants, as :func:`turn_in`. Where ``si.wi`` is attached to the direction, ``d`` must be.
+    """
+    if not mi.is_polarized:
+        return None
+    return turn_between(-d, si.to_world(mi.coordinate_system(si.wi)[0]), segment_frame(d))
+
+
+def turn_in(si, wo, out=None, d=None):
+    """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
+
+    ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
+    them both are computed as the next ray's is.
+    """
+    if not mi.is_polarized:
+        return None
+    out = si.to_world(wo) if out is None else out
+    return turn_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), segment_frame(out if d is None else d))
+
+
+def turned(light, turn):
+    """A Stokes vector in the turned frame."""
+    if not mi.is_polarized:
+        return light
+    c, s = turn.c, turn.s
+    return mi.SpectrumEntry(light[0], light[1] * c + light[2] * s, light[2] * c - light[1] * s, light[3])
+
+
+def scattered(value, turn):
+    """What a BSDF's value makes of unpolarized light, in the frame of the segment towards the sensor."""
+    if not mi.is_polarized:
+        return mi.unpolarized_spectrum(value)
+    return turned(column(value), turn)
+
+
+def scattering(value, out, into):
+    """A BSDF's value between the frames of the two segments: ``out`` towards the sensor, ``into`` towards the light."""
+    if not mi.is_polarized:
+        return mi.unpolarized_spectrum(value)
+    m = [[value[i, j] for j in range(4)] for i in range(4)]
+    for row in m:
+        row[1], row[2] = row[1] * into.c + row[2] * into.s, row[2] * into.c - row[1] * into.s
+    m[1], m[2] = (
+        [a * out.c + b * out.s for a, b in zip(m[1], m[2], strict=True)],
+        [b * out.c - a * out.s for a, b in zip(m[1], m[2], strict=True)],
+    )
+    return mi.Spectrum(*[entry for row in m for entry in row])
+
+
+def from_mirrored(value, wi, wo, mirrored):
+    """A BSDF's value between the frames of its directions, where ``mirrored`` lanes hold it between the frames of their
+    mirror images at the surface.
+
+    Reflected, a frame changes its hand: S2 and S3 change their signs on both sides.
+    """
+    m = [[value[i, j] if (i < 2) == (j < 2) else -value[i, j] for j in range(4)] for i in range(4)]
+    out = turn_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])
+    into = turn_between(-wo, _mirror(mi.coordinate_system(_mirror(-wo))[0]), mi.coordinate_system(-wo)[0])
+    upright = scattering(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
+    return dr.select(mirrored, upright, value)
+
+
+def _mirror(v):
+    return mi.Vector3f(v.x, v.y, -v.z)

@@ -1,0 +1,200 @@
+"""Shapes over time: the pulse of a light source, the impulse response of a sensor, the profile of a gate.
+
+Everything here is optical path length in metres; seconds are converted where they come in. No Mitsuba and no torch: the
+films of ``plugins/`` and the torch functions of ``sensing/`` build their kernels from the same shapes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.units import seconds_to_opl
+
+Array = NDArray[np.float64]
+
+KINDS = ("gaussian", "rectangular", "tabulated")
+# A Gaussian is cut at this many standard deviations and rescaled: 6e-5 of its mass lies beyond.
+CUT_STDDEVS = 4.0
+FWHM_PER_STDDEV = 2 * math.sqrt(2 * math.log(2))
+
+_erf = np.frompyfunc(math.erf, 1, 1)
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A probability density over optical path length, in metres: how light that would arrive at one moment is spread.
+
+    Make one with :meth:`gaussian`, :meth:`rectangular` or :meth:`tabulated`. ``center_opl`` shifts the shape: zero is
+    the moment that path lengths are counted from. Its integral is one; the power of a laser is that of the emitter.
+    Frozen, hashable, picklable. Raises UnitError for widths that are not positive and densities that are negative, not
+    finite or zero everywhere, ShapeError for tables of different lengths.
+    """
+
+    kind: str
+    width_opl: float = 0.0
+    center_opl: float = 0.0
+    opl: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UnitError(f"Pulse: expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+        object.__setattr__(self, "center_opl", _number(self.center_opl, "center_opl"))
+        if self.kind == "tabulated":
+            self._check_table()
+            return
+        width = _number(self.width_opl, "width")
+        if width <= 0:
+            raise UnitError(f"Pulse: expected a width above 0 metres, got {width!r}.")
+        object.__setattr__(self, "width_opl", width)
+
+    def _check_table(self) -> None:
+        opl = np.asarray(self.opl, dtype=np.float64).ravel()
+        values = np.asarray(self.values, dtype=np.float64).ravel()
+        if opl.size != values.size or opl.size < 2:
+            raise ShapeError(
+                f"Pulse.tabulated: expected two or more lengths and as many values, got {opl.size} and {values.size}."
+            )
+        if not (np.all(np.isfinite(opl)) and np.all(np.diff(opl) > 0)):
+            raise UnitError("Pulse.tabulated: expected finite lengths in rising order.")
+        if not np.all(np.isfinite(values)) or values.min() < 0 or values.max() == 0:
+            raise UnitError(
+                "Pulse.tabulated: expected finite values, none negative and not all zero (subtract the background of "
+                f"a measured pulse first), got values between {values.min():g} and {values.max():g}."
+            )
+        object.__setattr__(self, "opl", tuple(opl.tolist()))
+        object.__setattr__(self, "values", tuple(values.tolist()))
+
+    # ------------------------------------------------------------------------------------------- constructors
+
+    @classmethod
+    def gaussian(cls, fwhm_opl: float, center_opl: float = 0.0) -> Pulse:
+        """A Gaussian of full width at half maximum ``fwhm_opl``, cut at four standard deviations."""
+        return cls("gaussian", fwhm_opl, center_opl)
+
+    @classmethod
+    def rectangular(cls, width_opl: float, center_opl: float = 0.0) -> Pulse:
+        """Constant over ``width_opl``."""
+        return cls("rectangular", width_opl, center_opl)
+
+    @classmethod
+    def tabulated(cls, opl: Sequence[float], values: Sequence[float], center_opl: float = 0.0) -> Pulse:
+        """A measured shape: linear between ``values`` at the lengths ``opl`` (metres, rising), zero outside them."""
+        return cls("tabulated", 0.0, center_opl, tuple(opl), tuple(values))
+
+    @classmethod
+    def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
+        """As :meth:`gaussian`, in seconds."""
+        return cls.gaussian(seconds_to_opl(fwhm_s), seconds_to_opl(center_s))
+
+    @classmethod
+    def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
+        """As :meth:`rectangular`, in seconds."""
+        return cls.rectangular(seconds_to_opl(width_s), seconds_to_opl(center_s))
+
+    @classmethod
+    def tabulated_s(cls, times_s: Sequence[float], values: Sequence[float], center_s: float = 0.0) -> Pulse:
+        """As :meth:`tabulated`, with times in seconds."""
+        lengths = seconds_to_opl(np.asarray(times_s, dtype=np.float64))
+        return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center_s))
+
+    def shifted(self, opl: float) -> Pulse:
+        """The same shape, ``opl`` metres later."""
+        return replace(self, center_opl=self.center_opl + opl)
+
+    # ------------------------------------------------------------------------------------------------ the density
+
+    @property
+    def support_opl(self) -> tuple[float, float]:
+        """First and last length where the density is not zero, in metres."""
+        if self.kind == "tabulated":
+            return self.opl[0] + self.center_opl, self.opl[-1] + self.center_opl
+        half = self.width_opl / 2
+        if self.kind == "gaussian":
+            half = CUT_STDDEVS * self.width_opl / FWHM_PER_STDDEV
+        return self.center_opl - half, self.center_opl + half
+
+    def cumulative(self, opl: Any) -> Array:
+        """Share of the pulse up to the lengths ``opl``: 0 before the support and 1 after it, in double precision."""
+        x = np.asarray(opl, dtype=np.float64) - self.center_opl
+        if self.kind == "rectangular":
+            return np.asarray(np.clip(x / self.width_opl + 0.5, 0, 1), dtype=np.float64)
+        if self.kind == "gaussian":
+            limit = CUT_STDDEVS / math.sqrt(2)
+            u = np.clip(x * (FWHM_PER_STDDEV / (self.width_opl * math.sqrt(2))), -limit, limit)
+            return np.asarray(0.5 + 0.5 * np.asarray(_erf(u), dtype=np.float64) / math.erf(limit), dtype=np.float64)
+        nodes, density = np.array(self.opl), np.array(self.values)
+        steps = np.diff(nodes)
+        sums = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * steps)])
+        x = np.clip(x, nodes[0], nodes[-1])
+        i = np.clip(np.searchsorted(nodes, x, side="right") - 1, 0, nodes.size - 2)
+        t = x - nodes[i]
+        slope = np.diff(density)[i] / steps[i]
+        return np.asarray((sums[i] + t * (density[i] + 0.5 * slope * t)) / sums[-1], dtype=np.float64)
+
+
+def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
+    """Fourier transform of a pulse (F,): what it does to a phasor at frequencies (F,) in cycles per metre.
+
+    A phasor film spreads no arrivals; ``out.phasor`` times this, one factor for each frequency, is what it would
+    measure under the pulse. One at frequency zero.
+    """
+    low, high = pulse.support_opl
+    wanted = np.atleast_1d(np.asarray(frequencies, dtype=np.float64)).ravel()
+    # Sixteen steps for every cycle of the highest frequency, and a factor for the width of a step.
+    count = max(4096, math.ceil(16 * (high - low) * float(np.abs(wanted).max(initial=0.0))))
+    edges = np.linspace(low, high, count + 1)
+    shares = np.diff(pulse.cumulative(edges))
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    waves = np.array([np.exp(-2j * np.pi * nu * middle) @ shares for nu in wanted])
+    return np.asarray(waves * np.sinc(wanted * (high - low) / count), dtype=np.complex128)
+
+
+def cumulative_of_sum(pulses: Sequence[Pulse], step: float) -> tuple[int, Array]:
+    """Cumulative distribution of the sum of independent delays, one from each pulse: the convolution of the pulses.
+
+    Returns ``(first, values)``: ``values[j]`` belongs to the length ``(first + j) step``, the first one is 0, the last
+    one 1. Exact at these lengths for one pulse, of second order in ``step`` for several. Raises UnitError without a
+    pulse.
+    """
+    if not pulses:
+        raise UnitError("cumulative_of_sum: expected at least one pulse, got none.")
+    first, masses = 0, np.ones(1)
+    for pulse in pulses:
+        low, high = pulse.support_opl
+        a, b = math.floor(low / step), math.ceil(high / step)
+        share = np.diff(pulse.cumulative(np.arange(a, max(b, a + 1) + 1) * step))
+        masses = share if masses.size == 1 else _convolve(masses, share)
+        first += a
+    values = np.concatenate([[0.0], np.cumsum(masses)])
+    # The mass of a cell stands at its centre: n pulses leave it at (n / 2) cells after the sum of their first nodes.
+    extra = len(pulses) - 1
+    first += extra // 2
+    if extra % 2:
+        values = np.concatenate([[0.0], 0.5 * (values[1:] + values[:-1]), [1.0]])
+    return first, np.asarray(values / values[-1], dtype=np.float64)
+
+
+def _convolve(a: Array, b: Array) -> Array:
+    size = a.size + b.size - 1
+    if min(a.size, b.size) <= 64:
+        return np.convolve(a, b)
+    product = np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b, size), size)
+    return np.asarray(np.maximum(product, 0.0), dtype=np.float64)
+
+
+def _number(value: Any, name: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise UnitError(f"Pulse: expected {name} to be one number in metres, got {value!r}.") from None
+    if not math.isfinite(number):
+        raise UnitError(f"Pulse: expected a finite {name}, got {number!r}.")
+    return number

@@ -1,0 +1,85 @@
+"""Walks over Mitsuba's parsed list of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torchtransient.plugins import kind_of
+
+# Direct children of the scene that matter only where something refers to them.
+_DECLARATIONS = ("BSDF", "Medium", "Texture", "Volume", "PhaseFunction", "ReconstructionFilter", "Film", "Sampler")
+
+# Mitsuba's own integrators that are written in Python.
+_PYTHON_INTEGRATORS = (
+    "prb", "prb_basic", "prb_projective", "prbvolpath", "direct_projective", "volprim_rf_basic",
+)  # fmt: skip
+
+
+def children(state: Any, node: Any) -> list[tuple[str, int]]:
+    """(property, node index) for every child object of a node, references by id included."""
+    import mitsuba as mi
+
+    result, by_id = [], state.id_to_index
+    for key, value in node.props.items():
+        if isinstance(value, mi.Properties.ResolvedReference):
+            result.append((key, value.index()))
+        elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
+            result.append((key, by_id[value.id()]))
+    return result
+
+
+def find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
+    """Index of the first child that ``matches``, None when none does."""
+    for _, index in children(state, node):
+        if matches(state.nodes[index]):
+            return index
+    return None
+
+
+def is_film(node: Any) -> bool:
+    """In dictionaries Mitsuba does not know the kind of plugins written in Python; those are told by their name."""
+    import mitsuba as mi
+
+    unknown = node.type == mi.ObjectType.Unknown and node.props.plugin_name().endswith("_film")
+    return unknown or node.type == mi.ObjectType.Film
+
+
+def is_integrator(node: Any) -> bool:
+    """As :func:`is_film`, for integrators."""
+    import mitsuba as mi
+
+    plugin = node.props.plugin_name()
+    named = plugin.startswith("transient_") or plugin in _PYTHON_INTEGRATORS
+    return node.type == mi.ObjectType.Integrator or (named and node.type == mi.ObjectType.Unknown)
+
+
+def kind_of_node(node: Any) -> str:
+    """Mitsuba's kind of a node. It does not know plugins written in Python, whose kind our registry knows."""
+    kind = str(node.type).rsplit(".", 1)[-1]
+    if kind != "Unknown":
+        return kind
+    found = kind_of(node.props.plugin_name())
+    return {"bsdf": "BSDF", "medium": "Medium", "texture": "Texture", "film": "Film"}.get(found or "", "Unknown")
+
+
+def roots(state: Any) -> list[int]:
+    """Direct children of the scene that matter even when nothing refers to them."""
+    return [index for _, index in children(state, state.root) if kind_of_node(state.nodes[index]) not in _DECLARATIONS]
+
+
+def reachable(state: Any, starts: list[int]) -> list[int]:
+    """Nodes that can be met from some nodes, those included, through nested plugins and references."""
+    seen: dict[int, None] = {}
+    waiting = list(reversed(starts))
+    while waiting:
+        index = waiting.pop()
+        if index not in seen:
+            seen[index] = None
+            waiting.extend(child for _, child in reversed(children(state, state.nodes[index])))
+    return list(seen)
+
+
+def media_in_use(state: Any) -> bool:
+    """Whether a shape, sensor or emitter that is rendered has a participating medium."""
+    return any(kind_of_node(state.nodes[index]) == "Medium" for index in reachable(state, roots(state)))

@@ -1,0 +1,140 @@
+"""The decisions of a plan that need no render: variant, integrator, film, depth by albedo, each with its reason."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torchtransient.errors import SceneError
+from torchtransient.render.census import Census, Finding
+
+OUTPUTS = ("transient", "steady", "phasor", "stokes", "gates", "bands")
+# What a plan calls the films, and the plugin that measures it.
+FILM_PLUGINS = {
+    "transient": "transient_hdr_film",
+    "steady": "transient_hdr_film",
+    "phasor": "phasor_hdr_film",
+    "gated": "gated_hdr_film",
+}
+SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
+_ALIASES = {"transient_volpath": VOLUMES}
+# Depth of integrators that say nothing, as in Mitsuba's transient plugins.
+PLUGIN_DEPTH = 6
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A decision with the line that explains it."""
+
+    value: str
+    reason: str
+
+
+def some(findings: Sequence[Finding], most: int = 3) -> str:
+    """The first few findings as text."""
+    named = "; ".join(str(finding) for finding in findings[:most])
+    return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
+
+
+def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
+    """The outputs as a tuple. Raises ``SceneError`` for unknown ones, and for two that need different films."""
+    asked = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    unknown = [name for name in asked if name not in OUTPUTS]
+    if unknown or not asked:
+        raise SceneError(f"tt.plan: outputs are some of {', '.join(OUTPUTS)}; got {list(asked)}.")
+    films = [name for name in asked if name in ("transient", "phasor", "gates")]
+    if len(set(films)) > 1:
+        raise SceneError(
+            f"tt.plan: a film measures one of transient, phasor and gates, got {' and '.join(films)}; make a plan for "
+            "each."
+        )
+    return asked
+
+
+def choose_film(census: Census, outputs: Sequence[str]) -> Choice:
+    """steady, transient, phasor or gated."""
+    if "phasor" in outputs:
+        return Choice("phasor", "film: phasor, since phasors are asked for; no time axis is stored")
+    if "gates" in outputs:
+        return Choice("gated", "film: gated, since gates are asked for")
+    if "steady" in outputs and "transient" not in outputs:
+        return Choice("steady", "film: steady, one bin for all times, since nothing over time is asked for")
+    asked = "transients are" if "transient" in outputs else f"{outputs[0]} over time is"
+    return Choice("transient", f"film: transient, since {asked} asked for")
+
+
+def choose_variant(census: Census, outputs: Sequence[str], device: str, strict: bool) -> tuple[Choice, list[str]]:
+    """The cheapest variant in which nothing of the scene that was asked for is lost, and what is approximated."""
+    spectral = bool(census.measured or census.bands or "bands" in outputs)
+    if "bands" in outputs and not census.bands:
+        raise SceneError(
+            "tt.plan: bands are asked for, and no film has response curves. Give the film spectra as children, such as "
+            "'red': {'type': 'spectrum', 'value': [(600, 0.0), (650, 1.0), (700, 0.0)]}."
+        )
+    colour, colour_why = _colour(census, spectral)
+    polarized, polarization_why, notes = _polarization(census, outputs, strict)
+    if polarized and colour == "rgb":
+        colour, colour_why = "spectral", f"{colour_why}, and Mitsuba has no polarized RGB variant"
+    name = f"{device}_ad_{colour}" + ("_polarized" if polarized else "")
+    return Choice(name, f"variant: {name}; {colour_why}; {polarization_why}"), notes
+
+
+def _colour(census: Census, spectral: bool) -> tuple[str, str]:
+    if census.bands:
+        return "spectral", f"wavelengths, since the film has bands: {some(census.bands)}"
+    if spectral:
+        return "spectral", f"wavelengths, which three numbers cannot stand in for: {some(census.measured)}"
+    if census.colours:
+        return "rgb", f"colour: {some(census.colours)}"
+    return "mono", "every spectrum is grey, so that one channel carries all of it"
+
+
+def _polarization(census: Census, outputs: Sequence[str], strict: bool) -> tuple[bool, str, list[str]]:
+    if "stokes" in outputs:
+        return True, "polarized, since Stokes vectors are asked for", []
+    if census.integrator == "stokes":
+        return True, "polarized, since the scene's own integrator is stokes", []
+    if census.elements:
+        return True, f"polarized, since it changes the intensity: {some(census.elements)}", []
+    if not census.interfaces:
+        return False, "unpolarized, since nothing polarizes light", []
+    if not census.interfaces_in_a_row:
+        return False, f"unpolarized, which is exact: a single flat surface polarizes, {some(census.interfaces)}", []
+    if strict:
+        return True, f"polarized (strict), since light can meet several of these: {some(census.interfaces)}", []
+    note = (
+        "approximation: the light between polarizing surfaces is taken as unpolarized, as unpolarized renderers do; "
+        f"strict=True carries it. Found: {some(census.interfaces)}"
+    )
+    return False, "unpolarized, see the approximation", [note]
+
+
+def choose_integrator(census: Census) -> tuple[Choice, list[str]]:
+    """Surface or volume; a transient integrator of the scene that is neither is kept."""
+    notes = [
+        f"not used: {some(census.declared_only)}, declared and referred to by nothing"
+    ] if census.declared_only else []  # fmt: skip
+    own = census.integrator or ""
+    if own.startswith("transient_") and _ALIASES.get(own, own) not in (SURFACES, VOLUMES):
+        return Choice(own, f"integrator: {own}, the scene's own"), notes
+    if census.media:
+        return Choice(VOLUMES, f"integrator: {VOLUMES}, since the scene has {some(census.media)}"), notes
+    return Choice(SURFACES, f"integrator: {SURFACES}, since no medium can be reached from the scene"), notes
+
+
+def depth_by_albedo(census: Census, tail: float) -> tuple[int | None, str]:
+    """The depth at which at most ``tail`` of the emitted power is still on its way, if the albedos bound it."""
+    if census.albedo >= 1:
+        kept = PLUGIN_DEPTH if census.max_depth is None else census.max_depth
+        return None, (
+            f"max_depth: {kept}, kept; not bounded, since {census.brightest} may reflect everything and no pilot run "
+            "was asked for"
+        )
+    bounces = 1 if census.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(census.albedo)))
+    depth = bounces + 1
+    left = census.albedo**bounces
+    return depth, (
+        f"max_depth: {depth}; no albedo exceeds {census.albedo:.4g} ({census.brightest}), so that after {bounces} "
+        f"bounces at most {left:.2g} of the emitted power is left"
+    )

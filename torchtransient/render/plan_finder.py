@@ -1,0 +1,262 @@
+"""The decisions of a plan that may need a pilot run: depth, time axis, temporal filter."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import GradientError, SceneError
+from torchtransient.gates import Gate
+from torchtransient.pulses import Pulse
+from torchtransient.render import plan_choices as choices
+from torchtransient.render.build import BuildOptions
+from torchtransient.render.census import Census
+from torchtransient.render.engine import no_slope
+from torchtransient.render.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
+from torchtransient.render.scene_handle import load, unknown_key
+from torchtransient.render.variant import active_variant
+
+if TYPE_CHECKING:
+    from torchtransient.render.plan import Plan
+
+PILOT_PATHS = 32768
+PILOT_PIXELS = 2048
+# One bin for all times: far beyond the light of any scene when no pilot run says how far it goes.
+_ALL_TIMES = 1e9
+
+
+def _share(part: float, error: float) -> str:
+    return f"{part:.2g} +- {error:.1g} of the light" if part > 0 else "no light of the pilot run"
+
+
+def _seen(gates: Sequence[Gate], pulses: Sequence[Pulse]) -> tuple[Gate, ...]:
+    """Gates as light sees them that pulses spread."""
+    seen = tuple(gates)
+    for pulse in pulses:
+        seen = tuple(gate.spread(pulse) for gate in seen)
+    return seen
+
+
+class Finder:
+    """The decisions that may need a render: depth, window, temporal filter."""
+
+    def __init__(self, draft: Plan, census: Census, tail: float, missed: float, seed: int):
+        self.draft, self.census, self.tail, self.missed = draft, census, tail, missed
+        self.seed = seed
+        self.arrivals: Arrivals | None = None
+        self.report: PilotReport | None = None
+        self.reasons: list[str] = list(draft.reasons)
+        # How far before and after its arrival a pulse or an impulse response spreads light.
+        self.spread = (0.0, 0.0)
+
+    def settle(
+        self,
+        pilot: bool,
+        max_depth: int | str | None,
+        time_axis: TimeAxis | str | None,
+        bins: tuple[int | None, float | None],
+        temporal_filter: str | None,
+    ) -> Plan:
+        wants_axis = self.draft.film == "transient" and time_axis is None
+        if pilot and (max_depth is None or wants_axis):
+            self._run()
+        depth = self._depth(max_depth)
+        axis = self._axis(time_axis, bins, depth)
+        chosen = self._filter(temporal_filter)
+        if self.report is not None:
+            self.reasons.append(self._pilot_line())
+        return replace(
+            self.draft,
+            max_depth=depth,
+            time_axis=axis,
+            temporal_filter=chosen,
+            reasons=tuple(self.reasons),
+            pilot=self.report,
+        )
+
+    def _run(self) -> None:
+        """The pilot run, without polarization: it costs most of the time and changes neither depth nor time."""
+        started = time.perf_counter()
+        variant = self.draft.variant.removesuffix("_polarized")
+        scene = load(self.draft.scene, variant=variant)
+        gated = self.draft.film == "gated"
+        options = BuildOptions(
+            time_axis=None if gated else (0.0, 1.0, 1),
+            gates=self.draft.gates,
+            merge=True,
+            transient=True,
+            integrator=self.draft.integrator,
+            pulse=self.draft.pulse,
+            irf=self.draft.irf,
+        )
+        with active_variant(variant):
+            from torchtransient.plugins.integrators.pilot import pilot_events
+
+            built = scene.built(options).scene
+            sensors = built.sensors()
+            if not 0 <= self.draft.sensor < len(sensors):
+                raise SceneError(
+                    f"sensor: the scene has {len(sensors)}, numbered from 0; got {self.draft.sensor}. Give an index."
+                )
+            film = sensors[self.draft.sensor].film()
+            pulses = getattr(film, "pulses", [])
+            self.spread = tuple(sum(p.support_opl[side] for p in pulses) for side in (0, 1))
+            events = pilot_events(
+                built, built.integrator(), self.draft.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
+            )
+            scene.drop(options)
+        found = Arrivals(events)
+        if gated:
+            found = found.through(_seen(film.gates, pulses))
+        self.arrivals = found
+        dark = found.dark
+        self.report = PilotReport(
+            variant=variant,
+            paths=found.paths,
+            events=len(found.opl),
+            seconds=time.perf_counter() - started,
+            relative_error=float("nan") if dark else found.relative_error(),
+            tail=0.0,
+            tail_error=0.0,
+            first_opl=float("nan") if dark else float(found.opl.min()),
+            last_opl=float("nan") if dark else float(found.opl.max()),
+        )
+
+    def _pilot_line(self) -> str:
+        report = self.report
+        if report is None:
+            raise SceneError("tt.plan: no pilot run was made.")
+        dark = self.arrivals is None or self.arrivals.dark
+        error = "no light at all" if dark else f"image mean within {report.relative_error:.1%}"
+        return (
+            f"pilot: {report.paths} paths in {report.variant}, {report.events} arrivals, {error}; light that fewer "
+            f"than one path in {max(report.paths // 3, 1)} meets may have been overlooked"
+        )
+
+    # ------------------------------------------------------------------------------------------------------ depth
+
+    def _depth(self, given: int | str | None) -> int | None:
+        own = choices.PLUGIN_DEPTH if self.census.max_depth is None else self.census.max_depth
+        if isinstance(given, str) and given != "scene":
+            raise SceneError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
+        if given is not None:
+            depth = own if given == "scene" else int(given)
+            self._note_tail(depth)
+            self.reasons.append(f"max_depth: {depth}, as asked for{self._beyond(depth)}")
+            return depth
+        if self.arrivals is None:
+            depth, reason = choices.depth_by_albedo(self.census, self.tail)
+            self.reasons.append(reason)
+            return depth
+        if self.arrivals.dark:
+            self.reasons.append(f"max_depth: {own}, kept, since the pilot run saw no light")
+            return None
+        from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
+
+        depth = self.arrivals.enough_depth(self.tail)
+        self._note_tail(depth)
+        reason = f"max_depth: {depth}{self._beyond(depth)}, asked for was {self.tail:g}"
+        if depth >= PILOT_DEPTH:
+            reason += f"; the pilot run went no deeper than {PILOT_DEPTH}, so light beyond it is not bounded"
+        if own != -1 and own < depth:
+            reason += f"; at the scene's own {own} it would be {self.arrivals.share(self.arrivals.depth > own)[0]:.2g}"
+        self.reasons.append(reason)
+        return depth
+
+    def _note_tail(self, depth: int) -> None:
+        if self.arrivals is not None and self.report is not None and not self.arrivals.dark and depth > 0:
+            part, error = self.arrivals.share(self.arrivals.depth > depth)
+            self.report = replace(self.report, tail=part, tail_error=error)
+
+    def _beyond(self, depth: int) -> str:
+        if self.arrivals is None or self.report is None or self.arrivals.dark or depth < 0:
+            return ""
+        return f"; {_share(self.report.tail, self.report.tail_error)} in deeper paths"
+
+    # ----------------------------------------------------------------------------------------------------- window
+
+    def _axis(
+        self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None
+    ) -> TimeAxis | None:
+        if self.draft.film in ("phasor", "gated"):
+            if given is not None or bins != (None, None):
+                raise SceneError(f"tt.plan: a {self.draft.film} film has no time axis; leave time_axis and bins out.")
+            return None
+        if isinstance(given, TimeAxis):
+            self.reasons.append(f"time axis: {given}, as asked for")
+            return given
+        if given is not None and given != "scene":
+            raise SceneError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {given!r}.")
+        if self.draft.film == "steady":
+            last = _ALL_TIMES if self.arrivals is None or self.arrivals.dark else 4 * float(self.arrivals.opl.max())
+            return TimeAxis(0.0, last, 1)
+        if given == "scene" or self.arrivals is None or self.arrivals.dark:
+            return self._own_axis(given, bins)
+        return self._found_axis(self.arrivals, bins, depth)
+
+    def _own_axis(self, given: str | None, bins: tuple[int | None, float | None]) -> TimeAxis:
+        why = "as asked for" if given == "scene" else "without a pilot run"
+        if given is None and self.arrivals is not None:
+            why = "since the pilot run saw no light"
+        if bins != (None, None):
+            raise SceneError(
+                f"tt.plan: num_bins and bin_width_opl have no effect on the scene's own axis, taken {why}."
+            )
+        if self.census.film_axis is None:
+            raise SceneError(
+                f"tt.plan: the scene's film has no time axis, which would be taken {why}. Give "
+                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...), or let a pilot run find one."
+            )
+        axis = TimeAxis(*self.census.film_axis)
+        self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
+        return axis
+
+    def _found_axis(self, arrivals: Arrivals, bins: tuple[int | None, float | None], depth: int | None) -> TimeAxis:
+        num_bins, width = bins
+        first, last = arrivals.window(depth or -1, self.missed)
+        how = ""
+        if width is None and num_bins is None and self.census.film_axis is not None:
+            width, how = self.census.film_axis[1], ", bin width of the scene's film"
+            if (last - first) / width > MOST_BINS:
+                width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
+        if self.spread != (0.0, 0.0):
+            how += f", widened by pulse and response from {self.spread[0]:g} to {self.spread[1]:+g} m"
+        axis = axis_over(first + self.spread[0], last + self.spread[1], width, num_bins)
+        kept = arrivals.depth <= depth if depth is not None and depth > 0 else arrivals.depth > 0
+        part, error = arrivals.share(kept & ((arrivals.opl < axis.start_opl) | (arrivals.opl >= axis.end_opl)))
+        if self.report is not None:
+            self.report = replace(self.report, missed=part, missed_error=error)
+        self.reasons.append(
+            f"time axis: {axis}{how}; {_share(part, error)} outside, asked for was {self.missed:g}; the pilot run's "
+            f"last arrival came at {float(arrivals.opl.max()):.4g} m"
+        )
+        return axis
+
+    # --------------------------------------------------------------------------------------------- temporal filter
+
+    def _filter(self, given: str | None) -> str:
+        if self.draft.film in ("phasor", "gated"):
+            if given is not None:
+                raise SceneError(f"tt.plan: a {self.draft.film} film takes no temporal filter; leave it out.")
+            return ""
+        table = self.draft.scene.parameters() if self.draft.parameters else {}
+        for key in self.draft.parameters:
+            if key not in table:
+                raise SceneError(unknown_key(key, list(table)))
+        moving = [key for key in self.draft.parameters if table[key].moves_path_length]
+        own = self.census.temporal_filter or "box"
+        if given is not None:
+            if given == "box" and moving and not (self.draft.pulse or self.draft.irf or self.census.pulsed):
+                raise GradientError(no_slope(moving, given))
+            self.reasons.append(f"temporal filter: {given}, as asked for")
+            return given
+        if moving and own == "box" and not (self.draft.pulse or self.draft.irf or self.census.pulsed):
+            self.reasons.append(f"temporal filter: tent, since {moving[0]} changes path lengths and a box has no slope")
+            return "tent"
+        if self.draft.film != "steady":
+            why = "the scene's own" if self.census.temporal_filter else "since no parameter changes a path length"
+            self.reasons.append(f"temporal filter: {own}, {why}")
+        return own

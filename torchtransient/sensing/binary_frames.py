@@ -1,0 +1,59 @@
+"""Quanta sensors: binary frames that say whether at least one photon came."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.layout import TIME, check_count, check_transient
+from torchtransient.sensing.policies import GradPolicy
+from torchtransient.sensing.sensor import RandomSensor
+
+
+def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
+    """Photons per frame from the number of frames that saw any: -log(1 - counts/frames), any shape.
+
+    A pixel that fired in every frame is given the rate of a share 1 - 1/(2 frames). Differentiable.
+    """
+    number = check_count(frames, "frames", "frames_to_rate")
+    return -torch.log1p(-(counts / number).clamp(0, 1 - 1 / (2 * number)))
+
+
+class BinaryFrames(RandomSensor):
+    """Counts (..., C, T, H, W) of frames, out of `frames`, that saw a photon, from the mean photons of one frame.
+
+    Every bin along T is a gate or moment of its own, exposed `frames` times, so that bins are independent binomials
+    with probability 1 - exp(-mean). All four policies. Source: Fossum et al., Sensors 16 (2016).
+    """
+
+    def __init__(self, frames: int, *, grad: GradPolicy = "expected") -> None:
+        super().__init__(grad)
+        self.frames = check_count(frames, "frames", "BinaryFrames")
+
+    def expected(self, x: Tensor) -> Tensor:
+        return -torch.expm1(-check_transient(x, "BinaryFrames")) * self.frames
+
+    def variance(self, x: Tensor) -> Tensor:
+        variance: Tensor = -torch.expm1(-x) * torch.exp(-x) * self.frames
+        return variance
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        check_transient(x, "BinaryFrames")
+        if bool((x < 0).any()):
+            raise UnitError("BinaryFrames: expected mean photons >= 0, got negative ones.")
+        work = x.detach().float() if x.dtype in (torch.float16, torch.bfloat16) else x.detach()
+        p = -torch.expm1(-work)
+        return torch.binomial(torch.full_like(p, float(self.frames)), p, generator=generator).to(x.dtype)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        n, r = measurement.double(), x.double()
+        hit = n > 0
+        fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
+        value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * (self.frames - n)
+        total = torch.lgamma(torch.tensor(self.frames + 1.0, dtype=torch.float64))
+        value = value + total - torch.lgamma(n + 1) - torch.lgamma(self.frames - n + 1)
+        return value.sum(TIME).to(x.dtype)
+
+    def extra_repr(self) -> str:
+        return f"frames={self.frames}, {super().extra_repr()}"

@@ -1,0 +1,175 @@
+"""Sensors in a row, after a renderer or inside a data set; and the adjoint of linear ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
+from torchtransient.sensing.itof import ItofCorrelation
+from torchtransient.sensing.policies import GradPolicy, check_policy
+from torchtransient.sensing.sensor import RandomSensor, Sensor
+
+# Two axes are the same when their bins agree to a millionth of a bin over the whole length.
+_SAME_BIN = 1e-6
+
+
+class Compose(Sensor):
+    """Stages in the order in which light meets them: ``Compose([budget, response, detector])``.
+
+    Stages are sensors, or other modules of one tensor. The input is a transient (..., C, T, H, W), or what a renderer
+    returns (an object with ``transient``, ``phasor`` and ``axis``): its axis is compared with those of the stages, and
+    a phasor image goes to an `ItofCorrelation` in front. ``grad``: set this policy in every random stage; None leaves
+    them as they are.
+
+    ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
+    order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
+    results. Raises ShapeError for no stage or something that is no module, UnitError for axes that disagree.
+    """
+
+    def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
+        super().__init__()
+        wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
+        if not len(stages) or wrong:
+            raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
+        self.stages = nn.ModuleList(stages)
+        if grad is not None:
+            self.set_grad(grad)
+
+    def set_grad(self, grad: GradPolicy) -> Compose:
+        """Use this gradient policy in every random stage, nested ones too; returns the chain."""
+        policy = check_policy(grad, "Compose")
+        for module in self.modules():
+            if isinstance(module, RandomSensor):
+                module.grad = policy
+        return self
+
+    def expected(self, x: Any) -> Tensor:
+        """The chain of the stages' means; see the class."""
+        return self._run(x, lambda stage, y: stage.expected(y) if isinstance(stage, Sensor) else stage(y))
+
+    def forward(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
+        """The measurement, every random stage under its own policy and with the same generator in turn."""
+        return self._run(x, lambda stage, y: stage(y, generator=generator) if isinstance(stage, Sensor) else stage(y))
+
+    def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
+        """One draw of every random stage, whatever its policy, without gradient."""
+
+        def draw(stage: nn.Module, y: Tensor) -> Any:
+            if isinstance(stage, (RandomSensor, Compose)):
+                return stage.sample(y, generator)
+            return stage.expected(y) if isinstance(stage, Sensor) else stage(y)
+
+        with torch.no_grad():
+            return self._run(x, draw)
+
+    def _run(self, x: Any, step: Callable[[nn.Module, Tensor], Any]) -> Tensor:
+        stages = list(self.stages)
+        if isinstance(x, Tensor):
+            y = x
+        else:
+            y, used = self._opened(x)
+            stages = stages[used:]
+        for stage in stages:
+            y = step(stage, y)
+        return y
+
+    def _opened(self, output: Any) -> tuple[Tensor, int]:
+        """The tensor of a renderer's output, and how many stages it has passed already."""
+        transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
+        if isinstance(transient, Tensor):
+            self.check_axis(output.axis)
+            return transient, 0
+        first = self.stages[0]
+        if isinstance(phasor, Tensor) and isinstance(output.frequencies, FrequencyAxis):
+            if isinstance(first, Compose):
+                raise ShapeError("Compose: expected ItofCorrelation as the first stage itself, not in a chain.")
+            if not isinstance(first, ItofCorrelation):
+                raise ShapeError(f"Compose: expected ItofCorrelation as the first stage, got {type(first).__name__}.")
+            return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), 1
+        raise ShapeError(
+            f"Compose: expected a tensor (..., C, T, H, W) or the output of a renderer, got {type(output).__name__}."
+        )
+
+    def check_axis(self, axis: TimeAxis) -> None:
+        """UnitError when a stage was made for other bins than those of ``axis``."""
+        for name, module in self.named_modules():
+            own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
+            if isinstance(own, TimeAxis):
+                slack = _SAME_BIN * axis.bin_width_opl
+                same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
+                same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
+            elif isinstance(width_s, float):
+                own, same = width_s, abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
+            else:
+                continue
+            if not same:
+                raise UnitError(
+                    f"Compose: expected the axis of stage '{name}' ({type(module).__name__}: {own}), got {axis}. Make "
+                    "the sensor with the renderer's axis."
+                )
+
+
+def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
+    """``A^T y``: the transpose of a sensor's mean, exactly, for inputs of ``input_shape``; dtype and device of ``y``.
+
+    ``A`` is the linear part of `expected`, ``x -> expected(x) - expected(0)``; a sensor that is not linear gives the
+    transpose of its derivative at zero: see `linearity_error`. Raises ShapeError when ``y`` is no output for that
+    shape.
+    """
+    x = torch.zeros(tuple(input_shape), dtype=y.dtype, device=y.device, requires_grad=True)
+    with torch.enable_grad():
+        out = sensor.expected(x)
+        if out.shape != y.shape:
+            raise ShapeError(
+                f"adjoint: expected y {tuple(out.shape)} for inputs {tuple(input_shape)}, got {tuple(y.shape)}."
+            )
+        if not out.requires_grad:
+            raise GradientError(f"adjoint: expected a sensor with gradients, but {type(sensor).__name__} has none.")
+        (gradient,) = torch.autograd.grad(out, x, y)
+    return gradient
+
+
+def linearity_error(sensor: Sensor, x: Tensor) -> float:
+    """``|A(2 x) - 2 A(x)| / |A(2 x)|`` of the mean without its offset: rounding for a linear sensor."""
+    with torch.no_grad():
+        offset = sensor.expected(torch.zeros_like(x))
+        once, twice = sensor.expected(x) - offset, sensor.expected(2 * x) - offset
+        return float((twice - 2 * once).abs().max() / twice.abs().max().clamp_min(torch.finfo(x.dtype).tiny))
+
+
+def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, check: bool = True) -> Any:
+    """The sensor as a DeepInverse physics, ``y = physics(x)`` with x (B, C, T, H, W).
+
+    With ``img_size`` (C, T, H, W): a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from
+    them (``check`` tries the linearity on random light first: UnitError when it fails by more than 1e-4). Without: a
+    `Physics` of any sensor, with ``A`` and ``A_vjp``. Raises StorageError when ``deepinv`` is not installed (``pip
+    install 'torchtransient[deepinv]'``).
+    """
+    try:
+        from torchtransient.sensing import deepinverse
+    except ImportError as error:
+        raise StorageError(
+            f"deepinv_physics: expected the package deepinv to be installed ({error}); pip install "
+            "'torchtransient[deepinv]'."
+        ) from error
+    if img_size is None:
+        return deepinverse.SensorPhysics(sensor)
+    size = tuple(int(n) for n in img_size)
+    if check:
+        _check_linear(sensor, size)
+    return deepinverse.LinearSensorPhysics(sensor, size)
+
+
+def _check_linear(sensor: Sensor, size: tuple[int, ...]) -> None:
+    light = torch.rand((1, *size), generator=torch.Generator().manual_seed(0))
+    error = linearity_error(sensor, light)
+    if error > 1e-4:
+        raise UnitError(
+            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {error:.1e} at double "
+            "the light. Leave img_size out for a physics that is not linear."
+        )

@@ -1,0 +1,237 @@
+"""Devices as data: sensors described by plain dictionaries, to be kept in files and built for a time axis.
+
+A stage is a dictionary with a ``kind`` (a name in `KINDS`) and the arguments of that class or function; arguments may
+be stages themselves (a response, a code). The strings ``"@axis"`` and ``"@num_bins"`` stand for the axis that the
+sensor is built for. Only kinds in the list are ever called, so that a file from elsewhere runs no code of its own.
+
+    device = tt.sensing.device("kinect_v2_like")
+    sensor = device.sensor(axis, grad="gaussian")          # a Compose, behind a TransientRenderer with that axis
+    device.to_json(path);  Device.from_json(path) == device
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.sensing.afterpulsing import Afterpulsing, Crosstalk
+from torchtransient.sensing.binary_frames import BinaryFrames
+from torchtransient.sensing.compose import Compose
+from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
+from torchtransient.sensing.electronics import PixelElectronics
+from torchtransient.sensing.free_running import FreeRunningSPAD
+from torchtransient.sensing.gated import GatedIntegration
+from torchtransient.sensing.impulse_response import (
+    ComposedResponse,
+    GaussianResponse,
+    ImpulseResponse,
+    MeasuredResponse,
+    TailedResponse,
+    UniformResponse,
+)
+from torchtransient.sensing.itof import ItofCorrelation
+from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
+from torchtransient.sensing.policies import GradPolicy
+from torchtransient.sensing.shot_noise import ShotNoise
+from torchtransient.sensing.spad import SynchronousSPAD
+from torchtransient.sensing.spatial_psf import LensBlur
+from torchtransient.sensing.streak import StreakCamera, SweepJitter
+from torchtransient.sensing.tdc import TDC, random_code_widths
+
+
+def _seeded_code_widths(num_bins: int, dnl_std: float, seed: int = 0) -> torch.Tensor:
+    """The same random TDC wherever the file is read."""
+    return random_code_widths(num_bins, dnl_std, torch.Generator().manual_seed(seed))
+
+
+def _tensor(values: Any) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+KINDS: Mapping[str, Callable[..., Any]] = {
+    **{
+        made.__name__: made
+        for made in (
+            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
+            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCorrelation,
+            LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic, ShotNoise,
+            StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse,
+            fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
+        )
+    },
+    "polarsens": PolarizationMosaic.polarsens,
+    "tdc_code_widths": _seeded_code_widths,
+    "tensor": _tensor,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Device:
+    """A named sensor: its stages, what they stand for, and where its numbers are from.
+
+    ``sources``: one line each, with "assumed:" in front of numbers that no source gives. ``stages``: dictionaries as
+    above. ``bin_width_s`` and ``num_bins``: what the device records with, for `axis`; None where it has no bins.
+    Plain data: equal when all of it is. Raises StorageError for a stage that is no such dictionary.
+    """
+
+    name: str
+    description: str
+    sources: tuple[str, ...]
+    stages: tuple[dict[str, Any], ...]
+    bin_width_s: float | None = None
+    num_bins: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sources", tuple(self.sources))
+        object.__setattr__(self, "stages", tuple(copy.deepcopy(s) for s in self.stages))
+        if not self.stages:
+            raise StorageError(f"Device '{self.name}': expected at least one stage, got none.")
+        for stage in self.stages:
+            _check_spec(stage, self.name)
+
+    def axis(self, start_s: float = 0.0) -> TimeAxis:
+        """The device's own bins from ``start_s`` on. Raises StorageError for a device without bins."""
+        if self.bin_width_s is None or self.num_bins is None:
+            raise StorageError(f"Device '{self.name}': expected bin_width_s and num_bins, but it records no bins.")
+        return TimeAxis.from_seconds(start_s, self.bin_width_s, self.num_bins)
+
+    def sensor(self, axis: TimeAxis | None = None, *, grad: GradPolicy = "expected") -> Compose:
+        """The chain of modules for transients on ``axis`` (by default `axis()`, from t = 0), under one policy."""
+        if axis is None and self.bin_width_s is not None:
+            axis = self.axis()
+        stages = [build_stage(s, axis) for s in self.stages]
+        wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
+        if wrong:
+            raise StorageError(f"Device '{self.name}': expected stages that are modules, got {', '.join(wrong)}.")
+        return Compose(stages, grad=grad)
+
+    def changed(self, stage: int | str, **arguments: Any) -> Device:
+        """The same device with other arguments of one stage: its number, or its kind where that is there once."""
+        kinds = [s["kind"] for s in self.stages]
+        if isinstance(stage, str) and kinds.count(stage) != 1:
+            raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got the stages {kinds}.")
+        number = kinds.index(stage) if isinstance(stage, str) else stage
+        stages = [copy.deepcopy(s) for s in self.stages]
+        stages[number].update(arguments)
+        return Device(self.name, self.description, self.sources, tuple(stages), self.bin_width_s, self.num_bins)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists, dictionaries, numbers and strings."""
+        return {
+            "name": self.name,
+            "description": self.description,
+            "sources": list(self.sources),
+            "stages": copy.deepcopy(list(self.stages)),
+            "bin_width_s": self.bin_width_s,
+            "num_bins": self.num_bins,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Device:
+        """What `to_dict` made. Raises StorageError for missing or unknown entries."""
+        wanted = {"name", "description", "sources", "stages"}
+        found = set(data) if isinstance(data, Mapping) else set()
+        if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
+            raise StorageError(f"Device: expected the entries {sorted(wanted)}, got {sorted(found)}.")
+        return cls(
+            data["name"], data["description"], data["sources"], data["stages"],
+            data.get("bin_width_s"), data.get("num_bins"),
+        )  # fmt: skip
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """JSON text, also written to ``path`` when given. Raises StorageError for what JSON cannot hold."""
+        try:
+            text = json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise StorageError(f"Device '{self.name}': expected numbers, strings and lists only: {error}.") from error
+        if path is not None:
+            Path(path).write_text(text + "\n", encoding="utf-8")
+        return text
+
+    @classmethod
+    def from_json(cls, source: str | Path) -> Device:
+        """A device from a file (a `Path`, or a name without a brace) or from JSON text. Raises StorageError."""
+        try:
+            return cls.from_dict(json.loads(_text(source, "{")))
+        except (OSError, json.JSONDecodeError) as error:
+            raise StorageError(f"Device.from_json: expected a JSON file or text: {error}.") from error
+
+    def to_yaml(self, path: str | Path | None = None) -> str:
+        """YAML text, also written to ``path`` when given. Needs PyYAML (``pip install torchtransient[yaml]``)."""
+        text: str = _yaml().safe_dump(json.loads(self.to_json()), sort_keys=False)
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
+
+    @classmethod
+    def from_yaml(cls, source: str | Path) -> Device:
+        """A device from a YAML file or text, read by the safe loader. Raises StorageError."""
+        yaml = _yaml()
+        try:
+            return cls.from_dict(yaml.safe_load(_text(source, "\n")))
+        except (OSError, yaml.YAMLError) as error:
+            raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
+
+
+def build_stage(spec: Any, axis: TimeAxis | None = None) -> Any:
+    """The object that a stage stands for: a sensor, response, code, or the value itself where it is no dictionary.
+
+    Raises StorageError for an unknown kind, an argument that the kind does not take, or a placeholder without axis;
+    errors of the values themselves (UnitError, ShapeError) pass.
+    """
+    if isinstance(spec, str) and spec.startswith("@"):
+        if spec not in ("@axis", "@num_bins"):
+            raise StorageError(f"build_stage: expected '@axis' or '@num_bins', got {spec!r}.")
+        if axis is None:
+            raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
+        return axis if spec == "@axis" else axis.num_bins
+    if isinstance(spec, (list, tuple)):
+        return [build_stage(s, axis) for s in spec]
+    if not isinstance(spec, dict) or "kind" not in spec:
+        return spec
+    _check_spec(spec, "build_stage")
+    arguments = {k: build_stage(v, axis) for k, v in spec.items() if k != "kind"}
+    try:
+        return KINDS[spec["kind"]](**arguments)
+    except TorchTransientError:
+        raise
+    except TypeError as error:
+        raise StorageError(
+            f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
+        ) from error
+
+
+def _check_spec(spec: Any, where: str) -> None:
+    kind = spec.get("kind") if isinstance(spec, dict) else None
+    if not isinstance(kind, str) or kind not in KINDS:
+        known = ", ".join(sorted(KINDS))
+        raise StorageError(f"Device '{where}': expected a dictionary with a kind out of {known}; got {kind or spec!r}.")
+    for value in spec.values():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
+        if isinstance(value, dict) and "kind" in value:
+            _check_spec(value, where)
+
+
+def _text(source: str | Path, mark: str) -> str:
+    return source if isinstance(source, str) and mark in source else Path(source).read_text(encoding="utf-8")
+
+
+def _yaml() -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        raise StorageError("Device: expected PyYAML to be installed; pip install 'torchtransient[yaml]'.") from error
+    return yaml

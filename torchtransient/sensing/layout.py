@@ -1,0 +1,73 @@
+"""Checks that every sensor makes on its arguments: the layout (..., C, T, H, W), units, time axes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+
+TIME = -3  # the time dimension of (..., C, T, H, W)
+
+
+def check_transient(x: Tensor, where: str) -> Tensor:
+    """`x` when it is a floating tensor (..., C, T, H, W), else ShapeError or UnitError."""
+    if not isinstance(x, Tensor) or x.ndim < 4:
+        shape = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
+        raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {shape}. Add the missing dimensions.")
+    if not x.is_floating_point():
+        raise UnitError(f"{where}: expected a floating dtype, got {x.dtype}. Convert with .float().")
+    return x
+
+
+def check_number(
+    value: float, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
+) -> float:
+    """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise UnitError(f"{where}: expected {name} to be one number, got {value!r}.") from None
+    below = number <= low if open_low else number < low
+    if not math.isfinite(number) or below or number > high:
+        left = "(" if open_low else "["
+        raise UnitError(f"{where}: expected {name} in {left}{low:g}, {high:g}], got {number!r}.")
+    return number
+
+
+def check_count(value: float, name: str, where: str, *, low: int = 1) -> int:
+    """`value` as an int when it is a whole number >= low, else UnitError."""
+    number = check_number(value, name, where, low=low)
+    if number != int(number):
+        raise UnitError(f"{where}: expected {name} to be a whole number, got {value!r}.")
+    return int(number)
+
+
+def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> float:
+    """Bin width in seconds from a TimeAxis or a number; exactly one of them. UnitError otherwise.
+
+    A width of a second or more is refused: it is most likely given in nanoseconds, picoseconds or bins.
+    """
+    if (axis is None) == (bin_width_s is None):
+        raise UnitError(f"{where}: expected either axis= (a TimeAxis) or bin_width_s=, got both or neither.")
+    if axis is not None:
+        if not isinstance(axis, TimeAxis):
+            raise UnitError(f"{where}: expected axis to be a TimeAxis, got {type(axis).__name__}.")
+        return axis.bin_width_s
+    return check_seconds(bin_width_s if bin_width_s is not None else 0.0, "bin_width_s", where, open_low=True)
+
+
+def check_seconds(value: float, name: str, where: str, *, open_low: bool = False) -> float:
+    """A duration in seconds, finite, not negative, below 1 s; UnitError otherwise (picoseconds given as seconds)."""
+    number = check_number(value, name, where, open_low=open_low)
+    if number >= 1.0:
+        raise UnitError(f"{where}: expected {name} in seconds, got {number!r} s. Picoseconds or bins? 50 ps is 50e-12.")
+    return number
+
+
+def accumulator(x: Tensor) -> Tensor:
+    """`x` in float64, in which running sums over many bins keep their digits."""
+    return x.to(torch.float64)

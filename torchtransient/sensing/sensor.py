@@ -1,0 +1,74 @@
+"""The two bases of what happens after the light arrives: deterministic sensors and random ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import GradientError
+from torchtransient.sensing.policies import (
+    GradPolicy,
+    check_policy,
+    gaussian_noise,
+    record_score,
+    straight_through,
+)
+
+
+class Sensor(nn.Module):
+    """Maps a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
+
+    `forward` takes `generator` in every sensor, so that chains need not know which of their links are random.
+    """
+
+    def expected(self, x: Tensor) -> Tensor:
+        """The mean of the measurement, differentiable in `x` and in the parameters."""
+        raise NotImplementedError(f"{type(self).__name__} has to define expected(x).")
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """`expected(x)`. `generator` is taken and not needed: nothing here is random."""
+        return self.expected(x)
+
+
+class RandomSensor(Sensor):
+    """A sensor that draws. `grad` says what `forward` returns and how gradients pass (see `policies`).
+
+    A subclass defines `expected`, `sample`, and as far as it supports the policy: `variance` (or `gaussian`) for
+    "gaussian", `log_prob` for "score". GradientError when the policy is not supported.
+    """
+
+    def __init__(self, grad: GradPolicy = "expected") -> None:
+        super().__init__()
+        self.grad: GradPolicy = check_policy(grad, type(self).__name__)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """One draw, without gradient, in the shape and dtype of `expected(x)`."""
+        raise NotImplementedError(f"{type(self).__name__} has to define sample(x, generator).")
+
+    def variance(self, x: Tensor) -> Tensor:
+        """Variance of every entry of the measurement, in the shape of `expected(x)`."""
+        raise GradientError(f"{type(self).__name__}: grad='gaussian' is not supported; choose another policy.")
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A differentiable normal surrogate of `sample`. Independent entries unless a subclass knows better."""
+        return self.expected(x) + gaussian_noise(self.variance(x), generator)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        """Log-probability of a measurement, time summed: (..., C, H, W), differentiable in `x`."""
+        raise GradientError(f"{type(self).__name__}: grad='score' is not supported; choose another policy.")
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The measurement under the policy `grad`; equal generators in equal states give equal measurements."""
+        if self.grad == "expected":
+            return self.expected(x)
+        if self.grad == "gaussian":
+            return self.gaussian(x, generator)
+        with torch.no_grad():
+            measurement = self.sample(x, generator)
+        if self.grad == "straight_through":
+            return straight_through(measurement, self.expected(x)) if torch.is_grad_enabled() else measurement
+        record_score(lambda: self.log_prob(measurement, x), type(self).__name__)
+        return measurement
+
+    def extra_repr(self) -> str:
+        return f"grad={self.grad!r}"

@@ -1,0 +1,116 @@
+"""Time-to-digital converters: codes of unequal width (DNL, INL), sliding scale, dither."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.layout import TIME, check_count, check_number, check_transient
+from torchtransient.sensing.sensor import Sensor
+
+
+def random_code_widths(num_bins: int, dnl_std: float, generator: torch.Generator | None = None) -> Tensor:
+    """(T,) float64 relative widths of codes, mean 1, normal with standard deviation `dnl_std`, at least 0.05 before."""
+    std = check_number(dnl_std, "dnl_std", "random_code_widths", high=1.0)
+    widths = 1 + std * torch.randn(
+        check_count(num_bins, "num_bins", "random_code_widths"), dtype=torch.float64, generator=generator
+    )
+    widths = widths.clamp_min(0.05)
+    return widths / widths.mean()
+
+
+def code_bands(edges: Tensor, num_bins: int) -> tuple[int, Tensor]:
+    """(first, (T, B) float64): share of the true bin k + first + b that gets the code k.
+
+    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light outside [0, num_bins] is in no bin.
+    """
+    lower, upper = edges[:-1], edges[1:]
+    index = torch.arange(lower.shape[0], dtype=torch.float64, device=edges.device)
+    first = int(torch.floor((lower - index).amin()))
+    last = int(torch.ceil((upper - index).amax()))
+    true = index.unsqueeze(1) + torch.arange(first, max(last, first + 1), dtype=torch.float64, device=edges.device)
+    overlap = torch.minimum(upper.unsqueeze(1), true + 1) - torch.maximum(lower.unsqueeze(1), true)
+    return first, overlap.clamp(0, 1) * ((true >= 0) & (true < num_bins))
+
+
+class TDC(Sensor):
+    """Turns equal true bins into the codes of a real converter, (..., C, T, H, W) to the same shape.
+
+    `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
+    Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known start offsets, one code
+    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown offset, uniform over one
+    bin, that is not taken off: half the events get the next code. Apply it to rates, before detection: it acts on the
+    single photon, so that pile-up happens in codes. What falls beyond the last code is lost.
+
+    Linear, not random; the expectation over offsets is exact. Raises UnitError for widths that are not positive,
+    ShapeError when T does not fit.
+    """
+
+    code_widths: Tensor
+    bands: Tensor
+
+    def __init__(
+        self, code_widths: Tensor, *, offset_bins: float = 0.0, sliding_scale: int = 1, dither: bool = False
+    ) -> None:
+        super().__init__()
+        if not isinstance(code_widths, Tensor) or code_widths.ndim != 1 or code_widths.numel() == 0:
+            raise ShapeError("TDC: expected code_widths (T,), got something else.")
+        widths = code_widths.detach().double()
+        if not bool((widths > 0).all()) or not bool(torch.isfinite(widths).all()):
+            raise UnitError("TDC: expected code_widths > 0, finite, relative to the bin (mean about 1).")
+        self.sliding_scale = check_count(sliding_scale, "sliding_scale", "TDC")
+        self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6)
+        self.dither = bool(dither)
+        self.register_buffer("code_widths", widths)
+        first, bands = self._bands(widths)
+        self.first = first
+        self.register_buffer("bands", bands)
+
+    def _bands(self, widths: Tensor) -> tuple[int, Tensor]:
+        """The share matrix as a band, averaged over the offsets of the sliding scale."""
+        codes = widths.shape[0]
+        parts = []
+        for shift in range(self.sliding_scale):
+            # a conversion that starts `shift` codes late sees the widths of later codes, round the converter
+            seen = widths.roll(-shift)
+            edges = torch.nn.functional.pad(seen.cumsum(0), (1, 0)) + self.offset_bins
+            parts.append(code_bands(edges, codes))
+        low = min(first for first, _ in parts)
+        high = max(first + band.shape[1] for first, band in parts)
+        total = widths.new_zeros(codes, high - low)
+        for first, band in parts:
+            total[:, first - low : first - low + band.shape[1]] += band / self.sliding_scale
+        if self.dither:
+            # half of what code k - 1 would have got goes to code k; the band then begins one bin earlier
+            later = torch.nn.functional.pad(total[:-1], (0, 1, 1, 0))
+            total = 0.5 * torch.nn.functional.pad(total, (1, 0)) + 0.5 * later
+            low -= 1
+        return low, total
+
+    @property
+    def differential_nonlinearity(self) -> Tensor:
+        """(T,) deviation of each code's width from the bin, in bins."""
+        return self.code_widths - 1
+
+    @property
+    def integral_nonlinearity(self) -> Tensor:
+        """(T,) deviation of each code's end from where it should be, in bins."""
+        return self.differential_nonlinearity.cumsum(0)
+
+    def expected(self, x: Tensor) -> Tensor:
+        check_transient(x, "TDC")
+        bins = x.shape[TIME]
+        if self.bands.shape[0] != bins:
+            raise ShapeError(f"TDC: expected T = {self.bands.shape[0]} as in code_widths, got {bins}.")
+        work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+        bands = self.bands.to(work.dtype)
+        before, after = max(0, -self.first), max(0, self.first + bands.shape[1] - 1)
+        padded = torch.nn.functional.pad(work, (0, 0, 0, 0, before, after))
+        total = torch.zeros_like(work)
+        for b in range(bands.shape[1]):
+            total = torch.addcmul(total, bands[:, b].view(-1, 1, 1), padded.narrow(TIME, before + self.first + b, bins))
+        return total.to(x.dtype)
+
+    def extra_repr(self) -> str:
+        return f"num_bins={self.bands.shape[0]}, sliding_scale={self.sliding_scale}, dither={self.dither}"

@@ -1,0 +1,170 @@
+"""Phasor images: one complex number a pixel and frequency."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient.axes import FrequencyAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.units import SPEED_OF_LIGHT
+from torchtransient.vis import colour_maps
+from torchtransient.vis.files import enlarge, picture_figure, save_figure, to_bytes
+from torchtransient.vis.sources import Source, frequencies_of, phasor_of
+from torchtransient.vis.stamps import with_strip
+from torchtransient.vis.video import Frames
+from torchtransient.vis.video_file import check_video, write_video
+
+_UNITS = (("THz", 1e12), ("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0))
+SHOWS = ("real", "imaginary", "amplitude", "phase", "domain")
+
+
+def phasor_picture(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    show: Sequence[str] = ("real", "domain"),
+    which: Sequence[int] = (0,),
+    frequencies: FrequencyAxis | Sequence[float] | None = None,
+    percentile: float = 99.0,
+    title: str = "",
+) -> Any:
+    """A matplotlib figure of phasor images: a row for each frequency of `which`, a panel for each of `show`.
+
+    "real" and "imaginary": blue to red around zero, on one symmetric scale that holds `percentile` of the pixels;
+    "amplitude"; "phase": cyclic hue, grey where dark; "domain": hue by phase and brightness by amplitude. `source`:
+    complex (C, F, H, W) or a result with such a `phasor`; channels are added up. `frequencies` (cycles per metre of
+    optical path, or a FrequencyAxis) are for the titles. Pixels that are not finite are grey. Writes the figure when
+    `path` is given. Raises ShapeError for another shape or an index outside, UnitError for an unknown panel,
+    StorageError.
+    """
+    if not show or any(name not in SHOWS for name in show):
+        raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")
+    images, known = _images(source, "phasor_picture")
+    frequencies = known if frequencies is None else frequencies_of(frequencies)
+    _check_indices(which, images, frequencies)
+    height, width = images.shape[1:]
+    figure, panels = picture_figure(height, width, panels=len(show) * len(which), side=3.6, columns=len(show))
+    for row, index in enumerate(which):
+        values = images[index].numpy()
+        for panel, name in zip(panels[row * len(show) :], show, strict=False):
+            panel.set_title(_label(index, frequencies, name), fontsize=9)
+            _draw(figure, panel, name, values, percentile)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path, "phasor_picture")
+
+
+def phasor_video(
+    source: Source,
+    path: str | Path,
+    *,
+    which: int = 0,
+    steps: int = 48,
+    fps: float = 24.0,
+    frequencies: FrequencyAxis | Sequence[float] | None = None,
+    scale: int | None = None,
+    progress: bool = False,
+) -> Path:
+    """Write one period of `Re(P exp(i phi))` as a video that can be looped: the wave that the modulated light makes.
+
+    `phi` grows, and with the phasor `exp(-2 pi i nu opl)` of this library crests run from early to late pixels, as
+    light does. Blue to red around zero on one symmetric scale. `source` as in `phasor_picture`. Returns the path.
+    Raises ShapeError, and StorageError as `video` does.
+    """
+    check_video(path)
+    images, known = _images(source, "phasor_video")
+    frequencies = known if frequencies is None else frequencies_of(frequencies)
+    _check_indices((which,), images, frequencies)
+    if steps < 1:
+        raise ShapeError(f"phasor_video: expected at least one step, got {steps!r}.")
+    values = np.nan_to_num(images[which].numpy(), posinf=0.0, neginf=0.0)
+    limit = colour_maps.symmetric_limit(np.abs(values))
+    colours = _colours("RdBu_r")
+    factor = max(1, round(320 / max(values.shape))) if scale is None else scale
+    label = _label(which, frequencies, "real")
+
+    def make(index: int) -> Any:
+        turned = np.real(values * np.exp(2j * math.pi * index / steps))
+        shown = to_bytes(colours(0.5 + 0.5 * turned / limit)[..., :3])
+        return with_strip(enlarge(shown, factor), label, (index + 1) / steps)
+
+    return write_video(path, Frames(steps, make), steps, fps=fps, progress=progress)
+
+
+def domain_colours(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.float64]:
+    """RGB (..., 3) in [0, 1] of complex values: hue by phase (0 is red), brightness by the root of the amplitude.
+
+    White-balanced hues of equal lightness; the given percentile of the amplitudes is fully bright. Values that are not
+    finite are grey.
+    """
+    finite = np.isfinite(values)
+    safe = np.where(finite, values, 0)
+    amplitude = np.abs(safe)
+    level = np.sqrt(np.clip(amplitude / colour_maps.symmetric_limit(amplitude, percentile), 0, 1))
+    image = colour_maps.cyclic(np.angle(safe) / (2 * math.pi), level)
+    image[~finite] = 0.5
+    return image
+
+
+def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: float) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    if name in ("real", "imaginary"):
+        part = np.real(values) if name == "real" else np.imag(values)
+        limit = colour_maps.symmetric_limit(part, percentile)
+        image = panel.imshow(part, cmap=_colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
+        figure.colorbar(image, ax=panel, shrink=0.8)
+    elif name == "amplitude":
+        top = colour_maps.symmetric_limit(np.abs(values), percentile)
+        image = panel.imshow(np.abs(values), cmap=_colours("inferno"), vmin=0, vmax=top, interpolation="nearest")
+        figure.colorbar(image, ax=panel, shrink=0.8)
+    else:
+        level: Any = colour_maps.cyclic(np.angle(values) / (2 * math.pi))
+        if name == "phase":
+            # What is as good as dark has no phase.
+            amplitude = np.where(np.isfinite(values), np.abs(values), 0)
+            level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude, percentile)] = 0.5
+        panel.imshow(level if name == "phase" else domain_colours(values, percentile), interpolation="nearest")
+        bar = figure.colorbar(
+            ScalarMappable(Normalize(-1, 1), colour_maps.cyclic_map()), ax=panel, shrink=0.8, label="phase"
+        )
+        bar.set_ticks([-1, -0.5, 0, 0.5, 1], labels=["$-\\pi$", "$-\\pi/2$", "0", "$\\pi/2$", "$\\pi$"])
+
+
+def _images(source: Source, who: str) -> tuple[Tensor, tuple[float, ...] | None]:
+    phasor, frequencies = phasor_of(source, who)
+    return phasor.to(torch.complex128).sum(0), frequencies
+
+
+def _check_indices(which: Sequence[int], images: Tensor, frequencies: Sequence[float] | None) -> None:
+    count = images.shape[0]
+    if not len(which) or any(not 0 <= index < count for index in which):
+        raise ShapeError(f"phasor picture: expected indices out of {count} frequencies, got {tuple(which)}.")
+    if frequencies is not None and len(frequencies) != count:
+        raise ShapeError(f"phasor picture: expected {count} frequencies, got {len(frequencies)}.")
+
+
+def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
+    if frequencies is None:
+        return f"{name}, frequency {index}"
+    nu = frequencies[index]
+    if nu == 0:
+        return f"{name}, steady light"
+    hertz = abs(nu) * SPEED_OF_LIGHT
+    unit, size = next(pair for pair in _UNITS if hertz >= pair[1] or pair[1] == 1)
+    return f"{name}, wavelength {1 / nu:.3g} m ({hertz / size:.3g} {unit})"
+
+
+def _colours(name: str) -> Any:
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))

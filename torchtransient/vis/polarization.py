@@ -1,0 +1,138 @@
+"""Polarization as pictures, with the colour maps of the field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient import stokes as st
+from torchtransient.errors import UnitError
+from torchtransient.vis import colour_maps
+from torchtransient.vis.files import picture_figure, save_figure
+from torchtransient.vis.sources import Source, stokes_of
+from torchtransient.vis.tone_mapping import tone_map
+
+QUANTITIES = ("intensity", "dop", "dolp", "aolp", "docp", "s1", "s2", "s3")
+_TITLES = {
+    "intensity": "intensity $S_0$",
+    "dop": "degree of polarization",
+    "dolp": "degree of linear polarization",
+    "aolp": "angle of linear polarization",
+    "docp": "degree of circular polarization",
+    "s1": "$S_1$",
+    "s2": "$S_2$",
+    "s3": "$S_3$",
+}
+_NO_LIGHT = 0.35  # grey: neither an angle nor a degree of anything
+
+
+def polarization_picture(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    quantities: Sequence[str] = ("intensity", "dolp", "aolp", "docp"),
+    frame: int | None = None,
+    floor: float | None = None,
+    angle_map: str = "even",
+    title: str = "",
+) -> Any:
+    """A matplotlib figure of polarization, a panel for each of `quantities`.
+
+    Quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow), "aolp" (-90 to 90 degrees, cyclic,
+    the more colourful the more linearly polarized), "docp" (-1 to 1, blue is left and red right circular), "s1", "s2",
+    "s3" (blue to red around zero). Channels are added up before; noise can make degrees exceed one, which are shown as
+    one. Pixels with an intensity below `floor` (None: a hundredth of the median of what is lit) are grey.
+
+    `source`: Stokes vectors (4, C, T, H, W) or (4, C, H, W), or a RenderOutput or file with such; `frame` picks a bin,
+    None shows the light of all times. `angle_map` "even" has hues of equal lightness, "hsv" the hue circle of many
+    papers. Writes the figure when `path` is given. Raises ShapeError for unpolarized sources, UnitError for unknown
+    names and a negative `floor`, StorageError.
+    """
+    unknown = [q for q in quantities if q not in QUANTITIES]
+    if unknown or not quantities:
+        raise UnitError(f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {quantities}.")
+    if angle_map not in ("even", "hsv"):
+        raise UnitError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {angle_map!r}.")
+    vectors = stokes_of(source, frame, "polarization_picture").to(torch.float64)
+    broken = ~torch.isfinite(vectors).all(0).all(0)
+    vectors = torch.nan_to_num(vectors, posinf=0.0, neginf=0.0)
+    total = vectors.sum(1)
+    if floor is None:
+        # Of the median, which lamps in the picture do not decide.
+        lit = total[0][total[0] > 0]
+        floor = 0.01 * lit.median().item() if lit.numel() else 0.0
+    elif not floor >= 0:
+        raise UnitError(f"polarization_picture: expected floor >= 0, got {floor!r}.")
+    dark = ((total[0] <= floor) | broken).numpy()
+    figure, panels = picture_figure(total.shape[1], total.shape[2], panels=len(quantities), side=3.4)
+    for panel, name in zip(panels, quantities, strict=False):
+        panel.set_title(_TITLES[name], fontsize=10)
+        if name == "intensity":
+            panel.imshow(tone_map(_shown_intensity(vectors[0], broken)).numpy(), interpolation="nearest")
+        elif name == "aolp":
+            _draw_angle(figure, panel, total, dark, angle_map)
+        else:
+            _draw_scalar(figure, panel, name, total, dark)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path, "polarization_picture")
+
+
+def angle_image(stokes: Tensor, dark: NDArray[np.bool_], angle_map: str = "even") -> NDArray[np.float64]:
+    """RGB (H, W, 3) in [0, 1]: hue by the angle of linear polarization of `stokes` (4, H, W), colourful by its degree.
+
+    Where `dark`, grey. "even" goes from grey of the same lightness to the full hue, so that the picture's lightness
+    says nothing.
+    """
+    turns = st.angle_of_linear_polarization(stokes, 0).numpy() / math.pi
+    degree = np.clip(st.degree_of_linear_polarization(stokes, 0).numpy(), 0, 1)
+    # Half polarized light is already half as colourful; the root lets weak polarization be seen.
+    strength = np.sqrt(degree)[..., None]
+    if angle_map == "hsv":
+        colours = colour_maps.cyclic_map("hsv")(np.mod(turns + 0.5, 1.0))[..., :3]
+        grey = np.full_like(colours, 0.6)
+    else:
+        colours = colour_maps.cyclic(turns)
+        grey = np.broadcast_to(colour_maps.oklch(0.75, 0.0, 0.0), colours.shape)
+    image = strength * colours + (1 - strength) * grey
+    image[dark] = _NO_LIGHT
+    return np.asarray(image)
+
+
+def _draw_angle(figure: Any, panel: Any, total: Tensor, dark: NDArray[np.bool_], angle_map: str) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    panel.imshow(angle_image(total, dark, angle_map), interpolation="nearest")
+    colours = ScalarMappable(Normalize(-90, 90), colour_maps.cyclic_map(angle_map))
+    bar = figure.colorbar(colours, ax=panel, shrink=0.8, label="degrees")
+    bar.set_ticks([-90, -45, 0, 45, 90])
+
+
+def _draw_scalar(figure: Any, panel: Any, name: str, total: Tensor, dark: NDArray[np.bool_]) -> None:
+    import matplotlib
+
+    if name in ("dop", "dolp"):
+        measure = st.degree_of_polarization if name == "dop" else st.degree_of_linear_polarization
+        values, colours, low, high = measure(total, 0).numpy(), "inferno", 0.0, 1.0
+    elif name == "docp":
+        values, colours, low, high = st.degree_of_circular_polarization(total, 0).numpy(), "RdBu_r", -1.0, 1.0
+    else:
+        values, colours = total[int(name[1])].numpy(), "RdBu_r"
+        high = colour_maps.symmetric_limit(values)
+        low = -high
+    colour_map = matplotlib.colormaps[colours].with_extremes(bad=(_NO_LIGHT,) * 3)
+    shown = np.where(dark, np.nan, values) if name in ("dop", "dolp", "docp") else values
+    image = panel.imshow(shown, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
+    figure.colorbar(image, ax=panel, shrink=0.8)
+
+
+def _shown_intensity(intensity: Tensor, broken: Tensor) -> Tensor:
+    return torch.where(broken, torch.nan, intensity)

@@ -1,0 +1,248 @@
+"""What the pictures take: tensors, arrays, results of a render, or files that hold one."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ShapeError, StorageError, TorchTransientError
+
+Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
+_HDF5 = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What a source offers; None for what it lacks."""
+
+    transient: Tensor | None = None
+    steady: Tensor | None = None
+    phasor: Tensor | None = None
+    axis: TimeAxis | None = None
+    frequencies: tuple[float, ...] | None = None
+
+
+def transient_of(
+    source: Source, axis: TimeAxis | None = None, who: str = "picture", any_channels: bool = False
+) -> tuple[Tensor, TimeAxis | None]:
+    """The intensity over time (C, T, H, W), C = 1 or 3, on the CPU without gradients, and its axis if it is known.
+
+    `source`: a tensor or array (C, T, H, W), or polarized (4, C, T, H, W) of which the first component is taken; an
+    object with `transient` (and `axis`), such as a RenderOutput; or a file, `.h5`, `.npz` or `.npy`. `axis` replaces
+    the source's. Raises ShapeError for another shape, an empty cube, or an axis of another number of bins; StorageError
+    for a file that cannot be read.
+    """
+    loaded = _load(source, "transient")
+    cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
+    if cube.ndim == 5 and cube.shape[0] == 4:
+        cube = cube[0]
+    if cube.ndim != 4 or cube.numel() == 0 or not (any_channels or cube.shape[0] in (1, 3)):
+        raise ShapeError(
+            f"{who}: expected a transient (C, T, H, W) or (4, C, T, H, W) with C = 1 or 3, got {tuple(cube.shape)}; of "
+            "a batch, choose one, and of many channels, choose one or three."
+        )
+    axis = axis or loaded.axis
+    if axis is not None and axis.num_bins != cube.shape[1]:
+        raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the transient {cube.shape[1]}.")
+    return cube, axis
+
+
+def axis_of(cube: Tensor, axis: TimeAxis | None, who: str) -> TimeAxis:
+    """`axis`, which a picture of lengths in metres cannot do without; ShapeError when it is None."""
+    if axis is None:
+        raise ShapeError(
+            f"{who}: a transient of {cube.shape[1]} bins without an axis has no times. Give axis=TimeAxis(...), or a "
+            "RenderOutput, which knows its own."
+        )
+    return axis
+
+
+def steady_of(source: Source, who: str = "picture") -> Tensor:
+    """The intensity (C, H, W), C = 1 or 3: a tensor (C, H, W) or (4, C, H, W), the `steady` of a result or file, or the
+    sum over time of a transient. Errors as `transient_of`.
+    """
+    loaded = _load(source, "")
+    image = loaded.steady
+    if image is None:
+        image = transient_of(source, None, who)[0].sum(1)
+    if image.ndim == 4 and image.shape[0] == 4:
+        image = image[0]
+    if image.ndim != 3 or image.shape[0] not in (1, 3) or image.numel() == 0:
+        raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
+    return image
+
+
+def stokes_of(source: Source, frame: int | None = None, who: str = "picture") -> Tensor:
+    """Stokes vectors (4, C, H, W): of one bin of a transient (4, C, T, H, W), or of the light of all times (`frame`
+    None: the `steady` of a result, or the sum over time). Raises ShapeError when the source is not polarized or has
+    no such bin.
+    """
+    loaded = _load(source, "")
+    cube, image = loaded.transient, loaded.steady
+    if image is not None and (cube is None or frame is None) and image.ndim == 4 and image.shape[0] == 4:
+        result = image
+    elif cube is not None and cube.ndim == 5 and cube.shape[0] == 4:
+        if frame is not None and not -cube.shape[2] <= frame < cube.shape[2]:
+            raise ShapeError(f"{who}: bin {frame} of {cube.shape[2]} does not exist.")
+        result = cube.sum(2) if frame is None else cube[:, :, frame]
+    else:
+        found = cube if cube is not None else image
+        shape = "neither" if found is None else tuple(found.shape)
+        raise ShapeError(
+            f"{who}: expected Stokes vectors (4, C, T, H, W) or (4, C, H, W), got {shape}; polarized variants such as "
+            "llvm_ad_mono_polarized render them."
+        )
+    if result.numel() == 0:
+        raise ShapeError(f"{who}: expected Stokes vectors of some pixels, got {tuple(result.shape)}.")
+    return result
+
+
+def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float, ...] | None]:
+    """Phasor images, complex (C, F, H, W), and their frequencies in cycles per metre if the source knows them.
+
+    A complex tensor or array (C, F, H, W), or polarized (4, C, F, H, W) of which the first component is taken, or the
+    `phasor` of a result. Raises ShapeError for another shape or a real dtype.
+    """
+    loaded = _load(source, "phasor")
+    phasor = _only(loaded.phasor, "phasor", "complex (C, F, H, W)", who)
+    if phasor.ndim == 5 and phasor.shape[0] == 4:
+        phasor = phasor[0]
+    if phasor.ndim != 4 or phasor.numel() == 0 or not phasor.is_complex():
+        raise ShapeError(
+            f"{who}: expected complex phasors (C, F, H, W), got {phasor.dtype} of shape {tuple(phasor.shape)}."
+        )
+    return phasor, loaded.frequencies
+
+
+def as_tensor(value: Any, who: str) -> Tensor:
+    """A tensor or array on the CPU without gradients; ShapeError for anything else. 16 bit becomes float32."""
+    if isinstance(value, np.ndarray):
+        try:
+            tensor = torch.from_numpy(np.ascontiguousarray(value))
+        except TypeError:
+            raise ShapeError(f"{who}: expected numbers, got an array of {value.dtype}.") from None
+    elif isinstance(value, Tensor):
+        tensor = value.detach().cpu()
+    else:
+        raise ShapeError(
+            f"{who}: expected a tensor, an array, a RenderOutput or the path of a result, got {type(value).__name__}."
+        )
+    if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
+        return tensor
+    return tensor.to(torch.float32)
+
+
+def _refuse_batch(source: Any) -> None:
+    """Four entries of a batch must not pass for four components of polarized light, where the source can tell."""
+    transient, polarized = getattr(source, "transient", None), getattr(source, "polarized", None)
+    if polarized is None and isinstance(getattr(source, "metadata", None), dict):
+        polarized = _variant_is_polarized(source.metadata)
+    if polarized is False and transient is not None and transient.ndim > 4:
+        raise ShapeError(
+            f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(transient.shape)}; "
+            "choose one entry."
+        )
+
+
+def _variant_is_polarized(metadata: dict[str, Any]) -> bool | None:
+    variant = (metadata.get("stats") or {}).get("variant")
+    return None if variant is None else "polarized" in variant
+
+
+def frequencies_of(given: Any) -> tuple[float, ...] | None:
+    """Cycles per metre of a FrequencyAxis or of a row of numbers; None stays None."""
+    if given is None:
+        return None
+    if isinstance(given, FrequencyAxis):
+        return given.frequencies
+    return tuple(float(f) for f in np.ravel(given))
+
+
+def _only(value: Tensor | None, name: str, shape: str, who: str) -> Tensor:
+    if value is None:
+        raise ShapeError(f"{who}: the source holds no {name} {shape}.")
+    return value
+
+
+def _load(source: Source, name: str) -> Loaded:
+    """What a source offers. A bare tensor is taken for `name`; without one, 5 dimensions or 4 that do not begin with
+    four components are a transient, and the rest a steady image.
+    """
+    if isinstance(source, str | Path):
+        source = read_file(Path(source))
+    if isinstance(source, Loaded):
+        return source
+    if hasattr(source, "transient") or hasattr(source, "phasor"):
+        _refuse_batch(source)
+        given = [(key, getattr(source, key, None)) for key in ("transient", "steady", "phasor")]
+        known = frequencies_of(getattr(source, "frequencies", None))
+        transient, steady, phasor = (None if value is None else as_tensor(value, key) for key, value in given)
+        return Loaded(transient, steady, phasor, axis=getattr(source, "axis", None), frequencies=known)
+    tensor = as_tensor(source, "picture")
+    if name == "phasor":
+        return Loaded(phasor=tensor)
+    if name == "transient" or tensor.ndim == 5 or (tensor.ndim == 4 and tensor.shape[0] != 4):
+        return Loaded(transient=tensor)
+    return Loaded(steady=tensor)
+
+
+def read_file(path: Path) -> Any:
+    """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
+
+    Of a result, the names `transient`, `steady`, `phasor` and the numbers of the axis are read, each if it is
+    there. Raises StorageError for a missing, damaged or unknown file.
+    """
+    if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
+        raise StorageError(f"picture: expected a result, .h5, .npz or .npy, got '{path}'.")
+    if not path.is_file():
+        raise StorageError(f"picture: '{path}' does not exist.")
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.load(path, allow_pickle=False)
+        values = _hdf5_values(path) if path.suffix.lower() in _HDF5 else _npz_values(path)
+        axis = None
+        if "num_bins" in values:
+            axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+        arrays = {key: as_tensor(values[key], key) for key in ("transient", "steady", "phasor") if key in values}
+    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, TorchTransientError):
+            raise
+        raise StorageError(f"picture: '{path}' cannot be read: {error}.") from error
+    if (cube := arrays.get("transient")) is not None and cube.ndim > 4 and "metadata" in values:
+        metadata = json.loads(str(values["metadata"]))
+        _refuse_batch(SimpleNamespace(transient=cube, metadata=metadata))
+    if not arrays:
+        raise StorageError(f"picture: '{path}' holds none of transient, steady and phasor.")
+    return Loaded(
+        transient=arrays.get("transient"),
+        steady=arrays.get("steady"),
+        phasor=arrays.get("phasor"),
+        axis=axis,
+        frequencies=frequencies_of(values.get("frequencies_per_metre")),
+    )
+
+
+def _npz_values(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def _hdf5_values(path: Path) -> dict[str, Any]:
+    try:
+        import h5py
+    except ImportError as error:
+        raise StorageError(
+            "picture: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]'."
+        ) from error
+    with h5py.File(path, "r") as file:
+        return {**{name: file[name][()] for name in file}, **dict(file.attrs)}

@@ -1,0 +1,148 @@
+"""Light in flight: a transient as frames and as a video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError
+from torchtransient.vis.files import Image, enlarge, to_bytes
+from torchtransient.vis.sources import Source, transient_of
+from torchtransient.vis.stamps import moment, with_strip
+from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
+from torchtransient.vis.video_file import check_video, write_video
+
+_VISIBLE = 320  # pixels: smaller pictures are enlarged to about this, else a player shows a stamp
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames (H, W, 3) uint8 that are made when they are asked for; `len`, iteration (any number of times), indices."""
+
+    count: int
+    make: Callable[[int], Image]
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Image:
+        if not -self.count <= index < self.count:
+            raise IndexError(f"frame {index} of {self.count}")
+        return self.make(index % self.count)
+
+    def __iter__(self) -> Iterator[Image]:
+        return (self.make(index) for index in range(self.count))
+
+
+def frames(
+    source: Source,
+    *,
+    axis: TimeAxis | None = None,
+    exposure: float | None = None,
+    curve: str = "srgb",
+    accumulate: bool = False,
+    stamp: bool = True,
+    scale: int | None = None,
+    every: int = 1,
+) -> Frames:
+    """The frames of a transient under one exposure, one after the other in time.
+
+    `source`: a transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, or a file; `axis` for sources that
+    have none. `exposure` multiplies the radiance of a bin (None: 99 % of the lit pixels of all frames are below
+    white); `curve` as in `tone_map`. `accumulate` shows the light that has arrived so far. `every` adds up that many
+    bins to a frame. `scale` enlarges pixels (None: small pictures to some 320 pixels). `stamp` puts the time under
+    each frame. Pixels that are not finite are magenta. Raises ShapeError and UnitError.
+    """
+    cube, axis = transient_of(source, axis, "frames")
+    if every < 1 or int(every) != every:
+        raise ShapeError(f"frames: expected every to be a whole number of at least 1, got {every!r}.")
+    bins, (height, width) = cube.shape[1], cube.shape[2:]
+    count = -(-bins // every)
+    if exposure is None:
+        exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
+    factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
+    running = _Running(cube) if accumulate else None
+
+    def make(index: int) -> Image:
+        first, last = index * every, min((index + 1) * every, bins)
+        light = cube[:, first:last].sum(1) if running is None else running.until(last)
+        shown = enlarge(to_bytes(tone_map(light, exposure, curve).numpy()), factor)
+        middle = (first + last - 1) // 2 if running is None else last - 1
+        return with_strip(shown, moment(axis, middle, bins), last / bins) if stamp else shown
+
+    return Frames(count, make)
+
+
+def video(
+    source: Source,
+    path: str | Path,
+    *,
+    fps: float = 25.0,
+    progress: bool = False,
+    axis: TimeAxis | None = None,
+    exposure: float | None = None,
+    curve: str = "srgb",
+    accumulate: bool = False,
+    stamp: bool = True,
+    scale: int | None = None,
+    every: int = 1,
+) -> Path:
+    """Write the `frames` of a transient as `.mp4` or `.gif`; returns the path.
+
+    `progress` shows a bar. Other arguments as in `frames`. Raises StorageError for another ending, a folder that is
+    missing, or a missing package (`pip install 'torchtransient[vis]'`), before any frame is made.
+    """
+    check_video(path)
+    shown = frames(
+        source, axis=axis, exposure=exposure, curve=curve, accumulate=accumulate, stamp=stamp, scale=scale, every=every
+    )
+    return write_video(path, shown, len(shown), fps=fps, progress=progress)
+
+
+def side_by_side(parts: Sequence[Frames], gap: int = 4) -> Frames:
+    """Frames beside each other, as far as the shortest of `parts` reaches; smaller ones stand on the upper edge.
+
+    Raises ShapeError without any part. Write the result with `write_video(path, frames, len(frames))`.
+    """
+    if not parts:
+        raise ShapeError("side_by_side: expected at least one sequence of frames, got none.")
+
+    def make(index: int) -> Image:
+        images = [part[index] for part in parts]
+        height = max(image.shape[0] for image in images)
+        row = []
+        for image in images:
+            row += [np.pad(image, ((0, height - image.shape[0]), (0, 0), (0, 0)))]
+            row += [np.full((height, gap, 3), 255, np.uint8)]
+        return np.concatenate(row[:-1], axis=1)
+
+    return Frames(min(len(part) for part in parts), make)
+
+
+def _added(cube: Tensor, every: int) -> Tensor:
+    """The cube in bins of `every`, of which a copy is only made when it is smaller."""
+    if every == 1:
+        return cube
+    return torch.stack([cube[:, k : k + every].sum(1) for k in range(0, cube.shape[1], every)], dim=1)
+
+
+class _Running:
+    """The sum of the frames until one of them; asked for in order, each frame is added once."""
+
+    def __init__(self, cube: Tensor) -> None:
+        self.cube, self.last = cube, 0
+        self.total = torch.zeros_like(cube[:, 0], dtype=torch.float64)
+
+    def until(self, last: int) -> Tensor:
+        if last < self.last:
+            self.last = 0
+            self.total = torch.zeros_like(self.total)
+        self.total += self.cube[:, self.last : last].sum(1)
+        self.last = last
+        return self.total
