@@ -26,6 +26,11 @@ def renderer(room_scene):
     return make_renderer(room_scene)
 
 
+def same_gradient(found, expected):
+    """Equal but for the order in which threads add up: sums of a launch agree to single precision, not to the bit."""
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
 def gradient(renderer, x, weights, seed=0):
     """Gradient of the weighted transient with respect to the box's colour."""
     x = x.clone().requires_grad_()
@@ -40,7 +45,7 @@ def test_two_backwards_give_the_same_gradient(renderer, weights):
     torch.autograd.grad(3 * loss, x, retain_graph=True)
     again = torch.autograd.grad(loss, x)[0]
     assert first.abs().min() > 0
-    assert torch.equal(first, again)
+    same_gradient(first, again)
 
 
 def test_second_backward_follows_its_own_cotangent(renderer, weights):
@@ -104,7 +109,7 @@ def test_in_place_edit_between_render_and_backward_is_detected(renderer, weights
 def test_nn_parameter(renderer, weights):
     x = nn.Parameter(START.clone())
     (renderer({COLOUR: x}, seed=0).transient * weights).sum().backward()
-    assert torch.equal(x.grad, gradient(renderer, START, weights))
+    same_gradient(x.grad, gradient(renderer, START, weights))
 
 
 def test_optimizer_step_moves_the_image(renderer):
@@ -135,7 +140,7 @@ def test_non_contiguous_input(renderer, weights):
     storage = torch.stack([START, torch.zeros(3)], dim=1)
     x = storage.requires_grad_()[:, 0]
     (renderer({COLOUR: x}, seed=0).transient * weights).sum().backward()
-    assert torch.equal(storage.grad[:, 0], gradient(renderer, START, weights))
+    same_gradient(storage.grad[:, 0], gradient(renderer, START, weights))
 
 
 def test_expanded_and_permuted_cotangents(renderer, weights):
@@ -171,7 +176,7 @@ def test_autocast(renderer, weights):
         assert out.dtype == torch.float32
         loss = (out * weights).sum()
     loss.backward()
-    assert torch.equal(x.grad, gradient(renderer, START, weights))
+    same_gradient(x.grad, gradient(renderer, START, weights))
 
 
 def test_no_grad_records_nothing(renderer):
@@ -267,10 +272,10 @@ def test_adjoint_samples_are_independent_of_the_render(room_scene, weights):
     own, same = make_renderer(room_scene), make_renderer(room_scene, grad_seed="same")
     fixed = make_renderer(room_scene, grad_seed=5)
     assert not torch.equal(gradient(own, x, weights, 0), gradient(same, x, weights, 0))
-    assert torch.equal(gradient(own, x, weights, 0), gradient(own, x, weights, 0))
+    same_gradient(gradient(own, x, weights, 0), gradient(own, x, weights, 0))
     # A fixed adjoint seed gives one gradient of this linear functional whatever the render's seed is.
-    assert torch.equal(gradient(fixed, x, weights, 0), gradient(fixed, x, weights, 1))
-    assert torch.equal(gradient(fixed, x, weights, 0), gradient(same, x, weights, 5))
+    same_gradient(gradient(fixed, x, weights, 0), gradient(fixed, x, weights, 1))
+    same_gradient(gradient(fixed, x, weights, 0), gradient(same, x, weights, 5))
 
 
 def test_samples_of_the_gradient_are_a_choice(room_scene, weights):
@@ -307,7 +312,7 @@ def test_backward_in_another_thread(renderer, weights):
     thread = threading.Thread(target=loss.backward)
     thread.start()
     thread.join()
-    assert torch.equal(x.grad, gradient(renderer, START, weights))
+    same_gradient(x.grad, gradient(renderer, START, weights))
 
 
 def test_deepcopy_and_pickle(room_scene, weights):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError, UnitError
-from torchtransient.scenes.parts import SceneDict, albedo, diffuse, perspective, positive, transient_film
+from torchtransient.scenes.parts import SceneDict, diffuse, perspective, positive, transient_film
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 # Radius and height of the bottle's outline from the middle of its base to the middle of its lid.
@@ -17,9 +17,12 @@ PROFILE = (
     (0.0, 0.000), (0.030, 0.000), (0.0335, 0.0015), (0.035, 0.005), (0.035, 0.095), (0.0335, 0.107), (0.029, 0.119),
     (0.0215, 0.132), (0.0155, 0.144), (0.013, 0.155), (0.013, 0.178), (0.0125, 0.1795), (0.0115, 0.180), (0.0, 0.180),
 )  # fmt: skip
-# Scattering of whole milk diluted in water, 1/m: blue light scatters more, red light is absorbed more by the water.
+# A little milk in water, 1/m for `milk=1`: blue light scatters more, red light is absorbed more by the water.
 SCATTERING = (4.6, 5.5, 6.7)
 ABSORPTION = (0.30, 0.06, 0.03)
+# Mitsuba takes colours of at most one here: the extinction is kept in this unit, 1/m.
+EXTINCTION_UNIT = 40.0
+LASER_RADIUS = 0.004
 
 
 def lathe(profile: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -92,9 +95,9 @@ def milk_bottle(
     max_depth: int = 24,
     roughness: float = 0.05,
     index: float = 1.33,
-    milk: float = 1.0,
+    milk: float = 2.5,
     anisotropy: float = 0.7,
-    beam_degrees: float = 3.0,
+    beam_degrees: float = 8.0,
 ) -> SceneDict:
     """A bottle of water with a little milk on a table, a laser that shines up from its base. Lengths in metres.
 
@@ -102,10 +105,11 @@ def milk_bottle(
     the liquid, which fills it. `milk` scales the liquid's scattering, `anisotropy` is the mean cosine g, `beam_degrees`
     the half opening angle of the beam. The film counts times from the laser to the bottle's surface
     (`camera_unwarp`): a picture of the bottle shows events when they happen, as the photographs of Velten et al. (2013)
-    do after unwarping. The laser starts inside the liquid, just above the base, since no connection to a point light
-    can be made through a rough boundary.
+    do after unwarping. The laser is a disk inside of the liquid, just above the base, since lights
+    cannot be connected to through a rough boundary; and not a point, near which scattered light has no bound.
 
-    Keys of interest: `bottle.interior_medium.sigma_t`, `bottle.interior_medium.albedo`, `bottle.bsdf.alpha`. Raises
+    Keys of interest: `bottle.interior_medium.sigma_t.value.value` (in units of `EXTINCTION_UNIT`),
+    `bottle.interior_medium.albedo.value.value`, `bottle.bsdf.alpha`. Raises
     UnitError or SceneError for numbers out of range.
     """
     if not 0 <= beam_degrees < 90 or beam_degrees == 0:
@@ -116,8 +120,8 @@ def milk_bottle(
     write_ply(Path(mesh), vertices, faces)
     scattering = np.array(SCATTERING) * positive("milk", milk)
     extinction = scattering + np.array(ABSORPTION)
-    for channel in scattering / extinction:
-        albedo("single scattering albedo", channel)
+    if extinction.max() > EXTINCTION_UNIT:
+        raise UnitError(f"milk: expected an extinction of at most {EXTINCTION_UNIT} 1/m, got {extinction.max():.3g}")
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     return {
         "type": "scene",
@@ -135,17 +139,22 @@ def milk_bottle(
                      "int_ior": positive("index", index), "ext_ior": 1.0},
             "interior": {
                 "type": "homogeneous",
-                "sigma_t": {"type": "rgb", "value": extinction.tolist()},
+                "scale": EXTINCTION_UNIT,
+                "sigma_t": {"type": "rgb", "value": (extinction / EXTINCTION_UNIT).tolist()},
                 "albedo": {"type": "rgb", "value": (scattering / extinction).tolist()},
                 "phase": {"type": "hg", "g": float(anisotropy)},
             },
         },
         "laser": {
-            "type": "spot",
-            "to_world": look_at([0.0, 0.002, 0.0], [0.0, 0.18, 0.0], [1.0, 0.0, 0.0]),
-            "cutoff_angle": float(beam_degrees),
-            "beam_width": 0.8 * float(beam_degrees),
-            "intensity": {"type": "rgb", "value": [30.0, 30.0, 30.0]},
+            "type": "disk",
+            "to_world": translate([0.0, 0.002, 0.0]) @ rotate([1, 0, 0], -90) @ scale(LASER_RADIUS),
+            "bsdf": diffuse(0.0),
+            "emitter": {
+                "type": "angulararea",
+                "cutoff_angle": float(beam_degrees),
+                "beam_width": 0.8 * float(beam_degrees),
+                "radiance": {"type": "rgb", "value": [1e6, 1e6, 1e6]},
+            },
         },
         "table": {
             "type": "rectangle",
