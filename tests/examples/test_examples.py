@@ -106,3 +106,14 @@ def test_staircase_with_a_floor_in_place_of_the_house(tmp_path: Path, capsys: py
     assert recovery.errors[-1] < 0.25 * recovery.errors[0]
     for name in ("light", "gradient", "recovery"):
         assert (tmp_path / "pictures" / f"staircase_{name}.png").stat().st_size > 5_000
+
+
+def test_bottle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mi.set_variant("llvm_ad_rgb")
+    module = example("bottle")
+    out = module.main(["--height", "24", "--spp", "1024", "--max-depth", "6", "--output", str(tmp_path)])
+    assert capsys.readouterr().out.splitlines()[-1].startswith("bottle: the pulse rises at 0.")
+    for name in ("bottle.mp4", "bottle_frames.png", "bottle_peak.png"):
+        assert (tmp_path / name).stat().st_size > 5_000
+    # Slower than in vacuum: the index of water, and what scatters stays behind.
+    assert 0.6 < module.speed_of_rise(out) < 0.8

@@ -161,3 +161,35 @@ def test_moving_wall_direct_light():
 def test_errors(call, error, words):
     with pytest.raises(error, match=words):
         call()
+
+
+def test_lathe_is_closed_and_faces_outward():
+    from torchtransient.scenes.bottle import PROFILE, lathe
+
+    vertices, faces = lathe(np.array(PROFILE), 12)
+    edges = {}
+    for a, b, c in faces:
+        for edge in ((a, b), (b, c), (c, a)):
+            edges[edge] = edges.get(edge, 0) + 1
+    # Every edge is walked once in each direction by the two triangles that share it.
+    assert all(count == 1 and edges.get(edge[::-1]) == 1 for edge, count in edges.items())
+    corners = vertices[faces].astype(np.float64)
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    radius, height = np.array(PROFILE).T
+    frusta = np.pi / 3 * np.diff(height) * (radius[:-1] ** 2 + radius[:-1] * radius[1:] + radius[1:] ** 2)
+    polygon = 12 / (2 * np.pi) * np.sin(2 * np.pi / 12)
+    assert volume == pytest.approx(frusta.sum() * polygon, rel=1e-6)
+
+
+@pytest.mark.parametrize("outline", [[[0, 0], [1, 1]], [[0.1, 0], [1, 1], [0, 2]], [[0, 0], [-1, 1], [0, 2]]])
+def test_lathe_refuses_open_outlines(outline):
+    from torchtransient.scenes.bottle import lathe
+
+    with pytest.raises(SceneError, match="lathe"):
+        lathe(np.array(outline, dtype=float), 8)
+
+
+def test_milk_bottle_refuses_angles_and_numbers_out_of_range(tmp_path):
+    for arguments in ({"beam_degrees": 0.0}, {"anisotropy": 1.0}, {"milk": -1.0}, {"milk": 10.0}):
+        with pytest.raises(UnitError):
+            scenes.milk_bottle(tmp_path / "bottle.ply", **arguments)

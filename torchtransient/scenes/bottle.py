@@ -112,7 +112,7 @@ def milk_bottle(
     `bottle.interior_medium.albedo.value.value`, `bottle.bsdf.alpha`. Raises
     UnitError or SceneError for numbers out of range.
     """
-    if not 0 <= beam_degrees < 90 or beam_degrees == 0:
+    if not 0 < beam_degrees < 90:
         raise UnitError(f"beam_degrees: expected an angle between 0 and 90 degrees, got {beam_degrees!r}")
     if not abs(anisotropy) < 1:
         raise UnitError(f"anisotropy: expected a mean cosine between -1 and 1, got {anisotropy!r}")
