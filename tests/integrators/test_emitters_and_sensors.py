@@ -386,6 +386,7 @@ def test_sum_over_time_of_the_other_pairs(sensor, light):
 # ---------------------------------------------------------------------------------------------------- gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, light in LIGHTS.items() if light.key])
 def test_gradient_of_the_intensity(name):
     """Light is proportional to its intensity: with the same samples, intensity times derivative is the light itself."""

@@ -16,12 +16,17 @@ SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
 # sqrt(n) ulp.
 ROUNDING = 2e-3
+# Cases of more than a second that need many samples; the set of slow tests runs them.
+LONG = {
+    "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",
+    "phasor_glass_index", "meter_moves", "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
+}  # fmt: skip
 
 
 def marked(cases):
-    """Parameters of a test, with the marker that a case's tags ask for."""
+    """Parameters of a test, with the marker that a case's cost asks for."""
     slow = pytest.mark.slow
-    return [pytest.param(c, id=c.name, marks=[slow] if "slow" in c.tags else []) for c in cases]
+    return [pytest.param(c, id=c.name, marks=[slow] if "slow" in c.tags or c.name in LONG else []) for c in cases]
 
 
 @pytest.fixture(scope="module")

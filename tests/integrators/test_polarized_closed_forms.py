@@ -202,6 +202,7 @@ def test_slab_order_by_order(side, angle_deg):
         assert result.passed, f"order at {opl}: {result}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "metal",
     [

@@ -187,6 +187,7 @@ def test_seeds():
     assert np.abs(a - c).max() > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [2**26, 54 * 11, 30])
 @pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
 def test_total_weight_with_any_sampler_and_count(monkeypatch, sampler, lanes):

@@ -88,6 +88,7 @@ def training(room_scene):
     return lambda seed: training_step(renderer, optimizer, target, seed)
 
 
+@pytest.mark.slow
 def test_memory_is_flat_over_200_steps(training):
     for seed in range(20):
         training(seed)
