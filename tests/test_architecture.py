@@ -14,8 +14,8 @@ import torchtransient
 
 PACKAGE = Path(torchtransient.__file__).parent
 LEVEL = {
-    "errors": 0, "_llvm": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0, "gates": 0,
-    "stokes": 0,
+    "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
+    "gates": 0, "stokes": 0,
     "plugins": 1, "sensing": 1, "nlos": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,

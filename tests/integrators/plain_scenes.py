@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient._collection import no_collection
 from torchtransient.testing.statistics import two_sample_z_test
 
 
@@ -42,7 +43,8 @@ def runs(scene, count=6, spp=64, seed=0):
 
 def mitsuba_runs(sensor, objects, count=6, spp=64, **arguments):
     scene = load(sensor, objects, "path", **arguments)
-    images = np.array([np.array(mi.render(scene, seed=700 + k, spp=spp)) for k in range(count)], dtype=float)
+    with no_collection():
+        images = np.array([np.array(mi.render(scene, seed=700 + k, spp=spp)) for k in range(count)], dtype=float)
     return images[..., :1] if mi.is_monochromatic else images
 
 

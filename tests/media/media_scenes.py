@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient._collection import no_collection
 
 
 def T():
@@ -92,5 +93,6 @@ def runs(scene, count=6, spp=256, seed=0):
 
 def steady_runs(scene, count=6, spp=256, seed=700):
     """Independent images of one of Mitsuba's integrators."""
-    images = np.array([np.array(mi.render(scene, seed=seed + k, spp=spp)) for k in range(count)], dtype=float)
+    with no_collection():
+        images = np.array([np.array(mi.render(scene, seed=seed + k, spp=spp)) for k in range(count)], dtype=float)
     return images[..., :1] if mi.is_monochromatic else images

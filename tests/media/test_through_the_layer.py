@@ -1,5 +1,9 @@
 """Scenes with media in the torch layer: loaded from steady ones and the peer's files, with their parameters."""
 
+import gc
+import weakref
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
@@ -146,3 +150,44 @@ def test_no_kernels_are_compiled_while_training():
     kernels = [entry for entry in history if entry["type"] == dr.KernelType.JIT]
     assert len(kernels) >= 6
     assert all(entry["cache_hit"] for entry in kernels)
+
+
+@pytest.mark.parametrize("explode", [False, True])
+def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
+    """A scene freed between two method calls of one trace makes Dr.Jit write a function twice, and LLVM abort.
+
+    Scenes that hang in reference cycles are left to the collector, which runs whenever enough objects were made.
+    """
+    from torchtransient.plugins.integrators.media import free_flight
+
+    class Cycle:
+        pass
+
+    def dropped():
+        cycle = Cycle()
+        cycle.scene, cycle.me = tt.load({"type": "scene"}, variant=VARIANT), cycle
+        return weakref.ref(cycle)
+
+    key = "block.interior_medium.albedo.value.value"
+    scene = steady_scene("volpath", **block(homogeneous(1.0, 0.8)))
+    renderer = tt.TransientRenderer(scene, parameters=[key], time_axis=AXIS, spp=2)
+    original, alive = free_flight.medium_interaction, []
+
+    def interaction(*args):
+        gone = dropped()
+        _ = [[] for _ in range(1000)]  # with the threshold below the collector would run many times
+        alive.append(gone() is not None)
+        if explode:
+            raise ZeroDivisionError
+        return original(*args)
+
+    monkeypatch.setattr(free_flight, "medium_interaction", interaction)
+    thresholds = gc.get_threshold()
+    gc.set_threshold(10, 1, 1)
+    try:
+        with pytest.raises(RuntimeError) if explode else nullcontext():
+            renderer(seed=0).transient.sum().backward()
+        assert gc.isenabled()
+    finally:
+        gc.set_threshold(*thresholds)
+    assert alive and all(alive)

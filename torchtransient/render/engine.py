@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.memory import check_fits
@@ -136,7 +137,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _session(job: RenderJob) -> Iterator[_Session]:
-    with active_variant(job.scene.variant):
+    with active_variant(job.scene.variant), no_collection():
         slots = job.scene.slots(job.keys, job.options)
         session = _Session(job, slots)
         filters = session.set_filter(job.temporal_filter) if job.temporal_filter else []

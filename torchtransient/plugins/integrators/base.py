@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
@@ -218,6 +219,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # ----------------------------------------------------------------------------------- entry points
 
+    @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None):
         """Render steady ``(H, W, C)`` and transient ``(H, W, T, C)``.
 
@@ -267,6 +269,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(seen, ray))
         return mi.Float64(length) - film.start_opl
 
+    @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         """Accumulate the gradient of ``<grad_in, render()>`` into the attached parameters of the scene.
 
@@ -318,6 +321,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                     objective += a_turn * sensor_turn(seen, ray).angle()
                 dr.backward_from(objective)
 
+    @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
 
