@@ -65,6 +65,15 @@ def test_window_shorter_than_the_period_loses_what_falls_outside():
         Afterpulsing(0.1, 50e-10, 0.0, bin_width_s=1e-10, period_s=5e-10)(x)
 
 
+def test_long_periods_are_wrapped_round_the_window():
+    """A period longer than two windows is not transformed whole; the means are those of the whole period."""
+    x = torch.rand(1, 16, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for period in (16, 32, 33, 40, 100):
+        kernel = afterpulse_kernel(70e-10, 20e-10, 1e-10, period)
+        whole = add_afterpulses(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, period - 16)), 0.3, kernel)
+        torch.testing.assert_close(add_afterpulses(x, 0.3, kernel), whole[:, :16])
+
+
 def test_float32_keeps_the_faint_bins():
     x = torch.zeros(1, 1024, 1, 1)
     x[0, 100] = 1e6
@@ -127,3 +136,79 @@ def test_hot_pixels():
     assert float((rates > 1000).double().mean()) == pytest.approx(0.02, abs=0.004)
     with pytest.raises(UnitError, match="hot_fraction"):
         hot_pixel_rates(2, 2, median_hz=1.0, hot_fraction=2.0)
+
+
+def test_crosstalk_is_a_binomial_number_of_every_neighbour():
+    """Each of 4 neighbours is triggered with its own probability, independently; the rim sends nothing back."""
+    n, p, ratio, images = 40, 0.2, 0.5, 30_000
+    x = torch.zeros(images, 1, 1, 3, 3)
+    x[..., 1, 1] = n
+    x[..., 0, 2] = 7
+    module = Crosstalk(p, diagonal_ratio=ratio)
+    added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double().view(images, 9)
+    edges = {1: (n, 7), 5: (n, 7), 3: (n, 0), 7: (n, 0)}
+    for pixel, (near, other) in edges.items():
+        variance = (near + other) * p * (1 - p)
+        assert float(added[:, pixel].mean()) == pytest.approx((near + other) * p, abs=5 * (variance / images) ** 0.5)
+        # a Poisson number would have a variance larger by 1/(1 - p), 25 %
+        assert float(added[:, pixel].var()) == pytest.approx(variance, rel=5 * (2 / images) ** 0.5)
+    assert float(added[:, 0].var()) == pytest.approx(n * 0.1 * 0.9, rel=5 * (2 / images) ** 0.5)
+    correlation = torch.corrcoef(added[:, [0, 3, 6, 7, 8]].T) - torch.eye(5)
+    assert float(correlation.abs().max()) < 5 / images**0.5
+    assert float(added[:, 4].mean()) == pytest.approx(7 * 0.1, rel=0.05)
+    torch.testing.assert_close(module.variance(x)[0].flatten()[1], torch.tensor((n + 7) * p * (1 - p)))
+
+
+@pytest.mark.parametrize("period_bins, tau, dead", [(40, 6.0, 4.0), (64, 30.0, 2.5), (100, 0.4, 1.0)])
+def test_afterpulses_are_followed_one_by_one(period_bins, tau, dead):
+    """Mean of every bin, and the variance of the total: a geometric number per detection, p / (1 - p)^2."""
+    n, p, pixels = 300, 0.3, 16_384
+    x = torch.zeros(1, BINS, 128, 128)
+    x[:, 5] = n
+    x[:, 20] = 50
+    module = Afterpulsing(p, tau * 1e-10, dead * 1e-10, bin_width_s=1e-10, period_s=period_bins * 1e-10)
+    added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double()
+    assert float(added.min()) >= 0
+    mean = module.extra(x.double()).mean((0, 2, 3)).clamp_min(0)
+    assert bool(((added.mean((0, 2, 3)) - mean).abs() < 5.5 * (1.5 * mean / pixels).sqrt() + 1e-3).all())
+    if period_bins == BINS:
+        total = added.sum(1)
+        assert float(total.mean()) == pytest.approx((n + 50) * p / (1 - p), rel=2e-3)
+        assert float(total.var()) == pytest.approx((n + 50) * p / (1 - p) ** 2, rel=5 * (2 / pixels) ** 0.5)
+
+
+def test_long_periods_are_placed_exactly():
+    """Periods too long for single precision, and delays of many periods."""
+    x = torch.zeros(1, 8, 64, 64)
+    x[:, 0] = 100
+    module = Afterpulsing(0.2, 1e-6, 1e-8, bin_width_s=1e-12, period_s=3e-7)
+    added = module.sample(x, torch.Generator().manual_seed(0)) - x
+    assert float(added.sum()) == pytest.approx(
+        float(module.extra(x).sum()), abs=5 * float(module.extra(x).sum()) ** 0.5
+    )
+    assert torch.equal(added, added.round())
+
+
+@pytest.mark.parametrize("make", [lambda: Crosstalk(0.05), lambda: Afterpulsing(0.05, 30e-10, 0.0, bin_width_s=1e-10)])
+def test_means_and_floods_take_poisson_numbers(make):
+    """Counts that are not whole, and too many to follow, still get whole numbers of the right mean."""
+    for level in (0.7, 1e6):
+        x = torch.full((1, BINS, 16, 16), level)
+        added = make().sample(x, torch.Generator().manual_seed(0)).double() - x
+        mean = make().extra(x.double())
+        assert float(added.sum()) == pytest.approx(float(mean.sum()), abs=5 * float(mean.sum()) ** 0.5 + 1)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Crosstalk(0.02), lambda: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10)]
+)
+def test_draws_do_not_depend_on_the_number_of_threads(make):
+    x = torch.poisson(torch.full((1, BINS, 64, 64), 5.0), generator=torch.Generator().manual_seed(1))
+    threads, results = torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 3):
+            torch.set_num_threads(n)
+            results.append(make().sample(x, torch.Generator().manual_seed(0)))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])

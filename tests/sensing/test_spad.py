@@ -15,7 +15,7 @@ from torchtransient.sensing import (
     first_photon_probabilities,
     sample_detections,
 )
-from torchtransient.sensing.draws import fast_poisson, sample_multinomial
+from torchtransient.sensing.draws import fast_poisson, sample_first_photons, sample_multinomial
 from torchtransient.sensing.running_sums import sum_before
 
 BINS = 48
@@ -106,6 +106,28 @@ def test_multinomial_of_many_trials():
     assert single.dtype == torch.float32
 
 
+@pytest.mark.parametrize("bins", [1, 2, 5, 64, 97])
+def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
+    """Chi-square over bins and "none", for weak light, strong light and a flood, without any running sum."""
+    g, cycles = torch.Generator().manual_seed(4), 200
+    shape = torch.rand(1, bins, 1, 1, dtype=torch.float64, generator=g) ** 4
+    for total in (0.01, 1.0, 6.0, 80.0):
+        rate = (total * shape / shape.sum()).expand(1, bins, 60, 60)
+        p, none = first_photon_probabilities(rate[..., :1, :1])
+        seen = sample_first_photons(cycles, rate, g).sum((-2, -1)).flatten()
+        trials = 3600 * cycles
+        expected = trials * torch.cat([p.flatten(), none.flatten()])
+        seen = torch.cat([seen, trials - seen.sum(0, keepdim=True)])
+        often = expected > 8
+        assert float(seen[~often].sum()) <= float(expected[~often].sum()) * 1.0 + 40
+        chi2 = float(((seen - expected) ** 2 / expected)[often].sum())
+        dof = int(often.sum()) - 1
+        if dof > 0:
+            assert chi2 / dof < 1 + 5 * (2 / dof) ** 0.5, f"{total} photons: chi2/dof = {chi2 / dof:.2f}"
+    dark = sample_first_photons(cycles, torch.zeros(1, bins, 4, 4), g)
+    assert float(dark.sum()) == 0
+
+
 def test_large_draws_do_not_depend_on_the_number_of_threads():
     p = torch.full((1, 64, 64, 64), 0.01)
     threads = torch.get_num_threads()
@@ -115,10 +137,10 @@ def test_large_draws_do_not_depend_on_the_number_of_threads():
             torch.set_num_threads(n)
             results.append(sample_multinomial(1000, p, torch.Generator().manual_seed(3)))
             results.append(fast_poisson(p * 100, torch.Generator().manual_seed(3)))
+            results.append(sample_first_photons(1000, p, torch.Generator().manual_seed(3)))
     finally:
         torch.set_num_threads(threads)
-    assert torch.equal(results[0], results[2])
-    assert torch.equal(results[1], results[3])
+    assert all(torch.equal(one, two) for one, two in zip(results[:3], results[3:], strict=True))
     assert abs(float(results[0].mean()) - 10) < 0.05
     assert abs(float(results[1].var()) - 1) < 0.02
 

@@ -1,9 +1,7 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
 from torchtransient.sensing.afterpulsing import Afterpulsing as Afterpulsing
-from torchtransient.sensing.afterpulsing import Crosstalk as Crosstalk
 from torchtransient.sensing.afterpulsing import add_afterpulses as add_afterpulses
-from torchtransient.sensing.afterpulsing import add_crosstalk as add_crosstalk
 from torchtransient.sensing.afterpulsing import afterpulse_kernel as afterpulse_kernel
 from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rates
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
@@ -16,6 +14,8 @@ from torchtransient.sensing.compressed_histograms import CodedHistogram as Coded
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
 from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
 from torchtransient.sensing.compressed_histograms import fourier_codes as fourier_codes
+from torchtransient.sensing.crosstalk import Crosstalk as Crosstalk
+from torchtransient.sensing.crosstalk import add_crosstalk as add_crosstalk
 from torchtransient.sensing.depth import Returns as Returns
 from torchtransient.sensing.depth import background_per_bin as background_per_bin
 from torchtransient.sensing.depth import centre_of_mass as centre_of_mass

@@ -1,4 +1,4 @@
-"""Detections that no photon made: afterpulses in time, crosstalk between pixels, hot pixels."""
+"""Afterpulses: detections triggered by carriers that an earlier one left behind. And maps of hot pixels."""
 
 from __future__ import annotations
 
@@ -9,71 +9,14 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
-from torchtransient.sensing.draws import fast_poisson
-from torchtransient.sensing.layout import (
-    TIME,
-    bin_width_of,
-    check_number,
-    check_seconds,
-    check_transient,
-)
-from torchtransient.sensing.policies import (
-    GradPolicy,
-    gaussian_noise,
-    record_score,
-    straight_through,
-)
-from torchtransient.sensing.sensor import RandomSensor
-from torchtransient.sensing.shot_noise import poisson_log_prob
+from torchtransient.sensing.added_counts import AddedCounts
+from torchtransient.sensing.draws import by_pieces
+from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
+from torchtransient.sensing.policies import GradPolicy
+from torchtransient.sensing.thinning import thin
 
-
-class AddedCounts(RandomSensor):
-    """A sensor that adds counts to those it is given: x + n with n Poisson of mean `extra(x)`. All four policies.
-
-    The counts given pass with their own gradient under every policy. A Poisson number stands for the binomial thinning
-    of single detections; its variance is larger by the probability of the effect (1 % of itself at 1 %).
-    """
-
-    def rough_extra(self, x: Tensor) -> Tensor:
-        """`extra` as precisely as a draw needs it."""
-        return self.extra(x)
-
-    def extra(self, x: Tensor) -> Tensor:
-        """Mean of the counts added, in the shape of `x`."""
-        raise NotImplementedError(f"{type(self).__name__} has to define extra(x).")
-
-    def expected(self, x: Tensor) -> Tensor:
-        return x + self.extra(x)
-
-    def variance(self, x: Tensor) -> Tensor:
-        return self.extra(x)
-
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        with torch.no_grad():
-            return x.detach() + self._draw(self.rough_extra(x.detach()), generator)
-
-    def _draw(self, mean: Tensor, generator: torch.Generator | None) -> Tensor:
-        work = mean.detach().clamp_min(0)
-        if work.dtype in (torch.float16, torch.bfloat16):
-            work = work.float()
-        return fast_poisson(work, generator).to(mean.dtype)
-
-    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        return poisson_log_prob((measurement - x).detach().clamp_min(0), self.extra(x)).sum(TIME)
-
-    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        if self.grad == "expected":
-            return self.expected(x)
-        if self.grad != "gaussian" and not torch.is_grad_enabled():
-            return self.sample(x, generator)
-        mean = self.extra(x)
-        if self.grad == "gaussian":
-            return x + mean + gaussian_noise(mean, generator)
-        added = self._draw(mean, generator)
-        if self.grad == "straight_through":
-            return x + straight_through(added, mean)
-        record_score(lambda: poisson_log_prob(added, mean).sum(TIME), type(self).__name__)
-        return x + added
+_BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
+_FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
 
 
 def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: float, period_bins: int) -> Tensor:
@@ -102,28 +45,37 @@ def add_afterpulses(
     kernel: Tensor,
     *,
     only_added: bool = False,
-    dtype: torch.dtype = torch.float64,
 ) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
     `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel`; the window is the first T bins of
     a period of P. Afterpulses outside the window are lost. With P = T sums grow by 1/(1 - probability) exactly.
-    Differentiable in all three. Computed in `dtype` by FFT round the period; the dtype and device of `counts` are kept.
+    Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
     """
     check_transient(counts, "add_afterpulses")
     bins, period = counts.shape[TIME], kernel.shape[0]
-    if period < bins:
-        raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
+    _check_period(period, bins)
     p = torch.as_tensor(probability, dtype=torch.float64, device=counts.device)
     transfer = p * torch.fft.rfft(kernel.to(counts.device, torch.float64))
     # only what is added is transformed: the detections themselves keep all their digits
     gain = transfer / (1 - transfer)
+    length = period
+    if period > 2 * bins:
+        # of a long period only the lags between two bins of the window matter, forwards and round the period
+        response = torch.fft.irfft(gain, n=period)
+        near = torch.cat([response[:bins], response.new_zeros(1), response[period - bins + 1 :]])
+        gain, length = torch.fft.rfft(near), 2 * bins
     # rows of time next to each other: the copy costs less than a transform that strides
-    rows = counts.movedim(TIME, -1).contiguous().to(dtype)
-    spectrum = torch.fft.rfft(rows, n=period) * gain.to(dtype.to_complex())
-    wide: Tensor = torch.fft.irfft(spectrum, n=period)
+    rows = counts.movedim(TIME, -1).contiguous().to(torch.float64)
+    spectrum = torch.fft.rfft(rows, n=length) * gain
+    wide: Tensor = torch.fft.irfft(spectrum, n=length)
     added = wide[..., :bins].movedim(-1, TIME).contiguous().to(counts.dtype)
     return added if only_added else counts + added
+
+
+def _check_period(period: int, bins: int) -> None:
+    if period < bins:
+        raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
 
 
 class Afterpulsing(AddedCounts):
@@ -176,74 +128,55 @@ class Afterpulsing(AddedCounts):
         """Mean delay beyond the dead time, in seconds, float64."""
         return self.log_tau_s.double().exp()
 
+    def _period_bins(self, x: Tensor) -> int:
+        return self.period_bins or x.shape[TIME]
+
     def extra(self, x: Tensor) -> Tensor:
-        return self._extra(x, torch.float64)
-
-    def rough_extra(self, x: Tensor) -> Tensor:
-        return self._extra(x, torch.float64 if x.dtype == torch.float64 else torch.float32)
-
-    def _extra(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         check_transient(x, "Afterpulsing")
-        kernel = afterpulse_kernel(self.tau_s, self.dead_time_s, self.bin_width_s, self.period_bins or x.shape[TIME])
-        return add_afterpulses(x, self.probability, kernel, only_added=True, dtype=dtype)
+        kernel = afterpulse_kernel(self.tau_s, self.dead_time_s, self.bin_width_s, self._period_bins(x))
+        return add_afterpulses(x, self.probability, kernel, only_added=True)
 
+    def share(self) -> float:
+        p = float(self.probability)
+        return p / (1 - p)
 
-def add_crosstalk(
-    counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
-) -> Tensor:
-    """Mean histogram with optical crosstalk: each detection triggers each of the 4 neighbours with `probability`.
+    def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
+        check_transient(counts, "Afterpulsing")
+        p, tau = float(self.probability), float(self.tau_s / self.bin_width_s)
+        # an event lies in the middle of its bin
+        after = 0.5 + self.dead_time_s / self.bin_width_s
+        period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
+        _check_period(period, bins)
+        # bins are told apart to 1e-3 of a bin, and delays have as many steps
+        real = torch.float32 if max(period, after, 20 * tau) < _FINE else torch.float64
 
-    `diagonal`: the same for the 4 neighbours across a corner. No delay: crosstalk takes less than a bin. What leaves
-    the rim of the sensor is lost. First order: crosstalk of crosstalk is left out. (..., C, T, H, W), dtype kept.
-    """
-    check_transient(counts, "add_crosstalk")
-    near = torch.as_tensor(probability, device=counts.device).to(counts.dtype)
-    far = torch.as_tensor(diagonal, device=counts.device).to(counts.dtype)
-    padded = torch.nn.functional.pad(counts, (1, 1, 1, 1))
-    height, width = counts.shape[-2:]
+        def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
+            """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
+            first = thin(piece, p, own)
+            found = [first.place[:0]]
+            for block in range(0, first.place.numel(), _BLOCK):
+                at = slice(block, block + _BLOCK)
+                place, number = first.place[at] + begin, first.number[at].long()
+                start = place.div(pixels, rounding_mode="floor") % bins
+                origin = place.sub_(start * pixels).repeat_interleave(number)
+                time = start.to(real).repeat_interleave(number)
+                while time.numel():
+                    delay = torch.rand(time.shape, dtype=real, device=time.device, generator=own).neg_().log1p_()
+                    time = delay.mul_(-tau).add_(after).floor_().add_(time)
+                    time.sub_((time * (1 / period)).floor_().mul_(period))
+                    # where the quotient was rounded
+                    time.sub_(period * (time >= period)).add_(period * (time < 0))
+                    seen = (time < bins).nonzero().squeeze(-1)
+                    found.append(time[seen].long().mul_(pixels).add_(origin[seen]))
+                    again = torch.rand(time.shape, dtype=real, device=time.device, generator=own) < p
+                    time, origin = time[again], origin[again]
+            return torch.cat(found)
 
-    def seen(dy: int, dx: int) -> Tensor:
-        return padded[..., 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-
-    added = near * (seen(-1, 0) + seen(1, 0) + seen(0, -1) + seen(0, 1))
-    if far.requires_grad or bool(far != 0):
-        added = added + far * (seen(-1, -1) + seen(-1, 1) + seen(1, -1) + seen(1, 1))
-    return added if only_added else counts + added
-
-
-class Crosstalk(AddedCounts):
-    """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`. `learnable`: `logit_probability`.
-
-    `diagonal_ratio`: probability across a corner over that across an edge.
-    """
-
-    logit_probability: Tensor
-
-    def __init__(
-        self,
-        probability: float,
-        *,
-        diagonal_ratio: float = 0.0,
-        learnable: bool = False,
-        grad: GradPolicy = "expected",
-    ) -> None:
-        super().__init__(grad)
-        p = check_number(probability, "probability", "Crosstalk", high=0.25, open_low=True)
-        self.diagonal_ratio = check_number(diagonal_ratio, "diagonal_ratio", "Crosstalk", high=1.0)
-        tensor = torch.tensor(math.log(p / (1 - p)), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("logit_probability", nn.Parameter(tensor))
-        else:
-            self.register_buffer("logit_probability", tensor)
-
-    @property
-    def probability(self) -> Tensor:
-        """Of one neighbour per detection, float64."""
-        return self.logit_probability.double().sigmoid()
-
-    def extra(self, x: Tensor) -> Tensor:
-        p = self.probability
-        return add_crosstalk(x, p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0, only_added=True)
+        one = torch.ones(1, dtype=counts.dtype, device=counts.device)
+        total = counts.clone(memory_format=torch.contiguous_format)
+        for places in by_pieces(follow, counts.reshape(-1), generator):
+            total.view(-1).scatter_add_(0, places, one.expand(places.shape))
+        return total
 
 
 def hot_pixel_rates(

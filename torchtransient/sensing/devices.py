@@ -24,10 +24,11 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.sensing.afterpulsing import Afterpulsing, Crosstalk
+from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
+from torchtransient.sensing.crosstalk import Crosstalk
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.gated import GatedIntegration

@@ -7,65 +7,108 @@ result depends on the generator, never on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME
+from torchtransient.sensing.thinning import halve
+
+Result = TypeVar("Result")
 
 _PIECES = 4
 _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs less than it saves
 _WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
 
-def _in_pieces(
+def by_pieces(
+    job: Callable[[Tensor, int, torch.Generator | None], Result], flat: Tensor, generator: torch.Generator | None
+) -> list[Result]:
+    """`job(piece, begin, generator)` of consecutive pieces of `flat` (N,), in threads for large ones on the CPU."""
+    if flat.device.type != "cpu" or flat.numel() < _WORTH_THREADS:
+        return [job(flat, 0, generator)]
+    pieces = flat.tensor_split(_PIECES)
+    begins = [0]
+    for piece in pieces[:-1]:
+        begins.append(begins[-1] + piece.numel())
+    return _in_threads(job, list(zip(pieces, begins, strict=True)), generator)
+
+
+def _in_threads(
+    job: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], generator: torch.Generator | None
+) -> list[Result]:
+    seeds = torch.randint(0, 2**63 - 1, (len(arguments),), generator=generator).tolist()
+
+    def run(given: tuple[Any, ...], seed: int) -> Result:
+        own = torch.Generator().manual_seed(seed)
+        with torch.no_grad():  # grad mode is per thread
+            return job(*given, own)
+
+    threads = min(torch.get_num_threads(), len(arguments))
+    if threads == 1:
+        return [run(given, seed) for given, seed in zip(arguments, seeds, strict=True)]
+    # a pool for each call: it costs less than a millisecond, and processes forked later inherit no dead threads
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(run, arguments, seeds))
+
+
+def _in_columns(
     draw: Callable[[Tensor, torch.Generator | None], Tensor], data: Tensor, generator: torch.Generator | None
 ) -> Tensor:
     """`draw` over pieces of `data` along its last dimension; in threads for large tensors on the CPU."""
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[-1] < _PIECES:
         return draw(data, generator)
-    seeds = torch.randint(0, 2**63 - 1, (_PIECES,), generator=generator).tolist()
-    pieces = data.tensor_split(_PIECES, dim=-1)
-    outer = torch.get_num_threads()
-
-    def job(piece: Tensor, seed: int) -> Tensor:
-        own = torch.Generator().manual_seed(seed)
-        with torch.no_grad():  # grad mode is per thread
-            return draw(piece, own)
-
-    if outer == 1:
-        results = [job(p, s) for p, s in zip(pieces, seeds, strict=True)]
-    else:
-        with ThreadPoolExecutor(min(outer, _PIECES)) as pool:
-            results = list(pool.map(job, pieces, seeds))
-    return torch.cat(results, dim=-1)
+    pieces = [(piece,) for piece in data.tensor_split(_PIECES, dim=-1)]
+    return torch.cat(_in_threads(draw, pieces, generator), dim=-1)
 
 
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """`torch.poisson` on several cores. Means have to be finite and >= 0, in float32 or float64."""
-    return _in_pieces(lambda m, g: torch.poisson(m, generator=g), mean, generator)
+    return _in_columns(lambda m, g: torch.poisson(m, generator=g), mean, generator)
 
 
-def _split(totals: Tensor, weights: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Distribute `totals` (P,) over `weights` (T, P) by conditional binomials, halving the bins level by level."""
+def _distribute(
+    trials: int, weights: Tensor, chance: Callable[[Tensor], Tensor], generator: torch.Generator | None
+) -> Tensor:
+    """Counts (T, P) of `trials` in bins by conditional binomials, halving the bins level by level.
+
+    `weights`: (T, P). `chance` turns the sum of the weights of neighbouring bins into the probability of their counts,
+    or that up to a factor which is 1 for all bins together. Neighbours part last: there are few counts then, and
+    their shares are nearly equal, which `halve` draws fast.
+    """
     levels = [weights]
     while levels[-1].shape[0] > 1:
         finer = levels[-1]
-        half = (finer.shape[0] + 1) // 2
-        coarser = finer[:half].clone()
-        coarser[: finer.shape[0] - half] += finer[half:]
+        even = finer.shape[0] // 2
+        coarser = finer[0::2].clone()
+        coarser[:even] += finer[1::2]
         levels.append(coarser)
-    counts = totals.unsqueeze(0)
+    total = chance(levels[-1]).clamp_max(1)
+    counts = torch.binomial(torch.full_like(total, float(trials)), total, generator=generator)
     for finer, coarser in zip(reversed(levels[:-1]), reversed(levels[1:]), strict=True):
-        pairs = finer.shape[0] - coarser.shape[0]
-        # at most 1, as a rounded sum of two positive numbers is not below either; 0/0 means no light and no counts
-        share = finer[:pairs] / coarser[:pairs].clamp_min(torch.finfo(finer.dtype).tiny)
-        first = torch.binomial(counts[:pairs], share, generator=generator)
-        counts = torch.cat([first, counts[pairs:], counts[:pairs] - first])
+        even = finer.shape[0] // 2
+        # 0/0 means no light and no counts
+        whole = chance(coarser[:even]).clamp_min(torch.finfo(finer.dtype).tiny)
+        share = chance(finer[0 : 2 * even : 2]).div(whole).clamp_max_(1)
+        split = torch.empty_like(finer)
+        first = halve(counts[:even], share, generator)
+        split[0 : 2 * even : 2] = first
+        torch.sub(counts[:even], first, out=split[1::2])
+        split[2 * even :] = counts[even:]
+        counts = split
     return counts
+
+
+def _any_photon(rate: Tensor) -> Tensor:
+    return torch.expm1(-rate).neg_()
+
+
+def _as_it_is(probability: Tensor) -> Tensor:
+    return probability
 
 
 def sample_multinomial(trials: int, probabilities: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -76,30 +119,43 @@ def sample_multinomial(trials: int, probabilities: Tensor, generator: torch.Gene
     `probabilities` (float32 or float64; above 2^24 trials float32 is drawn in float64 and rounded). No gradient.
     Raises ShapeError for fewer than 3 dimensions, UnitError for negative or non-finite probabilities.
     """
-    if probabilities.ndim < 3:
-        raise ShapeError(f"sample_multinomial: expected (..., T, H, W), got {tuple(probabilities.shape)}.")
-    p = probabilities.detach()
-    if p.numel() == 0:
-        return p.clone()
-    low, high = torch.aminmax(p)
+    return _sample_tree(trials, probabilities, _as_it_is, generator, "sample_multinomial")
+
+
+def sample_first_photons(cycles: int, rate: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Histogram of the first photon of each of `cycles` cycles, for `rate` (..., T, H, W) photons per cycle and bin.
+
+    The multinomial of `first_photon_probabilities`. Nothing is summed over earlier bins: of the photons first in one
+    of two neighbouring stretches of time, those in the earlier are a share (1 - exp(-a)) / (1 - exp(-a - b)) that
+    does not depend on what came before. Otherwise as `sample_multinomial`.
+    """
+    return _sample_tree(cycles, rate, _any_photon, generator, "sample_first_photons")
+
+
+def _sample_tree(
+    trials: int, weights: Tensor, chance: Callable[[Tensor], Tensor], generator: torch.Generator | None, where: str
+) -> Tensor:
+    if weights.ndim < 3:
+        raise ShapeError(f"{where}: expected (..., T, H, W), got {tuple(weights.shape)}.")
+    w = weights.detach()
+    if w.numel() == 0:
+        return w.clone()
+    low, high = torch.aminmax(w)
     if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"sample_multinomial: expected finite values >= 0, got {float(low):g} to {float(high):g}.")
-    work = torch.float64 if trials > _WHOLE_FLOAT32 or p.dtype == torch.float64 else torch.float32
-    bins, pixels = p.shape[TIME], p.shape[-2] * p.shape[-1]
-    columns = p.to(work).reshape(-1, bins, pixels)
+        raise UnitError(f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}.")
+    work = torch.float64 if trials > _WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
+    bins, pixels = w.shape[TIME], w.shape[-2] * w.shape[-1]
+    columns = w.to(work).reshape(-1, bins, pixels)
 
     def draw(piece: Tensor, own: torch.Generator | None) -> Tensor:
-        rows = []
-        for image in piece:  # one pass per leading index, not per pixel
-            detected = image.sum(0, dtype=torch.float64).clamp_max(1.0).to(work)
-            totals = torch.binomial(torch.full_like(detected, float(trials)), detected, generator=own)
-            rows.append(_split(totals, image, own))
-        return torch.stack(rows)
+        # one pass per leading index, not per pixel
+        images = [_distribute(trials, image, chance, own) for image in piece]
+        return torch.stack(images) if len(images) > 1 else images[0].unsqueeze(0)
 
     if columns.shape[0] > 1 and pixels < 4 * columns.shape[0]:
         # many small images: one wide one instead
         wide = columns.movedim(1, 0).reshape(1, bins, -1)
-        counts = _in_pieces(draw, wide, generator).view(bins, -1, pixels).movedim(0, 1)
+        counts = _in_columns(draw, wide, generator).view(bins, -1, pixels).movedim(0, 1)
     else:
-        counts = _in_pieces(draw, columns, generator)
-    return counts.reshape(p.shape).to(p.dtype)
+        counts = _in_columns(draw, columns, generator)
+    return counts.reshape(w.shape).to(w.dtype)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.draws import sample_first_photons
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -88,8 +88,7 @@ def sample_detections(
     number = check_count(cycles, "cycles", "sample_detections")
     rate = rate.detach()
     if dead_bins is None:
-        p, _ = first_photon_probabilities(_working(rate))
-        return sample_multinomial(number, p, generator).to(rate.dtype)
+        return sample_first_photons(number, _working(rate), generator).to(rate.dtype)
     whole, part = split_dead_time(dead_bins)
     share = part.to(rate.device)
     fire = -torch.expm1(-rate.to(torch.float64))

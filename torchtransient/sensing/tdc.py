@@ -107,9 +107,10 @@ class TDC(Sensor):
         bands = self.bands.to(work.dtype)
         before, after = max(0, -self.first), max(0, self.first + bands.shape[1] - 1)
         padded = torch.nn.functional.pad(work, (0, 0, 0, 0, before, after))
-        total = torch.zeros_like(work)
-        for b in range(bands.shape[1]):
-            total = torch.addcmul(total, bands[:, b].view(-1, 1, 1), padded.narrow(TIME, before + self.first + b, bins))
+        columns = bands.view(bins, -1, 1, 1).unbind(1)
+        total = columns[0] * padded.narrow(TIME, before + self.first, bins)
+        for b, column in enumerate(columns[1:], start=1):
+            total.addcmul_(column, padded.narrow(TIME, before + self.first + b, bins))
         return total.to(x.dtype)
 
     def extra_repr(self) -> str:

@@ -1,0 +1,80 @@
+"""The base of sensors that add detections no photon made to those they are given."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchtransient.sensing.draws import fast_poisson
+from torchtransient.sensing.layout import TIME
+from torchtransient.sensing.policies import record_score
+from torchtransient.sensing.sensor import RandomSensor
+from torchtransient.sensing.shot_noise import poisson_log_prob
+
+# Events per entry, on average, above which following them one by one is given up for Poisson numbers.
+_MOST_EVENTS = 16
+_BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
+
+
+def is_whole(counts: Tensor) -> bool:
+    """Whether all entries are whole numbers >= 0."""
+    flat = counts.reshape(-1)
+    blocks = (flat[begin : begin + _BLOCK] for begin in range(0, flat.numel(), _BLOCK))
+    return all(torch.equal(block, block.round().clamp_min_(0)) for block in blocks)
+
+
+class AddedCounts(RandomSensor):
+    """A sensor that adds counts n to those it is given: x + n with mean `extra(x)`. All four policies.
+
+    The counts given pass with their own gradient under every policy. Every detection triggers others with a small
+    probability: whole counts are followed one by one (`trigger`), which is exact. Where there is no such number, or
+    no use in it, Poisson numbers of the same mean stand for the sum: for counts that are not whole (the means of
+    another sensor), for more than 16 events per entry on average, and under the policy "score", whose probabilities
+    are theirs. Their variance is off by the probability of the effect (by 1 % at 1 %).
+    """
+
+    def extra(self, x: Tensor) -> Tensor:
+        """Mean of the counts added, in the shape of `x`."""
+        raise NotImplementedError(f"{type(self).__name__} has to define extra(x).")
+
+    def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Whole `counts` (..., C, T, H, W) >= 0, float32 or float64, with what they trigger, drawn event by event."""
+        raise NotImplementedError(f"{type(self).__name__} has to define trigger(counts, generator).")
+
+    def share(self) -> float:
+        """Expected events of one detection."""
+        raise NotImplementedError(f"{type(self).__name__} has to define share().")
+
+    def expected(self, x: Tensor) -> Tensor:
+        return x + self.extra(x)
+
+    def variance(self, x: Tensor) -> Tensor:
+        return self.extra(x)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            given = x.detach()
+            counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+            events = self.share() * float(counts.sum())
+            if not is_whole(counts) or events > _MOST_EVENTS * counts.numel():
+                return given + self._poisson(self.extra(given), generator)
+            return self.trigger(counts, generator).to(x.dtype)
+
+    @staticmethod
+    def _poisson(mean: Tensor, generator: torch.Generator | None) -> Tensor:
+        work = mean.detach().clamp_min(0)
+        if work.dtype in (torch.float16, torch.bfloat16):
+            work = work.float()
+        return fast_poisson(work, generator).to(mean.dtype)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        return poisson_log_prob((measurement - x).detach().clamp_min(0), self.extra(x)).sum(TIME)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score":
+            return super().forward(x, generator)
+        # the counts given pass with their own gradient, those added with their probabilities
+        mean = self.extra(x)
+        added = self._poisson(mean, generator)
+        record_score(lambda: poisson_log_prob(added, mean).sum(TIME), type(self).__name__)
+        return x + added

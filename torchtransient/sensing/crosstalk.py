@@ -1,0 +1,154 @@
+"""Crosstalk: detections that trigger neighbouring pixels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.sensing.added_counts import AddedCounts
+from torchtransient.sensing.draws import by_pieces
+from torchtransient.sensing.layout import check_number, check_transient
+from torchtransient.sensing.policies import GradPolicy
+from torchtransient.sensing.thinning import sixteen_bits, thin
+
+_EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+_BLOCK = 1 << 15  # entries at a time, so that temporaries stay in the cache
+_CELLS = 1 << 16  # values of a 16 bit number
+
+
+def add_crosstalk(
+    counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
+) -> Tensor:
+    """Mean histogram with optical crosstalk: each detection triggers each of the 4 neighbours with `probability`.
+
+    `diagonal`: the same for the 4 neighbours across a corner. No delay: crosstalk takes less than a bin. What leaves
+    the rim of the sensor is lost. First order: crosstalk of crosstalk is left out. (..., C, T, H, W), dtype kept.
+    """
+    check_transient(counts, "add_crosstalk")
+    near = torch.as_tensor(probability, device=counts.device).to(counts.dtype)
+    far = torch.as_tensor(diagonal, device=counts.device).to(counts.dtype)
+    padded = torch.nn.functional.pad(counts, (1, 1, 1, 1))
+    height, width = counts.shape[-2:]
+
+    def seen(dy: int, dx: int) -> Tensor:
+        return padded[..., 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+
+    added = near * (seen(-1, 0) + seen(1, 0) + seen(0, -1) + seen(0, 1))
+    if far.requires_grad or bool(far != 0):
+        added = added + far * (seen(-1, -1) + seen(-1, 1) + seen(1, -1) + seen(1, 1))
+    return added if only_added else counts + added
+
+
+class Crosstalk(AddedCounts):
+    """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`. `learnable`: `logit_probability`.
+
+    `diagonal_ratio`: probability across a corner over that across an edge.
+    """
+
+    logit_probability: Tensor
+
+    def __init__(
+        self,
+        probability: float,
+        *,
+        diagonal_ratio: float = 0.0,
+        learnable: bool = False,
+        grad: GradPolicy = "expected",
+    ) -> None:
+        super().__init__(grad)
+        p = check_number(probability, "probability", "Crosstalk", high=0.25, open_low=True)
+        self.diagonal_ratio = check_number(diagonal_ratio, "diagonal_ratio", "Crosstalk", high=1.0)
+        tensor = torch.tensor(math.log(p / (1 - p)), dtype=torch.float64)
+        if learnable:
+            self.register_parameter("logit_probability", nn.Parameter(tensor))
+        else:
+            self.register_buffer("logit_probability", tensor)
+
+    @property
+    def probability(self) -> Tensor:
+        """Of one neighbour per detection, float64."""
+        return self.logit_probability.double().sigmoid()
+
+    def _probabilities(self) -> tuple[Tensor, Tensor | float]:
+        """Of an edge and of a corner."""
+        p = self.probability
+        return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
+
+    def extra(self, x: Tensor) -> Tensor:
+        return add_crosstalk(x, *self._probabilities(), only_added=True)
+
+    def variance(self, x: Tensor) -> Tensor:
+        near, far = self._probabilities()
+        return add_crosstalk(x, near * (1 - near), far * (1 - far), only_added=True)
+
+    def share(self) -> float:
+        return 4 * float(self.probability) * (1 + self.diagonal_ratio)
+
+    def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
+        check_transient(counts, "Crosstalk")
+        near, far = (float(p) for p in self._probabilities())
+        neighbours = [(step, near) for step in _EDGES] + [(step, far) for step in _CORNERS if far > 0]
+        sets = _Neighbours([p for _, p in neighbours], counts.device)
+        *_, height, width = counts.shape
+        wide = width + 2
+        # by the lowest bit of a set, how far away that neighbour is in an image with a rim of one pixel
+        steps = [dy * wide + dx for (dy, dx), _ in neighbours]
+        first_step = torch.tensor([0, *(steps[(m & -m).bit_length() - 1] for m in range(1, 2 ** len(steps)))])
+        first_step = first_step.to(counts.device)
+
+        def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> list[Tensor]:
+            """Places, in images with a rim, of what the detections of a piece trigger."""
+            events = thin(piece, sets.any, own)
+            place = events.place + begin
+            row = place.div(width, rounding_mode="floor")
+            frame = row.div(height, rounding_mode="floor")
+            place += (row * 2).add_(frame, alpha=2 * wide).add_(wide + 1)
+            found = []
+            for block in range(0, place.numel(), _BLOCK):
+                at = slice(block, block + _BLOCK)
+                start = place[at].repeat_interleave(events.number[at].long())
+                bits = sets.draw(start, own)
+                while start.numel():
+                    found.append(start + first_step[bits])
+                    bits &= bits - 1
+                    more = bits.nonzero().squeeze(-1)
+                    start, bits = start[more], bits[more]
+            return found
+
+        one = torch.ones(1, dtype=counts.dtype, device=counts.device)
+        total = torch.nn.functional.pad(counts, (1, 1, 1, 1))
+        for found in by_pieces(follow, counts.reshape(-1), generator):
+            for places in found:
+                total.view(-1).scatter_add_(0, places, one.expand(places.shape))
+        return total[..., 1:-1, 1:-1].contiguous()
+
+
+class _Neighbours:
+    """Which neighbours a detection triggers, given that it triggers any: a set of bits 1, 2, 4, ..."""
+
+    def __init__(self, probabilities: list[float], device: torch.device) -> None:
+        subset = torch.arange(1, 2 ** len(probabilities))
+        chance = torch.ones(subset.shape, dtype=torch.float64)
+        for k, p in enumerate(probabilities):
+            chance *= torch.where((subset >> k) & 1 > 0, p, 1 - p)
+        self.any = float(chance.sum())
+        # set number m + 1 ends where the uniform number is edges[m]; the last ends at 1
+        edges = (chance.cumsum(0) / chance.sum())[:-1]
+        self._edges = edges.to(device)
+        # by 16 bits of the uniform number: the set, or 0 where they do not tell it
+        starts = torch.arange(_CELLS + 1, dtype=torch.float64) / _CELLS
+        first = torch.bucketize(starts[:-1], edges, right=True) + 1
+        last = torch.bucketize(starts[1:], edges) + 1
+        self._sets = torch.where(first == last, first, 0).to(device)
+
+    def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(K,) int64 sets, one for each entry of `like` (K,)."""
+        cell = sixteen_bits(like, generator).long() + _CELLS // 2
+        bits = self._sets[cell]
+        unsure = (bits == 0).nonzero().squeeze(-1)
+        u = torch.rand(unsure.shape, dtype=torch.float64, device=like.device, generator=generator)
+        bits[unsure] = torch.bucketize((cell[unsure] + u) / _CELLS, self._edges, right=True) + 1
+        return bits
