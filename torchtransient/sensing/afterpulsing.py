@@ -169,6 +169,7 @@ class Afterpulsing(AddedCounts):
                     seen = (time < bins).nonzero().squeeze(-1)
                     found.append(time[seen].long().mul_(pixels).add_(origin[seen]))
                     again = torch.rand(time.shape, dtype=real, device=time.device, generator=own) < p
+                    again = again.nonzero().squeeze(-1)
                     time, origin = time[again], origin[again]
             return torch.cat(found)
 

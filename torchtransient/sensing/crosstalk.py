@@ -91,13 +91,10 @@ class Crosstalk(AddedCounts):
         check_transient(counts, "Crosstalk")
         near, far = (float(p) for p in self._probabilities())
         neighbours = [(step, near) for step in _EDGES] + [(step, far) for step in _CORNERS if far > 0]
-        sets = _Neighbours([p for _, p in neighbours], counts.device)
         *_, height, width = counts.shape
         wide = width + 2
-        # by the lowest bit of a set, how far away that neighbour is in an image with a rim of one pixel
         steps = [dy * wide + dx for (dy, dx), _ in neighbours]
-        first_step = torch.tensor([0, *(steps[(m & -m).bit_length() - 1] for m in range(1, 2 ** len(steps)))])
-        first_step = first_step.to(counts.device)
+        sets = _Neighbours(steps, [p for _, p in neighbours], counts.device)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> list[Tensor]:
             """Places, in images with a rim, of what the detections of a piece trigger."""
@@ -110,12 +107,7 @@ class Crosstalk(AddedCounts):
             for block in range(0, place.numel(), _BLOCK):
                 at = slice(block, block + _BLOCK)
                 start = place[at].repeat_interleave(events.number[at].long())
-                bits = sets.draw(start, own)
-                while start.numel():
-                    found.append(start + first_step[bits])
-                    bits &= bits - 1
-                    more = bits.nonzero().squeeze(-1)
-                    start, bits = start[more], bits[more]
+                found.extend(sets.reached(start, own))
             return found
 
         one = torch.ones(1, dtype=counts.dtype, device=counts.device)
@@ -127,9 +119,12 @@ class Crosstalk(AddedCounts):
 
 
 class _Neighbours:
-    """Which neighbours a detection triggers, given that it triggers any: a set of bits 1, 2, 4, ..."""
+    """Which neighbours a detection triggers, given that it triggers any: sets of bits 1, 2, 4, ...
 
-    def __init__(self, probabilities: list[float], device: torch.device) -> None:
+    Nearly always it is one neighbour, and 16 random bits tell which; the others are looked at more closely.
+    """
+
+    def __init__(self, steps: list[int], probabilities: list[float], device: torch.device) -> None:
         subset = torch.arange(1, 2 ** len(probabilities))
         chance = torch.ones(subset.shape, dtype=torch.float64)
         for k, p in enumerate(probabilities):
@@ -138,17 +133,26 @@ class _Neighbours:
         # set number m + 1 ends where the uniform number is edges[m]; the last ends at 1
         edges = (chance.cumsum(0) / chance.sum())[:-1]
         self._edges = edges.to(device)
-        # by 16 bits of the uniform number: the set, or 0 where they do not tell it
+        self._steps = steps
+        # by the first 16 bits of the uniform number: the step to the only neighbour, 0 if they do not tell
         starts = torch.arange(_CELLS + 1, dtype=torch.float64) / _CELLS
         first = torch.bucketize(starts[:-1], edges, right=True) + 1
         last = torch.bucketize(starts[1:], edges) + 1
-        self._sets = torch.where(first == last, first, 0).to(device)
+        only = torch.zeros(2 ** len(steps), dtype=torch.int64)
+        only[[1 << k for k in range(len(steps))]] = torch.tensor(steps)
+        # numbers are signed: cell 0 is the lowest
+        self._only = torch.where(first == last, only[first], 0).roll(-_CELLS // 2).to(device)
 
-    def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
-        """(K,) int64 sets, one for each entry of `like` (K,)."""
-        cell = sixteen_bits(like, generator).long() + _CELLS // 2
-        bits = self._sets[cell]
-        unsure = (bits == 0).nonzero().squeeze(-1)
-        u = torch.rand(unsure.shape, dtype=torch.float64, device=like.device, generator=generator)
-        bits[unsure] = torch.bucketize((cell[unsure] + u) / _CELLS, self._edges, right=True) + 1
-        return bits
+    def reached(self, start: Tensor, generator: torch.Generator | None) -> list[Tensor]:
+        """Flat indices reached from detections at `start` (K,), in several tensors."""
+        bits = sixteen_bits(start, generator)
+        step = self._only[bits.long().bitwise_and_(_CELLS - 1)]
+        unsure = (step == 0).nonzero().squeeze(-1)
+        cell = bits[unsure].double().add_(_CELLS / 2)
+        u = torch.rand(unsure.shape, dtype=torch.float64, device=start.device, generator=generator)
+        subset = torch.bucketize(cell.add_(u).div_(_CELLS), self._edges, right=True) + 1
+        origin = start[unsure]
+        # a set that is not told yet points to the rim, which nobody sees
+        found = [torch.where(step != 0, start + step, 0)]
+        found += [origin[(subset >> k) & 1 > 0] + distance for k, distance in enumerate(self._steps)]
+        return found

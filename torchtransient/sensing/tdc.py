@@ -105,12 +105,13 @@ class TDC(Sensor):
             raise ShapeError(f"TDC: expected T = {self.bands.shape[0]} as in code_widths, got {bins}.")
         work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
         bands = self.bands.to(work.dtype)
-        before, after = max(0, -self.first), max(0, self.first + bands.shape[1] - 1)
-        padded = torch.nn.functional.pad(work, (0, 0, 0, 0, before, after))
-        columns = bands.view(bins, -1, 1, 1).unbind(1)
-        total = columns[0] * padded.narrow(TIME, before + self.first, bins)
-        for b, column in enumerate(columns[1:], start=1):
-            total.addcmul_(column, padded.narrow(TIME, before + self.first + b, bins))
+        total = torch.zeros_like(work)
+        for b, column in enumerate(bands.view(bins, -1, 1, 1).unbind(1)):
+            offset = self.first + b
+            low, high = max(0, -offset), min(bins, bins - offset)
+            if low < high:
+                codes = total.narrow(TIME, low, high - low)
+                codes.addcmul_(column[low:high], work.narrow(TIME, low + offset, high - low))
         return total.to(x.dtype)
 
     def extra_repr(self) -> str:
