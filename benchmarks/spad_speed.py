@@ -100,7 +100,7 @@ def synchronous(bins: int, size: int, cycles: int, repeats: int) -> dict[str, ob
 def free_running(bins: int, size: int, repeats: int) -> dict[str, object]:
     """Forward and backward of the stationary state."""
     report: dict[str, object] = {}
-    for flux in (0.3, 3.0, 30.0):
+    for flux in (0.3, 3.0, 30.0, 300.0, 1000.0, 3000.0):
         rate = pulse_image(bins, size, flux).requires_grad_()
         forward, backward = [], []
         for turn in range(repeats + 1):

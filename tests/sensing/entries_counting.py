@@ -84,13 +84,11 @@ ENTRIES = [
         "FreeRunningSPAD",
         lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, learnable=True, **k),
         random=True,
-        policies=("expected", "gaussian", "straight_through"),
     ),
     Entry(
         "FreeRunningSPAD-paralyzable",
         lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="paralyzable", learnable=True, **k),
         random=True,
-        policies=("expected", "gaussian", "straight_through"),
         errors=(
             (lambda: sensing.FreeRunningSPAD(500, 75.0, bin_width_s=20 * PS), UnitError),
             (lambda: sensing.FreeRunningSPAD(500, 75 * PS), UnitError),

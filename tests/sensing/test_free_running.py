@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from event_driven import arrivals, chi2_per_dof, detections, histogram, total_variation
+from event_driven import arrivals, chi2_per_dof, dense_limit, detections, histogram, total_variation
 
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing import (
@@ -16,7 +16,6 @@ from torchtransient.sensing import (
 )
 from torchtransient.sensing.krylov import gmres
 from torchtransient.sensing.renewal_chain import RenewalChain
-from torchtransient.sensing.running_sums import split_dead_time
 
 BINS = 64
 
@@ -31,27 +30,13 @@ def as_image(row):
     return torch.as_tensor(row, dtype=torch.float64).reshape(1, -1, 1, 1)
 
 
-def dense_step(rate, whole, part):
-    bins = len(rate)
-    matrix = np.zeros((bins, bins))
-    for i in range(bins):
-        for start, weight in ((i + whole, 1 - part), (i + whole + 1, part)):
-            survive = weight / (1 - np.exp(-rate.sum()))
-            for n in range(bins):
-                k = (start + n) % bins
-                matrix[i, k] += survive * (1 - np.exp(-rate[k]))
-                survive *= np.exp(-rate[k])
-    return matrix
-
-
 @pytest.mark.parametrize("dead", [0.5, 6.8, 63.0, 64.2, 150.3])
 def test_against_the_dense_markov_matrix(dead):
     rate = pulse(2.5)
-    whole, part = split_dead_time(dead)
-    values, vectors = np.linalg.eig(dense_step(rate, whole, float(part)).T)
-    pi = np.real(vectors[:, np.argmax(values.real)])
     found = nonparalyzable_histogram(as_image(rate), dead).flatten().numpy()
-    np.testing.assert_allclose(found / found.sum(), pi / pi.sum(), atol=1e-12)
+    wanted, error = dense_limit(rate, dead, 4)
+    # the straight lines add an error of third order in the rate of a bin, 0.25 here: r^3/600 measured, r^2/12 without
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=error + rate.max() ** 3 / 200 * wanted.max())
 
 
 @pytest.mark.parametrize("kind", ["non_paralyzable", "paralyzable"])
@@ -87,17 +72,16 @@ def test_tv_at_the_figure_of_the_reference():
 
 
 @pytest.mark.parametrize("dead", [30.0, 64.0, 700.0])
-@pytest.mark.parametrize("rate", [1e-3, 0.02])
+@pytest.mark.parametrize("rate", [1e-3, 0.02, 1.0, 50.0])
 def test_constant_light(rate, dead):
     x = torch.full((1, BINS, 1, 1), rate, dtype=torch.float64)
-    steady = torch.tensor(rate / 1e-10)
+    steady = torch.tensor(rate / 1e-10, dtype=torch.float64)
     for kind, found in (
         ("non_paralyzable", nonparalyzable_histogram(x, dead)),
         ("paralyzable", paralyzable_histogram(x, dead)),
     ):
         wanted = float(free_running_rate(steady, dead * 1e-10, kind)) * 1e-10
-        # binning is right to second order in the rate of a bin
-        torch.testing.assert_close(found, torch.full_like(x, wanted), rtol=rate**2 + 1e-6, atol=0)
+        torch.testing.assert_close(found, torch.full_like(x, wanted), rtol=1e-10, atol=0)
 
 
 def test_chain_and_transpose():
@@ -105,10 +89,10 @@ def test_chain_and_transpose():
     for scale in (0.01, 1.0, 80.0):
         rate = scale * torch.rand(3, 30, dtype=torch.float64, generator=g)
         chain = RenewalChain(rate, 37, torch.tensor(0.3, dtype=torch.float64))
-        a, b = (torch.randn(3, 30, dtype=torch.float64, generator=g) for _ in range(2))
+        a, b = (torch.randn(3, 60, dtype=torch.float64, generator=g) for _ in range(2))
         left, right = (chain.step(a) * b).sum(-1), (a * chain.transposed(b)).sum(-1)
         torch.testing.assert_close(left, right, rtol=1e-10, atol=1e-12)
-        torch.testing.assert_close(chain.step(a).sum(-1), a.sum(-1), rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(chain.step(a)[:, :30].sum(-1), a[:, :30].sum(-1), rtol=1e-10, atol=1e-12)
 
 
 def test_gmres_solves_rows_of_different_difficulty():
@@ -120,7 +104,10 @@ def test_gmres_solves_rows_of_different_difficulty():
         / 60**0.5
     )
     right = torch.randn(3, 60, dtype=torch.float64, generator=g)
-    found = gmres(lambda v: torch.einsum("pij,pj->pi", matrices, v), right, right * 0, 1e-11)
+    found, residual = gmres(lambda v: torch.einsum("pij,pj->pi", matrices, v), right, right * 0, 1e-11)
+    assert float(residual.max()) <= 1e-8
+    wanted = (right - torch.einsum("pij,pj->pi", matrices, found)).norm(dim=-1) / right.norm(dim=-1)
+    torch.testing.assert_close(residual, wanted, rtol=1e-3, atol=1e-15)
     torch.testing.assert_close(found, torch.linalg.solve(matrices, right), rtol=1e-6, atol=1e-7)
 
 
@@ -171,10 +158,14 @@ def test_dark_and_saturated_pixels():
 
 def test_errors():
     with pytest.raises(UnitError, match="half a bin"):
-        FreeRunningSPAD(10, 1e-12, bin_width_s=1e-10)
+        nonparalyzable_histogram(torch.ones(1, 4, 1, 1), 0.01)
     with pytest.raises(UnitError, match=">= 0"):
         nonparalyzable_histogram(torch.full((1, 4, 1, 1), -1.0), 2.0)
+    with pytest.raises(UnitError, match="at least one bin"):
+        FreeRunningSPAD(10, 0.7e-10, bin_width_s=1e-10)
     x = torch.ones(1, 4, 1, 1, requires_grad=True)
     spad = FreeRunningSPAD(10, 2e-10, bin_width_s=1e-10, grad="score")
-    with pytest.raises(GradientError, match="score"):
+    with pytest.raises(GradientError, match="ScoreFunction"):
         spad(x)
+    with pytest.raises(GradientError, match="were dead"):
+        spad.log_prob(torch.zeros(1, 4, 1, 1), x)

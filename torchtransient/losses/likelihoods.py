@@ -99,21 +99,26 @@ def first_photon_nll(
 
 
 def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
-    """Periods in which a free-running detector was armed at the start of each bin, from its histogram: float64.
+    """Periods in which a free-running detector was armed, averaged over each bin, from its histogram: float64.
 
-    Every detection takes the next (dead time - 1/2) bins, round the period and for as many periods as it lasts.
+    Every detection takes the dead time that follows it, round the period and for as many periods as it lasts.
+    Detections count as spread evenly over their bin.
     """
-    whole, part = split_dead_time(dead_bins)
+    split_dead_time(dead_bins)  # says what is wrong with a dead time that is too short
+    whole = math.floor(dead_bins + 1e-9)
+    part = max(0.0, dead_bins - whole)
     bins = counts.shape[_TIME]
     h = counts.to(torch.float64)
-    rounds, rest = divmod(whole - 1, bins)
+    rounds, rest = divmod(whole, bins)
     total = h.sum(_TIME, keepdim=True)
     before = h.cumsum(_TIME) - h
     # sum of h over the `rest` bins before bin k, round the period
     earlier = before.roll(rest, _TIME)
     index = torch.arange(bins, device=h.device).view(-1, 1, 1)
-    window = torch.where(index < rest, before - earlier + total, before - earlier)
-    return periods - rounds * total - window - float(part) * h.roll(whole, _TIME)
+    window = rounds * total + torch.where(index < rest, before - earlier + total, before - earlier)
+    # a detection u < 1 bins after the start of its bin reaches to whole + part + u: edges by integrals over both bins
+    edges = 0.5 * h - 0.5 * (1 - part) ** 2 * h.roll(whole, _TIME) + 0.5 * part**2 * h.roll(whole + 1, _TIME)
+    return periods - window - edges
 
 
 def free_running_nll(
@@ -127,26 +132,25 @@ def free_running_nll(
 ) -> Tensor:
     """-log-likelihood of a free-running SPAD's histogram with non-paralyzable dead time, up to a constant.
 
-    The history of a detector factorises into bins in which it was armed, and the histogram alone tells in how many
-    periods it was (`armed_periods`): -(n log(1 - exp(-r)) - r (armed - n)). Exact but for the periods at both ends of
-    the exposure and, for a fractional dead time, the share of a bin. Its least is where Rapp et al. and Gupta et al.
-    (see `sensing.free_running`) put it: r = -log(1 - n/armed). Arguments as in `first_photon_nll`.
+    That of photons while the detector is armed, which the histogram alone tells (`armed_periods`): r armed - n log(r).
+    Exact but for the periods at both ends of the exposure and the places of detections inside a bin: the error of the
+    best rate, r = n/armed, is second order in the counts of a bin per period. Its least is where Rapp et al. and Gupta
+    et al. (see `sensing.free_running`) put it. Arguments as in `first_photon_nll`.
     """
     _check(counts, rate, "free_running_nll")
     if bool((rate.detach() < 0).any()):
         raise UnitError("free_running_nll: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
     n = counts.to(torch.float64)
     armed = armed_periods(n, periods, dead_bins)
-    # the ends of the exposure and the fraction of a bin leave an uncertainty of about the square root of the counts
-    if bool((armed - n < -(2 + 6 * n.sum(_TIME, keepdim=True).sqrt())).any()):
+    # the ends of the exposure and the places inside a bin leave an uncertainty of about the square root of the counts
+    if bool((armed < -(2 + 6 * n.sum(_TIME, keepdim=True).sqrt())).any()):
         raise UnitError(
             f"free_running_nll: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
             "got more. Check periods and dead time."
         )
     r = (rate + (relative_floor(rate) if floor is None else floor)).to(torch.float64)
     hit = n > 0
-    fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
-    value = r * (armed - n).clamp_min(0) - torch.where(hit, n * fire.log(), torch.zeros_like(r))
+    value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
     return _reduce(value.to(rate.dtype), reduction, "free_running_nll")
 
 

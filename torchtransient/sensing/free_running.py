@@ -17,11 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import UnitError
-from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.errors import GradientError, UnitError
+from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
+from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_transient
-from torchtransient.sensing.policies import GradPolicy
-from torchtransient.sensing.renewal_chain import RenewalChain, stationary_phases
+from torchtransient.sensing.policies import GradPolicy, record_score
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.time_convolution import check_choice
@@ -38,33 +38,36 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
     return rate_hz / (1 + rate_hz * dead)
 
 
+def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
+    """Stationary state for rates (..., T, H, W), in the same layout."""
+    wide = rate.to(torch.float64).movedim(TIME, -1)
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    rows = stationary_state(wide.reshape(-1, wide.shape[-1]), dead)
+
+    def image(value: Tensor) -> Tensor:
+        return value.view(wide.shape).movedim(-1, TIME)
+
+    return FreeRunningState(image(rows.detected), image(rows.armed), image(rows.late), rows.whole)
+
+
 def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin of a free-running detector in its stationary state.
 
     `rate`: (..., C, T, H, W) photons (times efficiency) per period and bin; the T bins are one whole period.
     `dead_bins`: dead time in bins, at least 1/2, also longer than a period; a number or a scalar tensor, in which the
-    result is differentiable (once; piecewise smooth). dtype and device of `rate` are kept; computed in float64. Exact
-    to second order in the rate of a bin: use bins that hold less than about 0.2 photons, or narrower ones.
+    result is differentiable (once; piecewise smooth). dtype and device of `rate` are kept; computed in float64.
+
+    Photons arrive at a constant rate inside a bin, any number of them; dead times are exact to fractions of a bin.
+    Detections inside a bin follow a straight line: exact in constant light and for dead times of whole periods,
+    otherwise right to third order in the rate of a bin (see docs/photon_counting.md for errors). Raises
+    TorchTransientError for a phase locked so narrowly that bins cut in 32 do not show it.
     """
     check_transient(rate, "nonparalyzable_histogram")
     low, high = torch.aminmax(rate.detach())
     if not bool(low >= 0) or not bool(torch.isfinite(high)):
         raise UnitError(f"nonparalyzable_histogram: expected finite rates >= 0, got {float(low):g} to {float(high):g}.")
-    whole, part = split_dead_time(dead_bins)
-    bins = rate.shape[TIME]
-    columns = rate.to(torch.float64).movedim(TIME, -1)
-    rows = columns.reshape(-1, bins)
-    part = part.to(rows.device)
-    # a dark pixel has no phases; its limit is one photon, at most, per many periods: detections equal photons
-    faint = rows.detach().sum(-1, keepdim=True) < 1e-12
-    safe = torch.where(faint, torch.full_like(rows, 1.0 / bins), rows)
-    pi = stationary_phases(safe, part, whole)
-    chain = RenewalChain(safe, whole, part)
-    # armed and dead probability add up to the same number at every bin; normalise it to 1
-    armed = chain.armed(chain.shift(pi)).mean(-1, keepdim=True)
-    dead = pi.sum(-1, keepdim=True) * (whole - 1 + part) / bins
-    detected = torch.where(faint, rows, pi / (armed + dead))
-    return detected.view(columns.shape).movedim(-1, TIME).to(rate.dtype)
+    split_dead_time(dead_bins)  # says what is wrong with a dead time that is too short
+    return state_image(rate, dead_bins).detected.to(rate.dtype)
 
 
 def _mean_of_exponentials(x: Tensor) -> Tensor:
@@ -107,55 +110,18 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     return (wide * (early + late)).to(rate.dtype)
 
 
-def _chain_counts(
-    rate: Tensor, detected: Tensor, periods: int, dead_bins: float, generator: torch.Generator | None
-) -> Tensor:
-    """`periods` detectors in their stationary state, each run over one period: counts, float64."""
-    whole, part = split_dead_time(dead_bins)
-    share = part.to(rate.device)
-    bins = rate.shape[TIME]
-    fire = -torch.expm1(-rate)
-    # who of the detectors that are dead at the start is armed again at the start of bin k: detections of bin k - whole
-    # (or one earlier) before the period began
-    again = torch.zeros_like(rate)
-    reach = min(whole, bins)
-    again.narrow(TIME, 0, reach).copy_((1 - share) * detected.roll(whole, TIME).narrow(TIME, 0, reach))
-    reach = min(whole + 1, bins)
-    again.narrow(TIME, 0, reach).add_(share * detected.roll(whole + 1, TIME).narrow(TIME, 0, reach))
-    # armed and dead at the start of a bin are everybody: armed before bin 0 = 1 - dead(before any re-arms at 0)
-    hit_chance = torch.where(fire > 0, detected / fire.clamp_min(1e-300), torch.zeros_like(fire)).select(TIME, 0)
-    dead = detected.sum(TIME) * (whole - 1 + share)
-    armed_now = torch.where(fire.select(TIME, 0) > 0, hit_chance, 1 - dead).clamp(0, 1)
-    states = torch.cat([armed_now.unsqueeze(TIME), again.narrow(TIME, 1, bins - 1)], TIME)
-    drawn = sample_multinomial(periods, states, generator)
-    armed = drawn.select(TIME, 0)
-    returning = list(drawn.unbind(TIME)[1:]) + [torch.zeros_like(armed)] * (whole + 2)
-    counts = torch.empty_like(rate)
-    for k in range(bins):
-        hit = torch.binomial(armed, fire.select(TIME, k), generator=generator)
-        later = torch.binomial(hit, share.expand_as(hit), generator=generator) if float(share) > 0 else hit * 0
-        counts.select(TIME, k).copy_(hit)
-        if k + 1 < bins:
-            for delay, amount in ((whole, hit - later), (whole + 1, later)):
-                slot = k + delay - 1  # returning[j] arms at the start of bin j + 1
-                if slot < bins - 1:
-                    returning[slot] = returning[slot] + amount
-            armed = armed - hit + returning[k]
-    return counts
-
-
 class FreeRunningSPAD(RandomSensor):
     """Histogram (..., C, T, H, W) over laser phase, in counts, of a SPAD that runs free for `cycles` laser periods.
 
     The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period.
-    `dead_time_s`: at least half a bin, also longer than the period; `kind`: "non_paralyzable" or "paralyzable";
-    `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
+    `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
+    "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
 
     Samples: non-paralyzable, `cycles` detectors in their stationary state are run over one period each: mean and
     correlations within a period are right, those between periods (they lower the variance of totals further when the
     dead time is about a period or longer) are left out. Paralyzable: independent binomials with the exact mean and
-    N d (1 - d) as variance. Policies: expected, gaussian (independent bins, that variance), straight_through; "score"
-    is not supported: the stationary state itself depends on the rate.
+    N d (1 - d) as variance. Policies: all; gaussian has independent bins with that variance, score is that of the draws
+    as described here, dead and armed detectors at the start of the period included.
     """
 
     log_dead_time_s: Tensor
@@ -178,7 +144,7 @@ class FreeRunningSPAD(RandomSensor):
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)
         if kind == "non_paralyzable":
-            split_dead_time(dead / self.bin_width_s)  # says what is wrong with a dead time that is too short
+            self._check_dead_time(dead)
         value = torch.tensor(math.log(dead), dtype=torch.float64)
         if learnable:
             self.register_parameter("log_dead_time_s", nn.Parameter(value))
@@ -190,12 +156,15 @@ class FreeRunningSPAD(RandomSensor):
         """Dead time in seconds, float64."""
         return self.log_dead_time_s.double().exp()
 
+    @property
+    def _dead_bins(self) -> Tensor:
+        return self.dead_time_s / self.bin_width_s
+
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per period and bin."""
-        dead_bins = self.dead_time_s / self.bin_width_s
         if self.kind == "paralyzable":
-            return paralyzable_histogram(x, dead_bins)
-        return nonparalyzable_histogram(x, dead_bins)
+            return paralyzable_histogram(x, self._dead_bins)
+        return nonparalyzable_histogram(x, self._dead_bins)
 
     def expected(self, x: Tensor) -> Tensor:
         return self.probabilities(x) * self.cycles
@@ -205,16 +174,50 @@ class FreeRunningSPAD(RandomSensor):
         variance: Tensor = self.cycles * p * (1 - p)
         return variance
 
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def _check_dead_time(self, dead_time_s: float) -> None:
+        if not dead_time_s / self.bin_width_s >= 1 - 1e-9:
+            raise UnitError(
+                f"FreeRunningSPAD: expected dead_time_s of at least one bin of {self.bin_width_s:g} s, got "
+                f"{dead_time_s:g} s. Use narrower bins, or no dead time (ShotNoise) where it does not matter."
+            )
+
+    def _path(self, x: Tensor, generator: torch.Generator | None) -> Path:
+        """One draw of the non-paralyzable detector, step by step."""
         with torch.no_grad():
-            wide = x.detach().double()
-            p = self.probabilities(wide)
-            if self.kind == "paralyzable":
-                return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
-            dead_bins = float(self.dead_time_s) / self.bin_width_s
-            return _chain_counts(wide, p, self.cycles, dead_bins, generator).to(x.dtype)
+            self._check_dead_time(float(self.dead_time_s.detach()))
+            rate = x.detach().double()
+            return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.kind == "non_paralyzable":
+            return self._path(x, generator).counts.to(x.dtype)
+        with torch.no_grad():
+            p = self.probabilities(x.detach().double())
+            return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        if self.kind == "non_paralyzable":
+            raise GradientError(
+                "FreeRunningSPAD.log_prob: expected kind 'paralyzable'; a histogram does not tell which detectors were "
+                "dead when the period began. Use grad='score', which scores the draws themselves."
+            )
+        p, n = self.probabilities(x.double()), measurement.double()
+        quiet = self.cycles - n
+        ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
+        return (log_likelihood(n, p) + log_likelihood(quiet, 1 - p) + ways).sum(TIME)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score" or self.kind == "paralyzable":
+            return super().forward(x, generator)
+        path = self._path(x, generator)
+
+        def log_prob() -> Tensor:
+            rate = x.double()
+            return path_log_prob(path, bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles)
+
+        record_score(log_prob, type(self).__name__)
+        return path.counts.to(x.dtype)
 
     def extra_repr(self) -> str:
-        return (
-            f"cycles={self.cycles}, dead_time_s={float(self.dead_time_s):g}, kind={self.kind!r}, {super().extra_repr()}"
-        )
+        dead_time_s = float(self.dead_time_s.detach())
+        return f"cycles={self.cycles}, dead_time_s={dead_time_s:g}, kind={self.kind!r}, {super().extra_repr()}"

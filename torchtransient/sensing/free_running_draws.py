@@ -1,0 +1,114 @@
+"""Draws of a free-running detector over one period, from its stationary state, and how probable they were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.free_running_state import FreeRunningState
+from torchtransient.sensing.layout import TIME
+
+
+@dataclass(frozen=True)
+class BinChances:
+    """Probabilities of every step of a run through the bins of a period, (..., T, H, W)."""
+
+    begin: Tensor  # bin 0: armed at the start; then (T + 1 in all) dead at the start and armed again in bin 0, 1, ...
+    fire: Tensor  # detected in the bin, when armed at its start
+    soon: Tensor  # detected in the bin, when armed again in it
+    late: Tensor  # armed again after `whole` + 1 bins instead of `whole`, when detected
+    whole: int
+
+
+@dataclass(frozen=True)
+class Path:
+    """How many detectors took which step, same layout as BinChances."""
+
+    begin: Tensor
+    armed: Tensor  # at the start of the bin
+    back: Tensor  # armed again in it
+    fired: Tensor  # of `armed`
+    soon: Tensor  # of `back`
+    late: Tensor
+
+    @property
+    def counts(self) -> Tensor:
+        return self.fired + self.soon
+
+
+def _share(part: Tensor, whole: Tensor) -> Tensor:
+    """part / whole, 0 where nothing is, within [0, 1]."""
+    some = whole > 1e-13
+    share = part / torch.where(some, whole, torch.ones_like(whole))
+    return torch.where(some, share, 0.0).clamp(0, 1)
+
+
+def bin_chances(rate: Tensor, state: FreeRunningState) -> BinChances:
+    """Chances whose run has the means of `state`, whose entries are (..., T, H, W) here, like `rate`."""
+    bins, whole = rate.shape[TIME], state.whole
+    early = state.detected - state.late
+    back_soon, back_late = early.roll(whole, TIME), state.late.roll(whole + 1, TIME)
+    back = back_soon + back_late
+    index = torch.arange(bins, device=rate.device).view(-1, 1, 1)
+    # detections of before the period
+    dead = back_soon * (index < whole) + back_late * (index < whole + 1)
+    begin = torch.cat([state.armed.narrow(TIME, 0, 1), dead], TIME)
+    begin = begin / begin.sum(TIME, keepdim=True).clamp_min(1)  # rounding
+    fire = -torch.expm1(-rate)
+    rest = state.detected - state.armed * fire
+    # straight lines can put a little too much or too little here; one chance for both keeps the mean
+    whole_chance = _share(state.detected, state.armed + back)
+    fits = (rest >= 0) & (rest <= back)
+    return BinChances(
+        begin=begin,
+        fire=torch.where(fits, fire, whole_chance),
+        soon=torch.where(fits, _share(rest, back), whole_chance),
+        late=_share(state.late, state.detected),
+        whole=whole,
+    )
+
+
+def draw_path(chances: BinChances, periods: int, generator: torch.Generator | None) -> Path:
+    """`periods` detectors, each run over one period."""
+    begin = sample_multinomial(periods, chances.begin, generator)
+    bins = chances.fire.shape[TIME]
+    armed = begin.select(TIME, 0)
+    returning = list(begin.unbind(TIME)[1:])
+    taken: list[list[Tensor]] = [[], [], [], [], []]
+    for k in range(bins):
+        back = returning[k]
+        fired = torch.binomial(armed, chances.fire.select(TIME, k), generator=generator)
+        soon = torch.binomial(back, chances.soon.select(TIME, k), generator=generator)
+        hit = fired + soon
+        late = torch.binomial(hit, chances.late.select(TIME, k), generator=generator)
+        for column, value in zip(taken, (armed, back, fired, soon, late), strict=True):
+            column.append(value)
+        for slot, amount in ((k + chances.whole, hit - late), (k + chances.whole + 1, late)):
+            if slot < bins:
+                returning[slot] = returning[slot] + amount
+        armed = armed + back - hit
+    return Path(begin, *(torch.stack(column, TIME) for column in taken))
+
+
+def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:
+    """count log(chance), 0 for no count whatever the chance."""
+    some = count > 0
+    return torch.where(some, count * torch.log(torch.where(some, chance, torch.ones_like(chance))), 0.0)
+
+
+def path_log_prob(path: Path, chances: BinChances, periods: int) -> Tensor:
+    """Log-probability (..., H, W) of the steps that were drawn, up to a number that does not depend on the light."""
+    dead = periods - path.begin.sum(TIME)  # all period long
+    total = log_likelihood(path.begin, chances.begin).sum(TIME)
+    total = total + log_likelihood(dead, 1 - chances.begin.sum(TIME))
+    for hits, trials, chance in (
+        (path.fired, path.armed, chances.fire),
+        (path.soon, path.back, chances.soon),
+        (path.late, path.counts, chances.late),
+    ):
+        steps = log_likelihood(hits, chance) + log_likelihood(trials - hits, 1 - chance)
+        total = total + steps.sum(TIME)
+    return total

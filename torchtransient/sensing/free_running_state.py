@@ -1,0 +1,95 @@
+"""The stationary state of a free-running detector: detected, armed and dead, bin by bin."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import TorchTransientError
+from torchtransient.sensing.renewal_chain import RenewalChain
+from torchtransient.sensing.stationary_phases import stationary_phases
+
+_DARK = 1e-12  # photons per period; below, detections equal photons
+_BELOW_ZERO = 1e-5  # of the largest bin: counts as far below zero show bins too wide for what is in them
+_SETTLED = 1e-2  # of all counts: change from pieces twice as wide, some ten times the error that is left
+_FINEST = 32
+
+
+@dataclass(frozen=True)
+class FreeRunningState:
+    """Rows (P, T), per period, float64, differentiable."""
+
+    detected: Tensor
+    armed: Tensor  # probability at the start of the bin
+    late: Tensor  # of `detected`: those that are armed again in bin i + `whole` + 1; the others in i + `whole`
+    whole: int
+
+
+def whole_and_part(dead_bins: Tensor) -> tuple[int, Tensor]:
+    """Whole bins of a dead time and the rest of it, differentiable."""
+    # a whole number that rounding has put just below itself is still that number
+    whole = math.floor(float(dead_bins.detach()) + 1e-9)
+    part = dead_bins - whole
+    return whole, part - part.detach().clamp_max(0)
+
+
+def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
+    """For rates (P, T) per bin and period and a scalar dead time in bins, float64.
+
+    Where many photons in a bin meet a dead time that locks the phase, all detections crowd at an edge of a bin; the
+    straight lines of `renewal_chain` then go below zero. Such pixels are solved again with their bins cut in 2, 4, ...,
+    until counts settle. Raises TorchTransientError when they do not with 32 pieces.
+    """
+    # a dark pixel has no phases; its limit is one photon, at most, per many periods
+    dark = rate.detach().sum(-1, keepdim=True) < _DARK
+    safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
+    state = _solved(safe, dead_bins, 1)
+    low, high = state.detected.detach().aminmax(dim=-1)
+    rows = (~(low >= -_BELOW_ZERO * high)).nonzero().flatten()
+    pieces = 1
+    while rows.numel():
+        before = state.detected.detach()[rows]
+        pieces *= 2
+        if pieces > _FINEST:
+            raise TorchTransientError(
+                f"stationary_state: expected counts that settle when bins are cut, got {rows.numel()} pixels that do "
+                f"not with bins cut in {_FINEST}. The dead time locks the phase more narrowly than that; use narrower "
+                "bins, or less light in a bin."
+            )
+        finer = _solved(safe[rows], dead_bins, pieces)
+        state = FreeRunningState(
+            state.detected.index_copy(0, rows, finer.detected),
+            state.armed.index_copy(0, rows, finer.armed),
+            state.late.index_copy(0, rows, finer.late),
+            state.whole,
+        )
+        now = finer.detected.detach()
+        low, high = now.aminmax(dim=-1)
+        settled = (now - before).abs().sum(-1) <= _SETTLED * now.sum(-1)
+        rows = rows[~(settled & (low >= -_BELOW_ZERO * high))]
+    detected = torch.where(dark, rate, state.detected.clamp_min(0))
+    late = torch.where(dark, torch.zeros_like(rate), torch.minimum(state.late.clamp_min(0), detected))
+    armed = torch.where(dark, torch.ones_like(rate), state.armed.clamp(0, 1))
+    return FreeRunningState(detected, armed, late, state.whole)
+
+
+def _solved(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
+    """With every bin cut in `pieces` of equal rate, and put together again."""
+    pixels, bins = rate.shape
+    fine = (rate / pieces).repeat_interleave(pieces, -1) if pieces > 1 else rate
+    whole, part = whole_and_part(dead_bins * pieces)
+    part = part.to(rate.device)
+    lines = stationary_phases(fine, part, whole)
+    chain = RenewalChain(fine, whole, part)
+    # from one detection to the next a detector is dead, then armed
+    scale = bins * pieces / (whole + part + chain.waiting(lines))
+    count, slope = (lines * scale).view(pixels, 2, bins, pieces).unbind(1)
+    armed = chain.at_start(chain.inflow(lines * scale)).view(pixels, bins, pieces)[..., 0]
+    first = 1 - part
+    soon = first * count - math.sqrt(3.0) * first * part * slope  # detected in the first 1 - part of a piece
+    place = torch.arange(pieces, device=rate.device) + whole % pieces
+    late = (soon * (place >= pieces) + (count - soon) * (place + 1 >= pieces)).sum(-1)
+    return FreeRunningState(count.sum(-1), armed, late, whole // pieces)
