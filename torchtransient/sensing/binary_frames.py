@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.errors import UnitError
+from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.layout import TIME, check_count, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
@@ -40,8 +40,7 @@ class BinaryFrames(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         check_transient(x, "BinaryFrames")
-        if bool((x < 0).any()):
-            raise UnitError("BinaryFrames: expected mean photons >= 0, got negative ones.")
+        check_rates(x, "BinaryFrames")
         work = x.detach().float() if x.dtype in (torch.float16, torch.bfloat16) else x.detach()
         p = -torch.expm1(-work)
         return torch.binomial(torch.full_like(p, float(self.frames)), p, generator=generator).to(x.dtype)

@@ -60,7 +60,9 @@ def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     check_transient(scores, "peak_position")
     index = scores.detach().argmax(TIME, keepdim=True)
     middle = index.squeeze(TIME).to(scores.dtype) + 0.5
-    return middle + _parabola(scores, index).squeeze(TIME) if refine else middle
+    position = middle + _parabola(scores, index).squeeze(TIME) if refine else middle
+    # argmax takes NaN for the largest entry; a position from it would look like any other
+    return torch.where(scores.detach().gather(TIME, index).squeeze(TIME).isnan(), math.nan, position)
 
 
 def _parabola(scores: Tensor, index: Tensor) -> Tensor:
@@ -97,7 +99,9 @@ def centre_of_mass(
         reference = histogram.detach().argmax(TIME, keepdim=True).to(histogram.dtype) + 0.5
         excess = torch.where((bins - reference).abs() <= half_width_bins + 0.25, excess, 0.0)
     total = excess.sum(TIME, keepdim=True)
-    there = total > torch.finfo(histogram.dtype).eps * histogram.detach().abs().sum(TIME, keepdim=True)
+    weight = histogram.detach().abs().sum(TIME, keepdim=True)
+    # "not below" lets NaN through
+    there = ~(total <= torch.finfo(histogram.dtype).eps * weight)
     # Around the reference, so that float32 does not cancel far from the start of the axis.
     moment = (excess * (bins - reference)).sum(TIME, keepdim=True)
     shift = torch.where(there, moment, 0.0) / torch.where(there, total, 1.0)
@@ -138,7 +142,7 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     check_transient(histogram, "first_return")
     level = threshold if isinstance(threshold, Tensor) else histogram.new_tensor(float(threshold))
     level = level.unsqueeze(TIME) if level.ndim else level
-    reached = histogram.detach() >= level.detach()
+    reached = ~(histogram.detach() < level.detach())  # NaN counts as reached, and is then what is found
     valid = reached.any(TIME, keepdim=True)
     index = reached.to(torch.uint8).argmax(TIME, keepdim=True)
     here, before = histogram.gather(TIME, index), histogram.gather(TIME, (index - 1).clamp(min=0))
@@ -160,6 +164,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     check_transient(scores, me)
     check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
+    # NaN is no maximum anywhere: a histogram with one has no returns that could be told
+    unknown = scores.detach().isnan().any(TIME, keepdim=True)
     values = scores.detach()
     low = torch.full_like(values.select(TIME, 0).unsqueeze(TIME), -math.inf)
     before = torch.cat([low, values.narrow(TIME, 0, values.shape[TIME] - 1)], TIME)
@@ -178,7 +184,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     index = torch.where(valid, index, 0)
     position = index.to(scores.dtype) + 0.5 + _parabola(scores, index)
     strength = scores.gather(TIME, index)
-    return Returns(torch.where(valid, position, 0.0), torch.where(valid, strength, 0.0), valid)
+    position, strength = torch.where(valid, position, 0.0), torch.where(valid, strength, 0.0)
+    return Returns(torch.where(unknown, math.nan, position), torch.where(unknown, math.nan, strength), valid & ~unknown)
 
 
 def background_per_bin(histogram: Tensor) -> Tensor:

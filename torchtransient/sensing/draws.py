@@ -25,6 +25,17 @@ _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs 
 _WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
 
+def check_rates(rate: Tensor, where: str) -> Tensor:
+    """`rate` when all of it is finite and >= 0, else UnitError: torch.binomial never returns from a NaN count."""
+    low, high = torch.aminmax(rate.detach()) if rate.numel() else (rate.new_zeros(()), rate.new_zeros(()))
+    if not bool(low >= 0) or not bool(torch.isfinite(high)):
+        raise UnitError(
+            f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}. Look for NaN upstream; "
+            "clamp or use softplus where a network gives the rate."
+        )
+    return rate
+
+
 def by_pieces(
     job: Callable[[Tensor, int, torch.Generator | None], Result], flat: Tensor, generator: torch.Generator | None
 ) -> list[Result]:
@@ -140,9 +151,7 @@ def _sample_tree(
     w = weights.detach()
     if w.numel() == 0:
         return w.clone()
-    low, high = torch.aminmax(w)
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}.")
+    check_rates(w, where)
     work = torch.float64 if trials > _WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
     bins, pixels = w.shape[TIME], w.shape[-2] * w.shape[-1]
     columns = w.to(work).reshape(-1, bins, pixels)

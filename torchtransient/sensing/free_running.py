@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
-from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.draws import check_rates, sample_multinomial
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.renewal_chain import RenewalChain, stationary_phases
@@ -47,9 +47,9 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     to second order in the rate of a bin: use bins that hold less than about 0.2 photons, or narrower ones.
     """
     check_transient(rate, "nonparalyzable_histogram")
-    low, high = torch.aminmax(rate.detach())
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"nonparalyzable_histogram: expected finite rates >= 0, got {float(low):g} to {float(high):g}.")
+    check_rates(rate, "nonparalyzable_histogram")
+    if rate.numel() == 0:
+        return rate.clone()
     whole, part = split_dead_time(dead_bins)
     bins = rate.shape[TIME]
     columns = rate.to(torch.float64).movedim(TIME, -1)
@@ -67,11 +67,16 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     return detected.view(columns.shape).movedim(-1, TIME).to(rate.dtype)
 
 
-def _mean_of_exponentials(x: Tensor) -> Tensor:
-    """(1 - exp(-x))/x, 1 at 0, for any sign; series where the difference would cancel."""
-    small = x.abs() < 1e-4
-    safe = torch.where(small, torch.ones_like(x), x)
-    return torch.where(small, 1 - x / 2 + x**2 / 6, -torch.expm1(-safe) / safe)
+def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
+    """Mean of exp(-x) over x from `start` to `start + step`, of either sign: finite wherever both ends are >= 0.
+
+    Counted from the smaller end, so that no factor overflows where the other one is 0.
+    """
+    low = torch.where(step < 0, start + step, start)
+    width = step.abs()
+    small = width < 1e-4
+    safe = torch.where(small, torch.ones_like(width), width)
+    return torch.exp(-low) * torch.where(small, 1 - width / 2 + width**2 / 6, -torch.expm1(-safe) / safe)
 
 
 def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
@@ -102,8 +107,8 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     exponent = wrapped + part * first
     # while the bin passes, the window's rear edge is in `first` for the share `part`, then in `second`
     slope_1, slope_2 = wide - first, wide - second
-    early = part * torch.exp(-exponent) * _mean_of_exponentials(part * slope_1)
-    late = (1 - part) * torch.exp(-exponent - part * slope_1) * _mean_of_exponentials((1 - part) * slope_2)
+    early = part * _mean_of_exponentials(exponent, part * slope_1)
+    late = (1 - part) * _mean_of_exponentials(exponent + part * slope_1, (1 - part) * slope_2)
     return (wide * (early + late)).to(rate.dtype)
 
 
@@ -208,7 +213,7 @@ class FreeRunningSPAD(RandomSensor):
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
             wide = x.detach().double()
-            p = self.probabilities(wide)
+            p = self.probabilities(check_rates(wide, "FreeRunningSPAD"))
             if self.kind == "paralyzable":
                 return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
             dead_bins = float(self.dead_time_s) / self.bin_width_s

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof_codes import CorrelationCode
-from torchtransient.sensing.layout import check_number, check_transient
+from torchtransient.sensing.layout import check_number, check_transient, without_autocast
 from torchtransient.sensing.sensor import Sensor
 
 WithinBin = Literal["uniform", "center"]
@@ -70,6 +70,7 @@ def tap_weights(
     return torch.cat(rows)
 
 
+@without_autocast
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
 
@@ -85,6 +86,7 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     return taps.reshape(*taps.shape[:-1], *transient.shape[-2:])
 
 
+@without_autocast
 def taps_from_phasor(
     phasor: Tensor,
     phasor_axis: FrequencyAxis,

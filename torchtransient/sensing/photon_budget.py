@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.units import SPEED_OF_LIGHT
@@ -183,6 +183,12 @@ class PhotonBudget(Sensor):
         return x * self.detections_per_unit
 
     def expected(self, x: Tensor) -> Tensor:
+        dark = self.dark_count_rate_hz
+        if any(have not in (1, wanted) for have, wanted in zip(dark.shape, x.shape[-2:], strict=False)):
+            raise ShapeError(
+                f"PhotonBudget: expected an image {tuple(dark.shape)} as in dark_count_rate_hz, got "
+                f"{tuple(x.shape[-2:])}. Make the map for this sensor."
+            )
         background_hz = self.ambient_rate_hz * self.quantum_efficiency + self.dark_count_rate_hz.double()
         return self.signal(x) + (background_hz * self.bin_width_s).to(x.dtype)
 
