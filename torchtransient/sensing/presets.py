@@ -291,8 +291,7 @@ _CAMERAS = (
             "Teledyne DALSA Genie Nano manual, M2450-Polarized: IMX250MZR, 3.45 um pixels, 12 bit, full well 11 000 "
             "electrons, hence 2.7 per number; dynamic range 76.4 dB, hence a read noise of 1.7 electrons",
             "Sony's flyer, as users quote it: extinction ratio 300 at 525 nm, 425 at 430 nm. A commercial mosaic "
-            "imager had a contrast above 300 at 532 nm, but 20 to 30 in broad light (Montana State University, "
-            "thesis, 2020)",
+            "imager had a contrast above 300 at 532 nm, but 20 to 30 in broad light (Montana State University, 2020)",
             "Beckhoff TwinCAT Vision and others: 90 and 45 over 135 and 0 degrees",
             "assumed: transmission 0.8; black level 16",
         ),
