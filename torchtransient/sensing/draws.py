@@ -37,15 +37,18 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
 
 
 def by_pieces(
-    job: Callable[[Tensor, int, torch.Generator | None], Result], flat: Tensor, generator: torch.Generator | None
+    job: Callable[[Tensor, int, torch.Generator | None], Result], data: Tensor, generator: torch.Generator | None
 ) -> list[Result]:
-    """`job(piece, begin, generator)` of consecutive pieces of `flat` (N,), in threads for large ones on the CPU."""
-    if flat.device.type != "cpu" or flat.numel() < _WORTH_THREADS:
-        return [job(flat, 0, generator)]
-    pieces = flat.tensor_split(_PIECES)
+    """`job(piece, begin, generator)` of consecutive pieces along dimension 0, in threads for large data on the CPU.
+
+    `begin` is the place of the piece's first entry along that dimension.
+    """
+    if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[0] < _PIECES:
+        return [job(data, 0, generator)]
+    pieces = data.tensor_split(_PIECES)
     begins = [0]
     for piece in pieces[:-1]:
-        begins.append(begins[-1] + piece.numel())
+        begins.append(begins[-1] + piece.shape[0])
     return _in_threads(job, list(zip(pieces, begins, strict=True)), generator)
 
 
@@ -73,8 +76,10 @@ def _in_columns(
     """`draw` over pieces of `data` along its last dimension; in threads for large tensors on the CPU."""
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[-1] < _PIECES:
         return draw(data, generator)
-    pieces = [(piece,) for piece in data.tensor_split(_PIECES, dim=-1)]
-    return torch.cat(_in_threads(draw, pieces, generator), dim=-1)
+    result = torch.empty_like(data, memory_format=torch.contiguous_format)
+    places = zip(data.tensor_split(_PIECES, dim=-1), result.tensor_split(_PIECES, dim=-1), strict=True)
+    _in_threads(lambda piece, into, own: into.copy_(draw(piece, own)), list(places), generator)
+    return result
 
 
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
