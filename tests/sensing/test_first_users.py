@@ -157,6 +157,16 @@ def test_darkness_behind_a_transform_is_dark():
     torch.testing.assert_close(there, back, rtol=1e-12, atol=1e-12)
 
 
+def test_a_billion_frames():
+    """Mean and variance of N = 1e9 binary frames in float32: 2e4 draws know the variance to 1 %, 5 sigma are 5 %."""
+    frames, mean = 10**9, 0.4
+    p = -math.expm1(-mean)
+    counts = sensing.BinaryFrames(frames).sample(torch.full((1, 20000, 1, 1), mean), generator()).double()
+    sigma = math.sqrt(frames * p * (1 - p))
+    assert abs(float(counts.mean()) - frames * p) < 5 * sigma / math.sqrt(20000) + 2**-24 * frames
+    assert abs(float(counts.var()) / sigma**2 - 1) < 5 * math.sqrt(2 / 20000)
+
+
 def test_empty_batches_pass():
     axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 12)
     x = torch.zeros(0, 1, 12, 2, 3)
@@ -232,6 +242,77 @@ def test_dead_time_is_looked_at_when_the_detector_is_made():
         sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_leaves_physical_numbers_alone(dtype):
+    """A model goes to half precision as a whole: its network does, times and rates do not."""
+    response = sensing.GaussianResponse(60 * PS, delay_s=3333 * PS, learnable=True)
+    budget = sensing.PhotonBudget(
+        sensing.Optics(f_number=2.0),
+        pulse_energy_j=1e-9,
+        wavelength_m=532e-9,
+        repetition_rate_hz=1e6,
+        cycles=10,
+        dark_count_rate_hz=1e5,
+        bin_width_s=50 * PS,
+    )
+    network = torch.nn.Conv3d(1, 1, 1)
+    chain = sensing.Compose([budget, sensing.ImpulseResponse(response, bin_width_s=50 * PS), network])
+    model = torch.nn.Sequential(chain, sensing.FreeRunningSPAD(10, 75e-9, bin_width_s=1e-9)).to(dtype)
+    assert network.weight.dtype == dtype
+    assert float(response.fwhm_s.detach()) == pytest.approx(60e-12, rel=1e-12)
+    assert float(response.delay_s.detach()) == pytest.approx(3333e-12, rel=1e-12)
+    assert float(budget.dark_count_rate_hz) == 1e5
+    assert float(model[1].dead_time_s) == pytest.approx(75e-9, rel=1e-12)
+    response.float()
+    assert response.log_fwhm_s.dtype == torch.float32
+
+
+def test_parameters_that_ran_away_are_named():
+    for value, words in ((math.nan, "expected finite parameters"), (-2.0, "at most .* bins")):
+        response = sensing.GaussianResponse(60 * PS, learnable=True)
+        torch.nn.init.constant_(response.log_fwhm_s, value)
+        with pytest.raises(UnitError, match=words):
+            sensing.ImpulseResponse(response, bin_width_s=20 * PS)(torch.zeros(1, 4, 1, 1))
+
+
+AXIS = tt.TimeAxis.from_seconds(0.0, 50 * PS, 8)
+HISTOGRAM = torch.ones(1, 8, 2, 3)
+
+
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ShapeError, "MeasuredResponse"),
+        (lambda: sensing.ComposedResponse([60e-12]), ShapeError, "GaussianResponse"),
+        (
+            lambda: sensing.PhotonBudget(
+                2.0, pulse_energy_j=1e-9, wavelength_m=532e-9, repetition_rate_hz=1e6, cycles=1, axis=AXIS
+            ),
+            UnitError,
+            "Optics",
+        ),
+        (lambda: sensing.ShotNoise("straight_through")(HISTOGRAM, generator=0), UnitError, "manual_seed"),
+        (lambda: sensing.Compose(sensing.ShotNoise()), ShapeError, r"\[\]"),
+        (lambda: sensing.SynchronousSPAD(10, gate=[0.0, 1.0]), ShapeError, "list"),
+        (lambda: sensing.ItofCorrelation("sine", (20e6,), AXIS), UnitError, "sine_code"),
+        (lambda: sensing.ItofCorrelation(sensing.sine_code(4), (20e6,), 50e-12), UnitError, "from_seconds"),
+        (lambda: sensing.GatedIntegration([1e-9], 1e-9, 50e-12), UnitError, "from_seconds"),
+        (lambda: sensing.distance_of_position(torch.ones(1, 2, 3), 50e-12), UnitError, "from_seconds"),
+        (
+            lambda: sensing.log_matched_filter(HISTOGRAM, sensing.GaussianResponse(1e-10).kernel(5e-11)),
+            ShapeError,
+            "first, kernel",
+        ),
+        (lambda: sensing.first_return(HISTOGRAM, torch.ones(8)), ShapeError, "threshold"),
+        (lambda: sensing.centre_of_mass(HISTOGRAM, background=torch.ones(1, 1, 2, 3)), ShapeError, "background"),
+        (lambda: losses.poisson_nll(HISTOGRAM.numpy(), HISTOGRAM), ShapeError, "ndarray"),
+    ],
+)
+def test_what_first_users_get_wrong_is_named(call, error, words):
+    with pytest.raises(error, match=f"expected .*{words}"):
+        call()
+
+
 # -------------------------------------------------------------------------------------------------------------- losses
 
 
@@ -254,6 +335,18 @@ def test_items_of_a_batch_do_not_touch(loss):
     for i in range(2):
         for whole, alone in zip(together, both(mean[i : i + 1], counts[i : i + 1]), strict=True):
             torch.testing.assert_close(whole[i : i + 1], alone, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_loss_of_half_precision_is_single(dtype):
+    """A network under autocast: 1e3 counts have a square that float16 cannot hold. 8 bits of the mean: 2 %."""
+    counts, mean = torch.full((1, 4, 1, 1), 1000.0), torch.full((1, 4, 1, 1), 3.0, dtype=dtype, requires_grad=True)
+    for loss in (losses.poisson_nll, lambda n, m: losses.read_noise_nll(n, m, 2.0)):
+        value = loss(counts, mean)
+        wanted = loss(counts.double(), mean.detach().double())
+        assert value.dtype == torch.float32
+        assert float(value.detach()) == pytest.approx(float(wanted), rel=0.02)
+        assert bool(torch.isfinite(torch.autograd.grad(value, mean)[0]).all())
 
 
 def test_floor_of_an_item_in_the_dark_is_usable():

@@ -4,6 +4,7 @@ All take rates or means (..., C, T, H, W) and measurements of the same shape, an
 zero counts and in empty bins. Where the model says "impossible" (a count where the mean is 0) a floor keeps them so:
 `floor`, in the unit of the mean, is added to it. Counts below 0 (those of a normal surrogate) enter the same formulas,
 which keeps the gradient unbiased. Terms that do not depend on the mean are left out unless `constant`.
+Half precision is computed, and the loss returned, in float32.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ _RELATIVE_FLOOR = 1e-3
 
 
 def _check(measured: Tensor, model: Tensor, where: str) -> None:
+    if not isinstance(measured, Tensor) or not isinstance(model, Tensor):
+        raise ShapeError(f"{where}: expected two tensors, got {type(measured).__name__} and {type(model).__name__}.")
     if measured.shape != model.shape:
         raise ShapeError(
             f"{where}: expected counts and model of one shape, got {tuple(measured.shape)} and {tuple(model.shape)}."
@@ -47,6 +50,11 @@ def _reduce(value: Tensor, reduction: Reduction, where: str) -> Tensor:
     if reduction == "none":
         return value
     return value.sum() if reduction == "sum" else value.mean()
+
+
+def _single(model: Tensor) -> Tensor:
+    """Half precision, as networks give it under autocast, in float32: squares of counts exceed float16."""
+    return model.float() if model.dtype in (torch.float16, torch.bfloat16) else model
 
 
 def relative_floor(model: Tensor, share: float = _RELATIVE_FLOOR) -> Tensor:
@@ -76,6 +84,7 @@ def poisson_nll(
     ShapeError for different shapes, UnitError for negative means.
     """
     _check_counts(counts, mean, "poisson_nll")
+    mean = _single(mean)
     m = mean + (relative_floor(mean) if floor is None else floor)
     hit = counts != 0
     # where on the input: xlogy(0, 0) has a NaN gradient
@@ -104,6 +113,7 @@ def first_photon_nll(
     UnitError for negative rates or more counts than cycles.
     """
     _check_counts(counts, rate, "first_photon_nll")
+    rate = _single(rate)
     r = rate + (relative_floor(rate) if floor is None else floor)
     value = -first_photon_log_prob(counts, r, cycles, dead_bins, constant=constant)
     return _reduce(value, reduction, "first_photon_nll")
@@ -144,6 +154,7 @@ def free_running_nll(
     (see `sensing.free_running`) put it: r = -log(1 - n/armed). Arguments as in `first_photon_nll`.
     """
     _check_counts(counts, rate, "free_running_nll")
+    rate = _single(rate)
     n = counts.to(torch.float64)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the fraction of a bin leave an uncertainty of about the square root of the counts
@@ -174,6 +185,7 @@ def read_noise_nll(
     electrons. `read_noise` > 0, a number or a tensor that broadcasts; differentiable in it and in `mean`.
     """
     _check(measured, mean, "read_noise_nll")
+    measured, mean = _single(measured), _single(mean)
     sigma = torch.as_tensor(read_noise, device=mean.device).to(mean.dtype)
     if not bool((sigma.detach() > 0).all()):
         raise UnitError("read_noise_nll: expected read_noise > 0 electrons: without it an empty pixel has no width.")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.draws import fast_poisson
+from torchtransient.sensing.draws import WHOLE_FLOAT32, fast_poisson
 from torchtransient.sensing.layout import TIME
 from torchtransient.sensing.policies import record_score
 from torchtransient.sensing.sensor import RandomSensor
@@ -74,6 +74,8 @@ class AddedCounts(RandomSensor):
         work = mean.detach().clamp_min(0)
         if work.dtype in (torch.float16, torch.bfloat16):
             work = work.float()
+        elif work.dtype == torch.float32 and work.numel() and float(work.amax()) > WHOLE_FLOAT32 / 2:
+            work = work.double()
         return fast_poisson(work, generator).to(mean.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

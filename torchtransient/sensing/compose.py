@@ -33,6 +33,8 @@ class Compose(Sensor):
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
         super().__init__()
+        if isinstance(stages, nn.Module) and not isinstance(stages, (nn.Sequential, nn.ModuleList)):
+            raise ShapeError(f"Compose: expected a list of sensors, got one {type(stages).__name__}. Put it into [].")
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if not len(stages) or wrong:
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")

@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 _PIECES = 4
 _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs less than it saves
-_WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
+WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
 
 def check_rates(rate: Tensor, where: str) -> Tensor:
@@ -157,7 +157,7 @@ def _sample_tree(
     if w.numel() == 0:
         return w.clone()
     check_rates(w, where)
-    work = torch.float64 if trials > _WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
+    work = torch.float64 if trials > WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
     bins, pixels = w.shape[TIME], w.shape[-2] * w.shape[-1]
     columns = w.to(work).reshape(-1, bins, pixels)
 

@@ -220,6 +220,5 @@ class FreeRunningSPAD(RandomSensor):
             return _chain_counts(wide, p, self.cycles, dead_bins, generator).to(x.dtype)
 
     def extra_repr(self) -> str:
-        return (
-            f"cycles={self.cycles}, dead_time_s={float(self.dead_time_s):g}, kind={self.kind!r}, {super().extra_repr()}"
-        )
+        dead = float(self.dead_time_s.detach())
+        return f"cycles={self.cycles}, dead_time_s={dead:g}, kind={self.kind!r}, {super().extra_repr()}"

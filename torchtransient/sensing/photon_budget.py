@@ -140,6 +140,8 @@ class PhotonBudget(Sensor):
     ) -> None:
         super().__init__()
         where = "PhotonBudget"
+        if not isinstance(optics, Optics):
+            raise UnitError(f"{where}: expected optics to be an Optics, got {optics!r}. Optics(f_number=2.0), say.")
         self.optics = optics
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)

@@ -150,8 +150,9 @@ class SynchronousSPAD(RandomSensor):
             self.dead_bins = dead / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
             split_dead_time(self.dead_bins)  # says what is wrong with a dead time that is too short
         if gate is not None:
-            if gate.ndim != 1:
-                raise ShapeError(f"SynchronousSPAD: expected gate (T,), got {tuple(gate.shape)}.")
+            if not isinstance(gate, Tensor) or gate.ndim != 1:
+                shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
+                raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {shape}.")
             if not bool(((gate >= 0) & (gate <= 1)).all()):
                 raise UnitError("SynchronousSPAD: expected gate values between 0 and 1.")
             gate = gate.detach().double()
