@@ -28,7 +28,7 @@ _LAZY = {
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
-    "render": "torchtransient.render.renderer",
+    "render": "torchtransient.render.functional",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",

@@ -1,6 +1,7 @@
 """Scenes with media in the torch layer: loaded from steady ones and the peer's files, with their parameters."""
 
 import gc
+import threading
 import weakref
 from contextlib import nullcontext
 
@@ -191,3 +192,52 @@ def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
     finally:
         gc.set_threshold(*thresholds)
     assert alive and all(alive)
+
+
+def integrator_of(renderer):
+    """A weak reference to an object that Mitsuba's scene owns."""
+    (built,) = renderer.scene._builds.values()
+    return weakref.ref(built.scene.integrator())
+
+
+def test_scenes_are_freed_at_once():
+    """Not only when the collector runs: data sets are rendered scene by scene."""
+    key = "block.interior_medium.albedo.value.value"
+    renderer = tt.TransientRenderer(
+        steady_scene("volpath", **block(homogeneous(1.0, 0.8))), parameters=[key], time_axis=AXIS, spp=2
+    )
+    out = renderer(seed=0)
+    out.transient.sum().backward()
+    gone = integrator_of(renderer)
+    gc.disable()
+    try:
+        del renderer, out
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
+def test_a_scene_dropped_by_another_thread_waits_for_the_trace(monkeypatch):
+    from torchtransient.plugins.integrators.media import free_flight
+
+    def renderer():
+        scene = steady_scene("volpath", **block(homogeneous(1.0, 0.8)))
+        return tt.TransientRenderer(scene, parameters=[], time_axis=AXIS, spp=3)
+
+    others = [renderer()]
+    others[0](seed=0)
+    gone, mine = integrator_of(others[0]), renderer()
+    original, alive = free_flight.medium_interaction, []
+
+    def interaction(*args):
+        if others:
+            thread = threading.Thread(target=others.clear)
+            thread.start()
+            thread.join()
+        alive.append(gone() is not None)
+        return original(*args)
+
+    monkeypatch.setattr(free_flight, "medium_interaction", interaction)
+    mine(seed=0)
+    assert len(alive) > 3 and all(alive)
+    assert gone() is None

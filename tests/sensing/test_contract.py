@@ -77,6 +77,25 @@ def test_gradcheck_of_the_expectation(entry):
     assert torch.autograd.gradcheck(f, (x, *learnable), atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True)
 
 
+# these look at their values
+not_transformed = {"FreeRunningSPAD": ("vmap", "grad"), "EquiDepthHistogram": ("vmap",)}
+
+
+@each
+def test_functional_transforms(entry):
+    """torch.func of the mean: mapped items are those of a batch, gradients those of autograd."""
+    module, x = entry.module(), entry.x()
+    left_out = not_transformed.get(entry.name, ())
+    first = lambda x: parts(expected(module, x))[0]  # noqa: E731
+    if "vmap" not in left_out:
+        torch.testing.assert_close(torch.func.vmap(first)(x), first(x), rtol=1e-10, atol=1e-12)
+    if "grad" not in left_out:
+        energy = lambda x: first(x).abs().square().sum()  # noqa: E731
+        leaf = x.clone().requires_grad_()
+        (wanted,) = torch.autograd.grad(energy(leaf), leaf)
+        torch.testing.assert_close(torch.func.grad(energy)(x), wanted, rtol=1e-10, atol=1e-12)
+
+
 @each
 def test_non_contiguous_input(entry):
     module, x = entry.module(), entry.x()

@@ -2,7 +2,9 @@
 
 All take rates or means (..., C, T, H, W) and measurements of the same shape, and are finite, with finite gradients, at
 zero counts and in empty bins. Where the model says "impossible" (a count where the mean is 0) a floor keeps them so:
-`floor`, in the unit of the mean, is added to it. Terms that do not depend on the mean are left out unless `constant`.
+`floor`, in the unit of the mean, is added to it. Counts below 0 (those of a normal surrogate) enter the same formulas,
+which keeps the gradient unbiased. Terms that do not depend on the mean are left out unless `constant`.
+Half precision is computed, and the loss returned, in float32.
 """
 
 from __future__ import annotations
@@ -20,17 +22,26 @@ from torchtransient.sensing.spad import first_photon_log_prob
 Reduction = Literal["none", "sum", "mean"]
 
 _TIME = -3
-# Relative to the largest mean of an item: small against noise, large enough that 1/floor stays a usable gradient.
+# Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
 _RELATIVE_FLOOR = 1e-3
 
 
 def _check(measured: Tensor, model: Tensor, where: str) -> None:
+    if not isinstance(measured, Tensor) or not isinstance(model, Tensor):
+        raise ShapeError(f"{where}: expected two tensors, got {type(measured).__name__} and {type(model).__name__}.")
     if measured.shape != model.shape:
         raise ShapeError(
             f"{where}: expected counts and model of one shape, got {tuple(measured.shape)} and {tuple(model.shape)}."
         )
     if not model.is_floating_point():
         raise UnitError(f"{where}: expected a floating dtype, got {model.dtype}.")
+
+
+def _check_counts(counts: Tensor, model: Tensor, where: str) -> None:
+    """As `_check`, and rates cannot be negative. NaN in either passes and is what comes out."""
+    _check(counts, model, where)
+    if bool((model.detach() < 0).any()):
+        raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
 
 
 def _reduce(value: Tensor, reduction: Reduction, where: str) -> Tensor:
@@ -41,9 +52,21 @@ def _reduce(value: Tensor, reduction: Reduction, where: str) -> Tensor:
     return value.sum() if reduction == "sum" else value.mean()
 
 
+def _single(model: Tensor) -> Tensor:
+    """Half precision, as networks give it under autocast, in float32: squares of counts exceed float16."""
+    return model.float() if model.dtype in (torch.float16, torch.bfloat16) else model
+
+
 def relative_floor(model: Tensor, share: float = _RELATIVE_FLOOR) -> Tensor:
-    """`share` of the mean of the model over all its entries, without gradient: a floor that knows the scale."""
-    return (share * model.detach().abs().mean()).clamp_min(torch.finfo(model.dtype).tiny)
+    """`share` of the mean of each item (its C, T, H, W) of the model, without gradient: a floor that knows the scale.
+
+    Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one; an
+    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite.
+    """
+    size = model.detach().abs()
+    whole = size.mean() if size.numel() else size.sum()
+    item = size.mean((-4, -3, -2, -1), keepdim=True) if size.ndim > 4 else whole
+    return (share * torch.where(item > 0, item, whole)).clamp_min(torch.finfo(model.dtype).tiny)
 
 
 def poisson_nll(
@@ -56,15 +79,14 @@ def poisson_nll(
 ) -> Tensor:
     """-log of the Poisson probability of `counts`: m - n log m (+ log n! with `constant`), m = mean + floor.
 
-    `floor` None: 1e-3 of the average of `mean` (`relative_floor`), which biases empty bins by as much; 0: the exact
+    `floor` None: 1e-3 of the average of each item (`relative_floor`), which biases empty bins by as much; 0: the exact
     likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. Raises
     ShapeError for different shapes, UnitError for negative means.
     """
-    _check(counts, mean, "poisson_nll")
-    if bool((mean.detach() < 0).any()):
-        raise UnitError("poisson_nll: expected means >= 0, got negative ones. Clamp or use softplus upstream.")
+    _check_counts(counts, mean, "poisson_nll")
+    mean = _single(mean)
     m = mean + (relative_floor(mean) if floor is None else floor)
-    hit = counts > 0
+    hit = counts != 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(hit, m, torch.ones_like(m)).log()
     value = m - torch.where(hit, counts * log_mean, torch.zeros_like(m))
@@ -90,9 +112,8 @@ def first_photon_nll(
     dead; `dead_bins`: several detections per cycle (`SynchronousSPAD`). `floor` as in `poisson_nll`. Raises ShapeError;
     UnitError for negative rates or more counts than cycles.
     """
-    _check(counts, rate, "first_photon_nll")
-    if bool((rate.detach() < 0).any()):
-        raise UnitError("first_photon_nll: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
+    _check_counts(counts, rate, "first_photon_nll")
+    rate = _single(rate)
     r = rate + (relative_floor(rate) if floor is None else floor)
     value = -first_photon_log_prob(counts, r, cycles, dead_bins, constant=constant)
     return _reduce(value, reduction, "first_photon_nll")
@@ -137,9 +158,8 @@ def free_running_nll(
     best rate, r = n/armed, is second order in the counts of a bin per period. Its least is where Rapp et al. and Gupta
     et al. (see `sensing.free_running`) put it. Arguments as in `first_photon_nll`.
     """
-    _check(counts, rate, "free_running_nll")
-    if bool((rate.detach() < 0).any()):
-        raise UnitError("free_running_nll: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
+    _check_counts(counts, rate, "free_running_nll")
+    rate = _single(rate)
     n = counts.to(torch.float64)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the places inside a bin leave an uncertainty of about the square root of the counts
@@ -149,7 +169,7 @@ def free_running_nll(
             "got more. Check periods and dead time."
         )
     r = (rate + (relative_floor(rate) if floor is None else floor)).to(torch.float64)
-    hit = n > 0
+    hit = n != 0
     value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
     return _reduce(value.to(rate.dtype), reduction, "free_running_nll")
 
@@ -169,6 +189,7 @@ def read_noise_nll(
     electrons. `read_noise` > 0, a number or a tensor that broadcasts; differentiable in it and in `mean`.
     """
     _check(measured, mean, "read_noise_nll")
+    measured, mean = _single(measured), _single(mean)
     sigma = torch.as_tensor(read_noise, device=mean.device).to(mean.dtype)
     if not bool((sigma.detach() > 0).all()):
         raise UnitError("read_noise_nll: expected read_noise > 0 electrons: without it an empty pixel has no width.")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient import plugins
+from torchtransient._collection import let_go
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.gates import Gate, gates_to_text
@@ -91,7 +92,11 @@ class BuiltScene:
     params: Any
     mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
     integrator: str = ""
-    slots: dict[tuple[str, ...], Any] = field(default_factory=dict)
+
+    def __del__(self) -> None:
+        contents = list(self.__dict__.values())
+        self.__dict__.clear()
+        let_go(contents)
 
 
 def build(description: Description, variant: str, options: BuildOptions) -> BuiltScene:

@@ -32,6 +32,8 @@ class Scene:
         self._requested_variant = variant
         self._variant: str | None = None
         self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
+        # Not in the built scenes: what refers to itself is freed late.
+        self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
         self._table: ParameterTable | None = None
 
     @property
@@ -61,13 +63,14 @@ class Scene:
             found = build(self._description, self.variant, options)
             self._builds[options] = found
             while len(self._builds) > _MAX_BUILDS:
-                self._builds.popitem(last=False)
+                self.drop(next(iter(self._builds)))
         self._builds.move_to_end(options)
         return found
 
     def drop(self, options: BuildOptions) -> None:
         """Forget one built scene; the next use builds it anew."""
         self._builds.pop(options, None)
+        self._slots.pop(options, None)
 
     def options_for(self, keys: Iterable[str], options: BuildOptions) -> BuildOptions:
         """The options under which every one of ``keys`` is an independent, differentiable parameter.
@@ -95,9 +98,10 @@ class Scene:
         ``active_variant(scene.variant)``.
         """
         built, wanted = self.built(options), tuple(keys)
-        if wanted not in built.slots:
-            built.slots[wanted] = SlotTable(built, wanted)
-        return built.slots[wanted]
+        tables = self._slots.setdefault(options, {})
+        if wanted not in tables:
+            tables[wanted] = SlotTable(built, wanted)
+        return tables[wanted]
 
     def __getstate__(self) -> dict[str, Any]:
         return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}

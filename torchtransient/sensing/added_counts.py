@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from torchtransient.sensing.draws import fast_poisson
+from torchtransient.errors import UnitError
+from torchtransient.sensing.draws import WHOLE_FLOAT32, fast_poisson
 from torchtransient.sensing.layout import TIME
 from torchtransient.sensing.policies import record_score
 from torchtransient.sensing.sensor import RandomSensor
@@ -55,16 +58,24 @@ class AddedCounts(RandomSensor):
         with torch.no_grad():
             given = x.detach()
             counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
-            events = self.share() * float(counts.sum())
+            events = self.share() * self._total(counts)
             if not is_whole(counts) or events > _MOST_EVENTS * counts.numel():
                 return given + self._poisson(self.extra(given), generator)
             return self.trigger(counts, generator).to(x.dtype)
 
-    @staticmethod
-    def _poisson(mean: Tensor, generator: torch.Generator | None) -> Tensor:
+    def _total(self, counts: Tensor) -> float:
+        total = float(counts.sum(dtype=torch.float64))
+        if not math.isfinite(total):
+            raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
+        return total
+
+    def _poisson(self, mean: Tensor, generator: torch.Generator | None) -> Tensor:
+        self._total(mean.detach())
         work = mean.detach().clamp_min(0)
         if work.dtype in (torch.float16, torch.bfloat16):
             work = work.float()
+        elif work.dtype == torch.float32 and work.numel() and float(work.amax()) > WHOLE_FLOAT32 / 2:
+            work = work.double()
         return fast_poisson(work, generator).to(mean.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
+from torchtransient.sensing.time_convolution import filter_rows
 
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
@@ -67,8 +68,7 @@ def add_afterpulses(
         gain, length = torch.fft.rfft(near), 2 * bins
     # rows of time next to each other: the copy costs less than a transform that strides
     rows = counts.movedim(TIME, -1).contiguous().to(torch.float64)
-    spectrum = torch.fft.rfft(rows, n=length) * gain
-    wide: Tensor = torch.fft.irfft(spectrum, n=length)
+    wide = filter_rows(rows, gain, length)
     added = wide[..., :bins].movedim(-1, TIME).contiguous().to(counts.dtype)
     return added if only_added else counts + added
 
@@ -110,6 +110,7 @@ class Afterpulsing(AddedCounts):
         self.period_bins: int | None = None
         if period_s is not None:
             self.period_bins = round(check_seconds(period_s, "period_s", where, open_low=True) / self.bin_width_s)
+            _check_period(self.period_bins, 1)
         numbers = {"logit_probability": math.log(p / (1 - p)), "log_tau_s": math.log(tau)}
         for name, value in numbers.items():
             tensor = torch.tensor(value, dtype=torch.float64)

@@ -33,6 +33,8 @@ class Compose(Sensor):
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
         super().__init__()
+        if isinstance(stages, nn.Module) and not isinstance(stages, (nn.Sequential, nn.ModuleList)):
+            raise ShapeError(f"Compose: expected a list of sensors, got one {type(stages).__name__}. Put it into [].")
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if not len(stages) or wrong:
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
@@ -98,6 +100,8 @@ class Compose(Sensor):
     def check_axis(self, axis: TimeAxis) -> None:
         """UnitError when a stage was made for other bins than those of ``axis``."""
         for name, module in self.named_modules():
+            if not isinstance(module, Sensor):
+                continue  # a measured response has bins of its own
             own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
             if isinstance(own, TimeAxis):
                 slack = _SAME_BIN * axis.bin_width_opl
@@ -118,11 +122,15 @@ def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
     """``A^T y``: the transpose of a sensor's mean, exactly, for inputs of ``input_shape``; dtype and device of ``y``.
 
     ``A`` is the linear part of `expected`, ``x -> expected(x) - expected(0)``; a sensor that is not linear gives the
-    transpose of its derivative at zero: see `linearity_error`. Raises ShapeError when ``y`` is no output for that
+    transpose of its derivative at zero: see `linearity_error`. Differentiable in ``y`` and in the sensor's parameters,
+    so that an unrolled reconstruction can be trained through it. Raises ShapeError when ``y`` is no output for that
     shape.
     """
-    x = torch.zeros(tuple(input_shape), dtype=y.dtype, device=y.device, requires_grad=True)
-    with torch.enable_grad():
+    learnt = any(p.requires_grad for p in sensor.parameters())
+    onwards = torch.is_grad_enabled() and (y.requires_grad or learnt)
+    with torch.inference_mode(False), torch.enable_grad():
+        y = y.clone() if y.is_inference() else y
+        x = torch.zeros(tuple(input_shape), dtype=y.dtype, device=y.device, requires_grad=True)
         out = sensor.expected(x)
         if out.shape != y.shape:
             raise ShapeError(
@@ -130,7 +138,7 @@ def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
             )
         if not out.requires_grad:
             raise GradientError(f"adjoint: expected a sensor with gradients, but {type(sensor).__name__} has none.")
-        (gradient,) = torch.autograd.grad(out, x, y)
+        (gradient,) = torch.autograd.grad(out, x, y, create_graph=onwards)
     return gradient
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import TIME, check_count, check_transient
+from torchtransient.sensing.layout import TIME, check_count, check_transient, without_autocast
 from torchtransient.sensing.sensor import Sensor
 
 
@@ -70,6 +70,11 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     return table / lengths
 
 
+@without_autocast
+def _coded_sums(x: Tensor, matrix: Tensor) -> Tensor:
+    return torch.einsum("kt,...thw->...khw", matrix, x)
+
+
 class CodedHistogram(Sensor):
     """Coded sums (..., C, K, H, W) of a histogram (..., C, T, H, W): y = codes h, built up on the fly in a pixel.
 
@@ -97,7 +102,7 @@ class CodedHistogram(Sensor):
         if x.shape[TIME] != matrix.shape[1]:
             raise ShapeError(f"CodedHistogram.{name}: expected dimension -3 of {matrix.shape[1]}, got {x.shape[TIME]}.")
         work = torch.float32 if x.dtype in (torch.float16, torch.bfloat16) else x.dtype
-        return torch.einsum("kt,...thw->...khw", matrix.to(work), x.to(work)).to(x.dtype)
+        return _coded_sums(x.to(work), matrix.to(work)).to(x.dtype)
 
     def expected(self, x: Tensor) -> Tensor:
         return self._apply_matrix(self.codes, x, "expected")

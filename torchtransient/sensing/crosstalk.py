@@ -96,26 +96,26 @@ class Crosstalk(AddedCounts):
         steps = [dy * wide + dx for (dy, dx), _ in neighbours]
         sets = _Neighbours(steps, [p for _, p in neighbours], counts.device)
 
-        def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> list[Tensor]:
-            """Places, in images with a rim, of what the detections of a piece trigger."""
+        frames = counts.reshape(-1, height, width)
+        result = torch.empty_like(frames, memory_format=torch.contiguous_format)
+        one = torch.ones(1, dtype=counts.dtype, device=counts.device)
+
+        def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> None:
+            """Add to images with a rim what the detections of some frames trigger, and cut the rim off."""
+            total = torch.nn.functional.pad(piece, (1, 1, 1, 1))
             events = thin(piece, sets.any, own)
-            place = events.place + begin
-            row = place.div(width, rounding_mode="floor")
+            row = events.place.div(width, rounding_mode="floor")
             frame = row.div(height, rounding_mode="floor")
-            place += (row * 2).add_(frame, alpha=2 * wide).add_(wide + 1)
-            found = []
+            place = events.place + (row * 2).add_(frame, alpha=2 * wide).add_(wide + 1)
             for block in range(0, place.numel(), _BLOCK):
                 at = slice(block, block + _BLOCK)
                 start = place[at].repeat_interleave(events.number[at].long())
-                found.extend(sets.reached(start, own))
-            return found
+                for reached in sets.reached(start, own):
+                    total.view(-1).scatter_add_(0, reached, one.expand(reached.shape))
+            result[begin : begin + piece.shape[0]] = total[:, 1:-1, 1:-1]
 
-        one = torch.ones(1, dtype=counts.dtype, device=counts.device)
-        total = torch.nn.functional.pad(counts, (1, 1, 1, 1))
-        for found in by_pieces(follow, counts.reshape(-1), generator):
-            for places in found:
-                total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        return total[..., 1:-1, 1:-1].contiguous()
+        by_pieces(follow, frames, generator)
+        return result.view(counts.shape)
 
 
 class _Neighbours:

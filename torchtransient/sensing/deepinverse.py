@@ -39,9 +39,10 @@ class SensorPhysics(Physics):  # type: ignore[misc]
 
     def A_vjp(self, x: Tensor, v: Tensor, **kwargs: Any) -> Tensor:
         """Transpose of the derivative of ``A`` at ``x``, applied to ``v``."""
+        onwards = torch.is_grad_enabled() and (v.requires_grad or x.requires_grad)
         with torch.enable_grad():
-            at = x.detach().requires_grad_()
-            (gradient,) = torch.autograd.grad(self.sensor_module.expected(at), at, v)
+            at = x if x.requires_grad else x.detach().requires_grad_()
+            (gradient,) = torch.autograd.grad(self.sensor_module.expected(at), at, v, create_graph=onwards)
         return gradient
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import TIME, check_count, check_number, check_transient
+from torchtransient.sensing.layout import TIME, check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 
 
@@ -41,8 +41,11 @@ def log_matched_filter(
     """
     me = "log_matched_filter"
     ratio = check_number(signal_to_background, "signal_to_background", me, open_low=True)
-    if kernel.ndim != 1 or not kernel.numel():
-        raise ShapeError(f"{me}: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
+    if not isinstance(kernel, Tensor) or kernel.ndim != 1 or not kernel.numel():
+        shape = tuple(kernel.shape) if isinstance(kernel, Tensor) else type(kernel).__name__
+        raise ShapeError(
+            f"{me}: expected a kernel (K,) with K >= 1, got {shape}. first, kernel = response.kernel(bin_width_s)."
+        )
     if bool((kernel < 0).any()):
         raise UnitError(f"{me}: expected shares >= 0 in the kernel, got {float(kernel.min()):g}.")
     weights = torch.log1p(ratio * kernel.to(histogram.device))
@@ -60,7 +63,9 @@ def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     check_transient(scores, "peak_position")
     index = scores.detach().argmax(TIME, keepdim=True)
     middle = index.squeeze(TIME).to(scores.dtype) + 0.5
-    return middle + _parabola(scores, index).squeeze(TIME) if refine else middle
+    position = middle + _parabola(scores, index).squeeze(TIME) if refine else middle
+    # argmax takes NaN for the largest entry; a position from it would look like any other
+    return torch.where(scores.detach().gather(TIME, index).squeeze(TIME).isnan(), math.nan, position)
 
 
 def _parabola(scores: Tensor, index: Tensor) -> Tensor:
@@ -87,8 +92,7 @@ def centre_of_mass(
     (or of the largest bin), derivative zero. Negative differences count as they are, which keeps the mean unbiased.
     """
     check_transient(histogram, "centre_of_mass")
-    level = background.unsqueeze(TIME) if isinstance(background, Tensor) else background
-    excess = histogram - level
+    excess = histogram - _per_pixel(background, histogram, "centre_of_mass", "background")
     bins = _positions(histogram)
     if half_width_bins is None:
         reference = torch.full_like(histogram.detach().select(TIME, 0).unsqueeze(TIME), bins.numel() / 2)
@@ -97,7 +101,9 @@ def centre_of_mass(
         reference = histogram.detach().argmax(TIME, keepdim=True).to(histogram.dtype) + 0.5
         excess = torch.where((bins - reference).abs() <= half_width_bins + 0.25, excess, 0.0)
     total = excess.sum(TIME, keepdim=True)
-    there = total > torch.finfo(histogram.dtype).eps * histogram.detach().abs().sum(TIME, keepdim=True)
+    weight = histogram.detach().abs().sum(TIME, keepdim=True)
+    # "not below" lets NaN through
+    there = ~(total <= torch.finfo(histogram.dtype).eps * weight)
     # Around the reference, so that float32 does not cancel far from the start of the axis.
     moment = (excess * (bins - reference)).sum(TIME, keepdim=True)
     shift = torch.where(there, moment, 0.0) / torch.where(there, total, 1.0)
@@ -136,9 +142,8 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     middle. Earlier than the peak by a share of the pulse: a leading-edge discriminator has the same walk error.
     """
     check_transient(histogram, "first_return")
-    level = threshold if isinstance(threshold, Tensor) else histogram.new_tensor(float(threshold))
-    level = level.unsqueeze(TIME) if level.ndim else level
-    reached = histogram.detach() >= level.detach()
+    level = _per_pixel(threshold, histogram, "first_return", "threshold")
+    reached = ~(histogram.detach() < level.detach())  # NaN counts as reached, and is then what is found
     valid = reached.any(TIME, keepdim=True)
     index = reached.to(torch.uint8).argmax(TIME, keepdim=True)
     here, before = histogram.gather(TIME, index), histogram.gather(TIME, (index - 1).clamp(min=0))
@@ -160,6 +165,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     check_transient(scores, me)
     check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
+    # NaN is no maximum anywhere: a histogram with one has no returns that could be told
+    unknown = scores.detach().isnan().any(TIME, keepdim=True)
     values = scores.detach()
     low = torch.full_like(values.select(TIME, 0).unsqueeze(TIME), -math.inf)
     before = torch.cat([low, values.narrow(TIME, 0, values.shape[TIME] - 1)], TIME)
@@ -178,7 +185,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     index = torch.where(valid, index, 0)
     position = index.to(scores.dtype) + 0.5 + _parabola(scores, index)
     strength = scores.gather(TIME, index)
-    return Returns(torch.where(valid, position, 0.0), torch.where(valid, strength, 0.0), valid)
+    position, strength = torch.where(valid, position, 0.0), torch.where(valid, strength, 0.0)
+    return Returns(torch.where(unknown, math.nan, position), torch.where(unknown, math.nan, strength), valid & ~unknown)
 
 
 def background_per_bin(histogram: Tensor) -> Tensor:
@@ -192,6 +200,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     For light that leaves from and returns to the sensor; t = 0 when it leaves. Computed in float64 from the axis and
     returned in the dtype given: float32 resolves 4e-6 m at 100 m.
     """
+    check_time_axis(axis, "distance_of_position")
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
@@ -229,6 +238,16 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
 
     width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1.0)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
+
+
+def _per_pixel(value: Tensor | float, histogram: Tensor, where: str, name: str) -> Tensor:
+    """A number, or one for each pixel (..., C, H, W), ready to meet a histogram."""
+    if not isinstance(value, Tensor) or value.ndim == 0:
+        return torch.as_tensor(value, dtype=histogram.dtype, device=histogram.device)
+    wanted = (*histogram.shape[:TIME], *histogram.shape[TIME + 1 :])
+    if value.shape != wanted:
+        raise ShapeError(f"{where}: expected {name} to be a number or {wanted}, got {tuple(value.shape)}.")
+    return value.unsqueeze(TIME)
 
 
 def _positions(x: Tensor) -> Tensor:

@@ -22,19 +22,33 @@ Result = TypeVar("Result")
 
 _PIECES = 4
 _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs less than it saves
-_WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
+WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
+
+
+def check_rates(rate: Tensor, where: str) -> Tensor:
+    """`rate` when all of it is finite and >= 0, else UnitError: torch.binomial never returns from a NaN count."""
+    low, high = torch.aminmax(rate.detach()) if rate.numel() else (rate.new_zeros(()), rate.new_zeros(()))
+    if not bool(low >= 0) or not bool(torch.isfinite(high)):
+        raise UnitError(
+            f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}. Look for NaN upstream; "
+            "clamp or use softplus where a network gives the rate."
+        )
+    return rate
 
 
 def by_pieces(
-    job: Callable[[Tensor, int, torch.Generator | None], Result], flat: Tensor, generator: torch.Generator | None
+    job: Callable[[Tensor, int, torch.Generator | None], Result], data: Tensor, generator: torch.Generator | None
 ) -> list[Result]:
-    """`job(piece, begin, generator)` of consecutive pieces of `flat` (N,), in threads for large ones on the CPU."""
-    if flat.device.type != "cpu" or flat.numel() < _WORTH_THREADS:
-        return [job(flat, 0, generator)]
-    pieces = flat.tensor_split(_PIECES)
+    """`job(piece, begin, generator)` of consecutive pieces along dimension 0, in threads for large data on the CPU.
+
+    `begin` is the place of the piece's first entry along that dimension.
+    """
+    if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[0] < _PIECES:
+        return [job(data, 0, generator)]
+    pieces = data.tensor_split(_PIECES)
     begins = [0]
     for piece in pieces[:-1]:
-        begins.append(begins[-1] + piece.numel())
+        begins.append(begins[-1] + piece.shape[0])
     return _in_threads(job, list(zip(pieces, begins, strict=True)), generator)
 
 
@@ -62,8 +76,10 @@ def _in_columns(
     """`draw` over pieces of `data` along its last dimension; in threads for large tensors on the CPU."""
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[-1] < _PIECES:
         return draw(data, generator)
-    pieces = [(piece,) for piece in data.tensor_split(_PIECES, dim=-1)]
-    return torch.cat(_in_threads(draw, pieces, generator), dim=-1)
+    result = torch.empty_like(data, memory_format=torch.contiguous_format)
+    places = zip(data.tensor_split(_PIECES, dim=-1), result.tensor_split(_PIECES, dim=-1), strict=True)
+    _in_threads(lambda piece, into, own: into.copy_(draw(piece, own)), list(places), generator)
+    return result
 
 
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -140,10 +156,8 @@ def _sample_tree(
     w = weights.detach()
     if w.numel() == 0:
         return w.clone()
-    low, high = torch.aminmax(w)
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"{where}: expected finite values >= 0, got {float(low):g} to {float(high):g}.")
-    work = torch.float64 if trials > _WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
+    check_rates(w, where)
+    work = torch.float64 if trials > WHOLE_FLOAT32 or w.dtype == torch.float64 else torch.float32
     bins, pixels = w.shape[TIME], w.shape[-2] * w.shape[-1]
     columns = w.to(work).reshape(-1, bins, pixels)
 

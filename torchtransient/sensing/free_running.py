@@ -18,8 +18,9 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, UnitError
+from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
-from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state
+from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state, whole_and_part
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_transient
 from torchtransient.sensing.policies import GradPolicy, record_score
 from torchtransient.sensing.running_sums import split_dead_time
@@ -40,6 +41,9 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
 
 def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     """Stationary state for rates (..., T, H, W), in the same layout."""
+    if rate.numel() == 0:
+        empty = rate.to(torch.float64)
+        return FreeRunningState(empty, empty, empty, whole_and_part(torch.as_tensor(dead_bins))[0])
     wide = rate.to(torch.float64).movedim(TIME, -1)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     rows = stationary_state(wide.reshape(-1, wide.shape[-1]), dead)
@@ -63,18 +67,21 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     TorchTransientError for a phase locked so narrowly that bins cut in 32 do not show it.
     """
     check_transient(rate, "nonparalyzable_histogram")
-    low, high = torch.aminmax(rate.detach())
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"nonparalyzable_histogram: expected finite rates >= 0, got {float(low):g} to {float(high):g}.")
+    check_rates(rate, "nonparalyzable_histogram")
     split_dead_time(dead_bins)  # says what is wrong with a dead time that is too short
     return state_image(rate, dead_bins).detected.to(rate.dtype)
 
 
-def _mean_of_exponentials(x: Tensor) -> Tensor:
-    """(1 - exp(-x))/x, 1 at 0, for any sign; series where the difference would cancel."""
-    small = x.abs() < 1e-4
-    safe = torch.where(small, torch.ones_like(x), x)
-    return torch.where(small, 1 - x / 2 + x**2 / 6, -torch.expm1(-safe) / safe)
+def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
+    """Mean of exp(-x) over x from `start` to `start + step`, of either sign: finite wherever both ends are >= 0.
+
+    Counted from the smaller end, so that no factor overflows where the other one is 0.
+    """
+    low = torch.where(step < 0, start + step, start)
+    width = step.abs()
+    small = width < 1e-4
+    safe = torch.where(small, torch.ones_like(width), width)
+    return torch.exp(-low) * torch.where(small, 1 - width / 2 + width**2 / 6, -torch.expm1(-safe) / safe)
 
 
 def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
@@ -105,8 +112,8 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     exponent = wrapped + part * first
     # while the bin passes, the window's rear edge is in `first` for the share `part`, then in `second`
     slope_1, slope_2 = wide - first, wide - second
-    early = part * torch.exp(-exponent) * _mean_of_exponentials(part * slope_1)
-    late = (1 - part) * torch.exp(-exponent - part * slope_1) * _mean_of_exponentials((1 - part) * slope_2)
+    early = part * _mean_of_exponentials(exponent, part * slope_1)
+    late = (1 - part) * _mean_of_exponentials(exponent + part * slope_1, (1 - part) * slope_2)
     return (wide * (early + late)).to(rate.dtype)
 
 
@@ -185,14 +192,14 @@ class FreeRunningSPAD(RandomSensor):
         """One draw of the non-paralyzable detector, step by step."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s.detach()))
-            rate = x.detach().double()
+            rate = check_rates(x.detach().double(), "FreeRunningSPAD")
             return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.kind == "non_paralyzable":
             return self._path(x, generator).counts.to(x.dtype)
         with torch.no_grad():
-            p = self.probabilities(x.detach().double())
+            p = self.probabilities(check_rates(x.detach().double(), "FreeRunningSPAD"))
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

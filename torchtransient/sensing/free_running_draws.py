@@ -95,7 +95,7 @@ def draw_path(chances: BinChances, periods: int, generator: torch.Generator | No
 
 def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:
     """count log(chance), 0 for no count whatever the chance."""
-    some = count > 0
+    some = count != 0
     return torch.where(some, count * torch.log(torch.where(some, chance, torch.ones_like(chance))), 0.0)
 
 

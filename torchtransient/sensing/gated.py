@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import correlate
-from torchtransient.sensing.layout import check_number, check_seconds
+from torchtransient.sensing.layout import check_number, check_seconds, check_time_axis
 from torchtransient.sensing.response_shapes import normal_cdf
 from torchtransient.sensing.sensor import Sensor
 
@@ -93,7 +93,7 @@ class GatedIntegration(Sensor):
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]
         if not delays or len(widths) != len(delays):
             raise ShapeError(f"{me}: expected one width or one per delay, got {len(delays)} and {len(widths)}.")
-        self.axis = axis
+        self.axis = check_time_axis(axis, me)
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
         window_s = axis.num_bins * axis.bin_width_s

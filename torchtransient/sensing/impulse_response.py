@@ -25,14 +25,15 @@ from torchtransient.sensing.response_shapes import (
     remove_floor,
     resample_counts,
 )
-from torchtransient.sensing.sensor import Sensor
+from torchtransient.sensing.sensor import PhysicalModule, Sensor
 from torchtransient.sensing.time_convolution import Boundary, Method, check_choice, convolve_time
 
 _OUTSIDE = 1e-9  # share of a response that a kernel may leave out on each side before it is normalised
+_MOST_BINS = 1 << 24  # more is a unit gone wrong or a width that ran away, and takes all memory
 _SIGMAS = 6.0  # a normal distribution has that share outside
 
 
-class Response(nn.Module):
+class Response(PhysicalModule):
     """A distribution of delays. Subclasses give `cdf`, `survival`, and the `support_s` outside which nothing matters.
 
     `learnable`: whether the numbers are `nn.Parameter`s or buffers.
@@ -85,7 +86,17 @@ class Response(nn.Module):
 
     def kernel(self, bin_width_s: float) -> tuple[int, Tensor]:
         """(first, (K,) float64): shares that arrive `first + k` bins later, summing to 1."""
+        if not all(bool(torch.isfinite(p).all()) for p in self.parameters()):
+            raise UnitError(
+                f"{type(self).__name__}: expected finite parameters, got NaN or infinity. If they are learnt, lower "
+                "the learning rate."
+            )
         low, high = self.support_s()
+        if not high - low <= _MOST_BINS * bin_width_s:
+            raise UnitError(
+                f"{type(self).__name__}: expected a response of at most {_MOST_BINS} bins of {bin_width_s:g} s, got "
+                f"{high - low:g} s. Wrong unit? If it is learnt, lower the learning rate."
+            )
         first, last = math.floor(low / bin_width_s), math.ceil(high / bin_width_s)
         device = self.delay_ps.device
         edges = (torch.arange(first, last + 2, dtype=torch.float64, device=device) - 0.5) * bin_width_s
@@ -300,6 +311,9 @@ class ComposedResponse(Response):
         super().__init__(0.0, learnable=False)
         if len(responses) == 0:
             raise ShapeError("ComposedResponse: expected at least one response, got none.")
+        wrong = [type(r).__name__ for r in responses if not isinstance(r, Response)]
+        if wrong:
+            raise ShapeError(f"ComposedResponse: expected responses such as GaussianResponse, got {wrong}.")
         if oversampling < 1 or oversampling % 2 == 0:
             raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {oversampling}.")
         self.responses = nn.ModuleList(responses)
@@ -348,6 +362,11 @@ class ImpulseResponse(Sensor):
         super().__init__()
         check_choice(boundary, Boundary, "boundary", "ImpulseResponse")
         check_choice(method, Method, "method", "ImpulseResponse")
+        if not isinstance(response, Response):
+            raise ShapeError(
+                f"ImpulseResponse: expected a response such as GaussianResponse, got {type(response).__name__}. A "
+                "measured histogram goes into MeasuredResponse(counts, bin_width_s)."
+            )
         self.response = response
         self.bin_width_s = bin_width_of(axis, bin_width_s, "ImpulseResponse")
         self.boundary: Boundary = boundary

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof_codes import CorrelationCode
-from torchtransient.sensing.layout import check_number, check_transient
+from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, without_autocast
 from torchtransient.sensing.sensor import Sensor
 
 WithinBin = Literal["uniform", "center"]
@@ -57,7 +57,9 @@ def tap_weights(
     """
     me = "tap_weights"
     check_number(contrast, "contrast", me, high=1.0)
-    edges_s = axis.edges_s
+    if not isinstance(code, CorrelationCode):
+        raise UnitError(f"{me}: expected a code such as sine_code(4), got {code!r}.")
+    edges_s = check_time_axis(axis, me).edges_s
     rows = []
     for f in check_frequencies(frequencies_hz, me):
         if within_bin == "uniform":
@@ -70,6 +72,7 @@ def tap_weights(
     return torch.cat(rows)
 
 
+@without_autocast
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
 
@@ -85,6 +88,7 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     return taps.reshape(*taps.shape[:-1], *transient.shape[-2:])
 
 
+@without_autocast
 def taps_from_phasor(
     phasor: Tensor,
     phasor_axis: FrequencyAxis,

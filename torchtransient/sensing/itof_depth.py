@@ -25,7 +25,7 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import check_frequencies
 from torchtransient.sensing.itof_codes import CorrelationCode
-from torchtransient.sensing.layout import check_number
+from torchtransient.sensing.layout import check_number, without_autocast
 from torchtransient.units import SPEED_OF_LIGHT
 
 _TURN = 2 * math.pi
@@ -43,13 +43,16 @@ class ItofReading:
     depth_m: Tensor
 
 
+@without_autocast
 def tap_phasor(taps: Tensor, num_taps: int) -> Tensor:
     """(..., C, F, H, W) complex: ``(2 / N) sum_n taps_n exp(2 pi i n / N)`` of taps (..., C, F N, H, W).
 
     Taps at equal shifts of one function (sine, square). Harmonics ``m N +- 1`` of it alias into the result (wiggling).
-    Raises ShapeError when the tap dimension is no multiple of ``num_taps``.
+    Half precision becomes complex64. Raises ShapeError when the tap dimension is no multiple of ``num_taps``.
     """
     split = _split(taps, num_taps, "tap_phasor")
+    if split.dtype in (torch.float16, torch.bfloat16):
+        split = split.float()  # bfloat16 has no complex numbers
     # The mean has no part in the sum; without it, equal taps give exactly zero and float32 keeps its digits.
     split = split - split.mean(-3, keepdim=True)
     angles = _TURN * torch.arange(num_taps, dtype=torch.float64) / num_taps
@@ -69,7 +72,7 @@ def phase_of(phasor: Tensor) -> Tensor:
     real, imag = phasor.real, phasor.imag
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
     largest = torch.maximum(real.abs(), imag.abs()).detach()
-    there = largest > torch.finfo(real.dtype).tiny
+    there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
     scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
     wrapped = angle + torch.where(angle.detach() < 0, _TURN, 0.0)
@@ -81,7 +84,7 @@ def amplitude_of(phasor: Tensor) -> Tensor:
     """Modulus of a complex tensor, in its shape; derivative zero where it is zero."""
     real, imag = phasor.real, phasor.imag
     largest = torch.maximum(real.abs(), imag.abs()).detach()
-    there = largest > torch.finfo(real.dtype).tiny
+    there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
     scale = torch.where(there, largest, 1.0)
     square = (real / scale).square() + (imag / scale).square()
     return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
@@ -205,6 +208,7 @@ def _search(
     return best, whole
 
 
+@without_autocast
 def decode_code(taps: Tensor, code: CorrelationCode, num_phases: int = 1024) -> Tensor:
     """Phase (..., C, F, H, W) in radians of taps of *any* code, by the closest shape of the N taps.
 
@@ -216,7 +220,7 @@ def decode_code(taps: Tensor, code: CorrelationCode, num_phases: int = 1024) -> 
     split = _split(taps, code.num_taps, "decode_code").movedim(-3, -1)
     centred = split - split.mean(-1, keepdim=True)
     length = torch.linalg.vector_norm(centred, dim=-1, keepdim=True)
-    there = length > 1e-6 * split.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(split.dtype).tiny)
+    there = ~(length <= 1e-6 * split.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(split.dtype).tiny))
     unit = torch.where(there, centred, 0.0) / torch.where(there, length, 1.0)
     x = torch.arange(num_phases, dtype=torch.float64) / num_phases
     table = _unit_shapes(code, x).to(unit)
@@ -242,6 +246,8 @@ def _unit_shapes(code: CorrelationCode, turns: Tensor) -> Tensor:
 
 def _best_match(unit: Tensor, table: Tensor, chunk: int = 1 << 14) -> Tensor:
     """Index of the row of ``table`` (P, N) with the largest product for each of (..., N); memory chunk x P."""
+    if unit.numel() == 0:
+        return torch.zeros(unit.shape[:-1], dtype=torch.int64, device=unit.device)
     flat = unit.reshape(-1, unit.shape[-1])
     found = [(flat[i : i + chunk] @ table.T).argmax(-1) for i in range(0, flat.shape[0], chunk)]
     return torch.cat(found).reshape(unit.shape[:-1])
@@ -270,7 +276,7 @@ def read_itof(
     phasor, offset = tap_phasor(taps, num_taps), offset_of(taps, num_taps)
     phase = phase_of(phasor) if code is None else decode_code(taps, code)
     amplitude = amplitude_of(phasor)
-    lit = offset > 0
+    lit = ~(offset <= 0)
     confidence = torch.where(lit, amplitude, 0.0) / torch.where(lit, offset, 1.0)
     if len(values) == 1:
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
@@ -285,4 +291,4 @@ def _split(taps: Tensor, num_taps: int, where: str) -> Tensor:
         raise ShapeError(
             f"{where}: expected taps (..., C, F x N, H, W) with N = {num_taps} >= 3, got {tuple(taps.shape)}."
         )
-    return taps.reshape(*taps.shape[:-3], -1, num_taps, *taps.shape[-2:])
+    return taps.reshape(*taps.shape[:-3], taps.shape[-3] // num_taps, num_taps, *taps.shape[-2:])

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +14,29 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def without_autocast(
+    function: Callable[Concatenate[Tensor, Arguments], Result],
+) -> Callable[Concatenate[Tensor, Arguments], Result]:
+    """`function(x, ...)` in the dtype of `x` inside `torch.autocast` too.
+
+    Autocast makes bfloat16 or float16 of the operands of matrix products and convolutions. A network bears that; a
+    measurement loses 3e-3 of its value by it, and phases their millimetres.
+    """
+
+    @functools.wraps(function)
+    def run(x: Tensor, /, *args: Arguments.args, **keywords: Arguments.kwargs) -> Result:
+        kind = x.device.type if isinstance(x, Tensor) else "cpu"
+        if kind == "meta" or not torch.is_autocast_enabled(kind):
+            return function(x, *args, **keywords)
+        with torch.autocast(kind, enabled=False):
+            return function(x, *args, **keywords)
+
+    return run
 
 
 def check_transient(x: Tensor, where: str) -> Tensor:
@@ -54,10 +80,27 @@ def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -
     if (axis is None) == (bin_width_s is None):
         raise UnitError(f"{where}: expected either axis= (a TimeAxis) or bin_width_s=, got both or neither.")
     if axis is not None:
-        if not isinstance(axis, TimeAxis):
-            raise UnitError(f"{where}: expected axis to be a TimeAxis, got {type(axis).__name__}.")
-        return axis.bin_width_s
+        return check_time_axis(axis, where).bin_width_s
     return check_seconds(bin_width_s if bin_width_s is not None else 0.0, "bin_width_s", where, open_low=True)
+
+
+def check_time_axis(axis: object, where: str) -> TimeAxis:
+    """`axis` when it is a TimeAxis, else UnitError."""
+    if not isinstance(axis, TimeAxis):
+        raise UnitError(
+            f"{where}: expected axis to be a TimeAxis, got {type(axis).__name__}. Take the renderer's, or "
+            "TimeAxis.from_seconds(start, bin width, bins)."
+        )
+    return axis
+
+
+def check_generator(generator: object, where: str) -> None:
+    """UnitError for a generator that is none, a seed for instance."""
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise UnitError(
+            f"{where}: expected generator to be a torch.Generator, got {generator!r}. "
+            "Use torch.Generator().manual_seed(...)."
+        )
 
 
 def check_seconds(value: float, name: str, where: str, *, open_low: bool = False) -> float:

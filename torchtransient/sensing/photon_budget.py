@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.units import SPEED_OF_LIGHT
@@ -140,6 +140,8 @@ class PhotonBudget(Sensor):
     ) -> None:
         super().__init__()
         where = "PhotonBudget"
+        if not isinstance(optics, Optics):
+            raise UnitError(f"{where}: expected optics to be an Optics, got {optics!r}. Optics(f_number=2.0), say.")
         self.optics = optics
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)
@@ -183,6 +185,12 @@ class PhotonBudget(Sensor):
         return x * self.detections_per_unit
 
     def expected(self, x: Tensor) -> Tensor:
+        dark = self.dark_count_rate_hz
+        if any(have not in (1, wanted) for have, wanted in zip(dark.shape, x.shape[-2:], strict=False)):
+            raise ShapeError(
+                f"PhotonBudget: expected an image {tuple(dark.shape)} as in dark_count_rate_hz, got "
+                f"{tuple(x.shape[-2:])}. Make the map for this sensor."
+            )
         background_hz = self.ambient_rate_hz * self.quantum_efficiency + self.dark_count_rate_hz.double()
         return self.signal(x) + (background_hz * self.bin_width_s).to(x.dtype)
 

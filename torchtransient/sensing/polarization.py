@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import check_number
+from torchtransient.sensing.layout import check_number, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -57,6 +57,7 @@ def circular_analysers(extinction_ratio: float = math.inf, transmission: float =
     return factor * torch.stack([right + share * left, left + share * right])
 
 
+@without_autocast
 def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
     _check_stokes(stokes, "analyse")
@@ -65,6 +66,7 @@ def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     return torch.einsum("as,...scthw->...acthw", rows.to(stokes), stokes)
 
 
+@without_autocast
 def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     """Least-squares Stokes vectors (..., 4, C, T, H, W) of measurements (..., A, C, T, H, W) behind analysers (A, 4).
 
@@ -153,7 +155,7 @@ class PolarizationMosaic(Sensor):
     def expected(self, x: Tensor) -> Tensor:
         _check_stokes(x, "PolarizationMosaic")
         weights = self.weights(*x.shape[-2:]).to(x)
-        raw = torch.einsum("shw,...scthw->...cthw", weights, x)
+        raw = _behind_mosaic(x, weights)
         slack = -_ROUNDING * x.detach().select(TRANSIENT_DIM, 0)
         return torch.where((raw < 0) & (raw >= slack), 0.0, raw)
 
@@ -169,6 +171,11 @@ class PolarizationMosaic(Sensor):
         return f"block={tuple(self.rows.shape[:2])}"
 
 
+@without_autocast
+def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
+    return torch.einsum("shw,...scthw->...cthw", weights, stokes)
+
+
 def mosaic_rows(
     angles_deg: Sequence[Sequence[float]], extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
@@ -179,6 +186,7 @@ def mosaic_rows(
     return linear_analysers(flat, extinction_ratio, transmission).reshape(len(angles_deg), -1, 4)
 
 
+@without_autocast
 def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     """(..., P Q, C, T, H, W) from raw light (..., C, T, H, W): every pixel of a block spread over the others.
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.pulses import Pulse, cumulative_of_sum
+from torchtransient.sensing.layout import without_autocast
 
 # Longer kernels are applied by a Fourier transform in double precision, whose rounding stays 1e-12 below the largest
 # bin where one in single precision would drown the late ones.
@@ -83,6 +84,7 @@ def apply_pulse(transient: Tensor, axis: TimeAxis, *pulses: Pulse, keep: TimeAxi
     return result.movedim(-1, -3)
 
 
+@without_autocast
 def _convolve(rows: Tensor, kernel: Tensor) -> Tensor:
     """Full convolution along the last dimension: T + K - 1 entries."""
     length = rows.shape[-1] + kernel.numel() - 1

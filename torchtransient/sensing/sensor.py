@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Self
+
 import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import GradientError
+from torchtransient.sensing.layout import check_generator
 from torchtransient.sensing.policies import (
     GradPolicy,
     check_policy,
@@ -15,7 +19,26 @@ from torchtransient.sensing.policies import (
 )
 
 
-class Sensor(nn.Module):
+class PhysicalModule(nn.Module):
+    """A module whose own numbers are physical and stay in the precision they have when a model goes to half precision.
+
+    In bfloat16 the logarithm of 60 ps is that of 62 ps, and 1e5 dark counts are infinite in float16. Devices, float32
+    and float64 are followed; modules of another kind inside follow everything.
+    """
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        def careful(value: Tensor) -> Tensor:
+            moved = fn(value)
+            return value.to(moved.device) if moved.dtype in (torch.float16, torch.bfloat16) else moved
+
+        if recurse:
+            for child in self.children():
+                child._apply(fn)  # type: ignore[no-untyped-call]
+        super()._apply(careful, recurse=False)  # type: ignore[no-untyped-call]
+        return self
+
+
+class Sensor(PhysicalModule):
     """Maps a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
 
     `forward` takes `generator` in every sensor, so that chains need not know which of their links are random.
@@ -61,6 +84,7 @@ class RandomSensor(Sensor):
         """The measurement under the policy `grad`; equal generators in equal states give equal measurements."""
         if self.grad == "expected":
             return self.expected(x)
+        check_generator(generator, type(self).__name__)
         if self.grad == "gaussian":
             return self.gaussian(x, generator)
         with torch.no_grad():

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.draws import sample_first_photons
+from torchtransient.sensing.draws import check_rates, sample_first_photons
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -67,7 +67,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
     armed = armed_cycles(counts, number, dead_bins)
-    usable = armed > 0.5
+    usable = ~(armed <= 0.5)  # NaN stays NaN
     safe = torch.where(usable, armed, torch.ones_like(armed))
     share = torch.where(usable, counts.to(torch.float64) / safe, torch.zeros_like(armed))
     highest = 1 - 1 / (2 * number)
@@ -89,6 +89,7 @@ def sample_detections(
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, _working(rate), generator).to(rate.dtype)
+    check_rates(rate, "sample_detections")
     whole, part = split_dead_time(dead_bins)
     share = part.to(rate.device)
     fire = -torch.expm1(-rate.to(torch.float64))
@@ -147,9 +148,11 @@ class SynchronousSPAD(RandomSensor):
         if dead_time_s is not None:
             dead = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
             self.dead_bins = dead / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+            split_dead_time(self.dead_bins)  # says what is wrong with a dead time that is too short
         if gate is not None:
-            if gate.ndim != 1:
-                raise ShapeError(f"SynchronousSPAD: expected gate (T,), got {tuple(gate.shape)}.")
+            if not isinstance(gate, Tensor) or gate.ndim != 1:
+                shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
+                raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {shape}.")
             if not bool(((gate >= 0) & (gate <= 1)).all()):
                 raise UnitError("SynchronousSPAD: expected gate values between 0 and 1.")
             gate = gate.detach().double()
@@ -225,7 +228,7 @@ def first_photon_log_prob(
             "than armed cycles. Check cycles and the dead time."
         )
     quiet = quiet.clamp_min(0)
-    hit = n > 0
+    hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
     fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
     value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * quiet

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import check_number, check_transient
+from torchtransient.sensing.layout import check_number, check_transient, without_autocast
 from torchtransient.sensing.response_shapes import FWHM_PER_SIGMA
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.time_convolution import check_choice
@@ -17,6 +17,7 @@ from torchtransient.sensing.time_convolution import check_choice
 Border = Literal["constant", "reflect", "replicate", "circular"]
 
 
+@without_autocast
 def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
     """Convolve (..., C, T, H, W) with a PSF (h, w), odd sizes, over the image plane; the PSF's own centre stays put.
 

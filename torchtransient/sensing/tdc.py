@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME, check_count, check_number, check_transient
@@ -34,6 +34,13 @@ def code_bands(edges: Tensor, num_bins: int) -> tuple[int, Tensor]:
     return first, overlap.clamp(0, 1) * ((true >= 0) & (true < num_bins))
 
 
+def _bands_of_loaded_widths(module: nn.Module, incompatible: object) -> None:
+    """The share matrix follows code widths that came from a state_dict."""
+    if isinstance(module, TDC):
+        module.first, bands = module._bands(module.code_widths.double())
+        module.bands = bands.to(module.code_widths)
+
+
 class TDC(Sensor):
     """Turns equal true bins into the codes of a real converter, (..., C, T, H, W) to the same shape.
 
@@ -42,6 +49,8 @@ class TDC(Sensor):
     apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown offset, uniform over one
     bin, that is not taken off: half the events get the next code. Apply it to rates, before detection: it acts on the
     single photon, so that pile-up happens in codes. What falls beyond the last code is lost.
+
+    `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
 
     Linear, not random; the expectation over offsets is exact. Raises UnitError for widths that are not positive,
     ShapeError when T does not fit.
@@ -63,9 +72,10 @@ class TDC(Sensor):
         self.offset_bins = check_number(offset_bins, "offset_bins", "TDC", low=-1e6)
         self.dither = bool(dither)
         self.register_buffer("code_widths", widths)
-        first, bands = self._bands(widths)
-        self.first = first
-        self.register_buffer("bands", bands)
+        self.first, bands = self._bands(widths)
+        # not saved: the band of other widths may have another shape, and begins at another bin
+        self.register_buffer("bands", bands, persistent=False)
+        self.register_load_state_dict_post_hook(_bands_of_loaded_widths)  # type: ignore[no-untyped-call]
 
     def _bands(self, widths: Tensor) -> tuple[int, Tensor]:
         """The share matrix as a band, averaged over the offsets of the sliding scale."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, get_args
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.errors import ShapeError
-from torchtransient.sensing.layout import TIME, check_transient
+from torchtransient.sensing.layout import TIME, check_transient, without_autocast
 
 Boundary = Literal["zero", "periodic"]
 Method = Literal["auto", "direct", "fft"]
@@ -25,6 +26,7 @@ def check_choice(value: str, choices: object, name: str, where: str) -> None:
         raise ShapeError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {value!r}.")
 
 
+@without_autocast
 def convolve_time(
     x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero", method: Method = "auto"
 ) -> Tensor:
@@ -93,9 +95,25 @@ def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
     # Twice the bins hold every lag in (-bins, bins) without wrapping into the window: at least bins + taps - 1 if the
     # lags lie on one side, and one side does not reach the other.
     length = bins if boundary == "periodic" else _good_length(2 * bins + taps)
-    spectrum = torch.fft.rfft(rows.to(torch.float64), n=length) * torch.fft.rfft(kernel.to(torch.float64), n=length)
-    y: Tensor = torch.fft.irfft(spectrum, n=length).roll(first, -1)
-    return y[..., :bins].to(rows.dtype)
+    transfer = torch.fft.rfft(kernel.to(torch.float64), n=length)
+    y = filter_rows(rows.to(torch.float64), transfer, length)
+    return y.roll(first, -1)[..., :bins].to(rows.dtype)
+
+
+def filter_rows(rows: Tensor, transfer: Tensor, length: int) -> Tensor:
+    """Rows (..., T), float64, times a transfer function, (..., length): results that rounding has put below zero are 0.
+
+    A transform leaves 1e-17 of either sign where there is no light, and a negative rate is none that a detector could
+    draw from. The gradient is that of the transform alone.
+    """
+    if rows.numel() == 0:
+        return rows.new_zeros(*rows.shape[:-1], length)
+    y: Tensor = torch.fft.irfft(torch.fft.rfft(rows, n=length) * transfer, n=length)
+    # the rounding of a transform is about eps log2(length) of the length of the row (Higham, chapter 24)
+    scale = torch.linalg.vector_norm(rows.detach(), dim=-1, keepdim=True) * transfer.detach().abs().amax()
+    slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
+    value = y.detach()
+    return y - torch.where((value < 0) & (value >= -slack), value, 0.0)
 
 
 def _good_length(length: int) -> int:

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient._collection import no_collection
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
 from torchtransient.plugins.integrators.base import Pass
 
@@ -141,6 +142,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
     )
 
 
+@no_collection()
 def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[_PilotLane, int]:
     """The filled lane, and the largest number of events of a path, which may be more than it had slots for."""
     sampler = sensor.sampler().clone()

@@ -1,0 +1,363 @@
+"""What the first users of the sensors met: broken numbers, extreme light, states that travel, losses on batches."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient import losses, sensing
+from torchtransient.errors import ShapeError, UnitError
+
+PS = 1e-12
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def light(*shape, dtype=torch.float64, seed=0):
+    return torch.rand(shape, dtype=dtype, generator=generator(seed))
+
+
+def with_nan(shape=(1, 1, 12, 2, 3), value=math.nan):
+    x = 0.1 + light(*shape)
+    x[..., 5, 0, 0] = value
+    return x
+
+
+# --------------------------------------------------------------------------------------------- NaN is never a number
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -0.2])
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        sensing.SynchronousSPAD(50),
+        sensing.SynchronousSPAD(50, dead_time_s=70 * PS, bin_width_s=20 * PS),
+        sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS),
+        sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS, kind="paralyzable"),
+        sensing.BinaryFrames(50),
+        sensing.ShotNoise(),
+    ],
+    ids=["first photon", "dead time", "free", "paralyzable", "frames", "shot"],
+)
+def test_no_draw_from_what_is_no_rate(sensor, value):
+    """torch.binomial does not return from a NaN count, and takes a negative probability for zero."""
+    with pytest.raises(UnitError, match="expected finite"):
+        sensor.sample(with_nan(value=value), generator())
+
+
+@pytest.mark.parametrize("policy", ["straight_through", "score"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_no_added_counts_of_what_is_no_count(policy, value):
+    for make in (
+        lambda: sensing.Crosstalk(0.05, grad=policy),
+        lambda: sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, bin_width_s=20 * PS, grad=policy),
+    ):
+        with pytest.raises(UnitError, match="expected finite counts"), sensing.ScoreFunction():
+            make()(with_nan(value=value), generator())
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [
+        sensing.peak_position,
+        lambda h: sensing.peak_position(h, refine=False),
+        sensing.soft_argmax,
+        sensing.centre_of_mass,
+        lambda h: sensing.centre_of_mass(h, half_width_bins=2),
+        lambda h: sensing.first_return(h, 5.0).position.squeeze(-3),
+        lambda h: sensing.multi_return(h, 1, threshold=0.1).position.squeeze(-3),
+        lambda h: sensing.coates(h, 1000).rate.sum(-3),
+    ],
+    ids=["peak", "bin", "soft", "mass", "mass near", "first", "multi", "coates"],
+)
+def test_depth_of_nan_is_nan(estimate):
+    found = estimate(with_nan())
+    assert bool(found[..., 0, 0].isnan().all())
+    assert int(found.isnan().sum()) == 1
+
+
+@pytest.mark.parametrize("code", [None, sensing.hamiltonian_code(3)], ids=["fourier", "by shape"])
+def test_phase_of_nan_is_nan(code):
+    taps = 0.1 + light(1, 3, 2, 3)
+    taps[0, 1, 0, 0] = math.nan
+    reading = sensing.read_itof(taps, (40e6,), 3, code=code)
+    for value in (reading.phase, reading.amplitude, reading.confidence, reading.depth_m):
+        assert bool(value[..., 0, 0].isnan().all())
+        assert int(value.isnan().sum()) == 1
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        losses.poisson_nll,
+        lambda n, r: losses.first_photon_nll(n, r, 100),
+        lambda n, r: losses.free_running_nll(n, r, 100, 2.5),
+        lambda n, r: losses.read_noise_nll(n, r, 2.0),
+    ],
+    ids=["poisson", "first photon", "free running", "read noise"],
+)
+def test_loss_of_nan_is_nan(loss):
+    good = 0.1 + light(1, 12, 2, 3)
+    assert bool(torch.isfinite(loss(good, good)))
+    bad = good.clone()
+    bad[0, 5, 0, 0] = math.nan
+    assert bool(loss(bad, good).isnan())
+    assert bool(loss(good, bad).isnan())
+
+
+# ------------------------------------------------------------------------------------------------------ extreme light
+
+
+def test_paralyzable_detector_in_floods_of_light():
+    """Rates that fall by 1e3 from one bin to the next; against the integral by 2e4 midpoints."""
+    rate = torch.tensor([2000.0, 3.0, 0.5, 0.0, 0.01, 800.0, 1.0, 0.2], dtype=torch.float64)
+    dead = 2.3
+    fine = (torch.arange(8 * 20000, dtype=torch.float64) + 0.5) / 20000
+    edges = torch.nn.functional.pad(rate.cumsum(0), (1, 0))
+    total = float(edges[-1])
+
+    def flux(t):
+        turn = torch.floor(t / 8)
+        t = t - 8 * turn
+        k = t.floor().long().clamp(0, 7)
+        return turn * total + edges[k] + (t - k) * rate[k]
+
+    density = rate[fine.floor().long()] * torch.exp(-(flux(fine) - flux(fine - dead)))
+    wanted = density.view(8, 20000).mean(1)
+    x = rate.view(1, 8, 1, 1).clone().requires_grad_()
+    found = sensing.paralyzable_histogram(x, dead)
+    torch.testing.assert_close(found.flatten().detach(), wanted, rtol=1e-4, atol=1e-6)
+    found.sum().backward()
+    assert bool(torch.isfinite(x.grad).all())
+
+
+def test_darkness_behind_a_transform_is_dark():
+    """A transform leaves 1e-17 of either sign; detectors and likelihoods take neither for a rate."""
+    axis = tt.TimeAxis.from_seconds(0.0, 10 * PS, 512)
+    x = torch.zeros(1, 512, 2, 2, dtype=torch.float64)
+    x[:, 100] = 3.0
+    response = sensing.ImpulseResponse(sensing.emg_response(60 * PS, 80 * PS), axis, method="fft")
+    rate = response(x)
+    afterpulsing = sensing.Afterpulsing(0.02, 200 * PS, 300 * PS, axis=axis)
+    spad = sensing.SynchronousSPAD(1000)
+    mean = afterpulsing(spad.expected(rate))
+    assert float(rate.min()) == 0.0
+    assert float(mean.min()) >= 0.0
+    counts = spad.sample(rate, generator())
+    assert bool(torch.isfinite(losses.poisson_nll(counts, mean)))
+    # what is negative stays negative, and sums and the transpose are those of the plain transform
+    torch.testing.assert_close(response(-x), -rate, rtol=0, atol=1e-14)
+    u, v = light(1, 512, 1, 1) - 0.5, light(1, 512, 1, 1, seed=1) - 0.5
+    there, back = (response(u) * v).sum(), (u * sensing.adjoint(response, v, v.shape)).sum()
+    torch.testing.assert_close(there, back, rtol=1e-12, atol=1e-12)
+
+
+def test_a_billion_frames():
+    """Mean and variance of N = 1e9 binary frames in float32: 2e4 draws know the variance to 1 %, 5 sigma are 5 %."""
+    frames, mean = 10**9, 0.4
+    p = -math.expm1(-mean)
+    counts = sensing.BinaryFrames(frames).sample(torch.full((1, 20000, 1, 1), mean), generator()).double()
+    sigma = math.sqrt(frames * p * (1 - p))
+    assert abs(float(counts.mean()) - frames * p) < 5 * sigma / math.sqrt(20000) + 2**-24 * frames
+    assert abs(float(counts.var()) / sigma**2 - 1) < 5 * math.sqrt(2 / 20000)
+
+
+def test_empty_batches_pass():
+    axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 12)
+    x = torch.zeros(0, 1, 12, 2, 3)
+    for sensor in (
+        sensing.ImpulseResponse(sensing.GaussianResponse(50 * PS), axis, method="fft"),
+        sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, axis=axis),
+        sensing.FreeRunningSPAD(10, 70 * PS, axis=axis),
+    ):
+        assert sensor(x).shape == x.shape
+    reading = sensing.read_itof(torch.zeros(0, 1, 3, 2, 2), (40e6,), 3, code=sensing.hamiltonian_code(3))
+    assert reading.depth_m.shape == (0, 1, 2, 2)
+
+
+# --------------------------------------------------------------------------------------------------- states and chains
+
+
+def test_state_of_a_converter_travels_whole():
+    """Widths whose band begins elsewhere: the share matrix and its place follow."""
+    wide, narrow = torch.full((12,), 1.5), torch.full((12,), 0.6)
+    x = light(1, 12, 2, 2)
+    source, target = sensing.TDC(wide), sensing.TDC(narrow)
+    target.load_state_dict(source.state_dict())
+    assert torch.equal(target(x), source(x))
+    assert target.first == source.first
+
+
+def test_a_measured_response_has_bins_of_its_own():
+    """A response measured at 8 ps in a chain for 32 ps, behind a renderer."""
+    axis = tt.TimeAxis.from_seconds(0.0, 32 * PS, 40)
+    measured = sensing.MeasuredResponse(torch.tensor([0.0, 0, 3, 9, 5, 2, 1, 0, 0, 0, 0, 0]), 8 * PS)
+    chain = sensing.Compose([sensing.ImpulseResponse(measured, axis)])
+    chain.check_axis(axis)
+    with pytest.raises(UnitError, match="expected the axis"):
+        chain.check_axis(tt.TimeAxis.from_seconds(0.0, 8 * PS, 40))
+
+
+def test_transpose_can_be_trained_through():
+    """Gradients of |A^T y|^2 in y and in the width of the response, against finite differences."""
+    axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 16)
+    sensor = sensing.ImpulseResponse(sensing.GaussianResponse(60 * PS, learnable=True), axis)
+    y = light(1, 16, 1, 1).requires_grad_()
+
+    def energy(y, *_):
+        return sensing.adjoint(sensor, y, (1, 16, 1, 1)).square().sum()
+
+    assert torch.autograd.gradcheck(energy, (y, sensor.response.log_fwhm_s), rtol=1e-4)
+    with torch.no_grad():
+        assert not sensing.adjoint(sensor, y, (1, 16, 1, 1)).requires_grad
+    with torch.inference_mode():
+        inside = sensing.adjoint(sensor, y.clone(), (1, 16, 1, 1))
+    torch.testing.assert_close(inside, sensing.adjoint(sensor, y, (1, 16, 1, 1)).detach())
+
+
+def test_map_of_dark_counts_has_to_fit():
+    """A map for another sensor would have made a picture of its own size from one pixel."""
+    budget = sensing.PhotonBudget(
+        sensing.Optics(f_number=2.0),
+        pulse_energy_j=1e-9,
+        wavelength_m=532e-9,
+        repetition_rate_hz=1e7,
+        cycles=10,
+        dark_count_rate_hz=torch.full((4, 5), 100.0),
+        bin_width_s=20 * PS,
+    )
+    for shape in ((1, 8, 1, 1), (1, 8, 5, 4)):
+        with pytest.raises(ShapeError, match="expected an image"):
+            budget(torch.zeros(shape))
+    assert budget(torch.zeros(1, 8, 4, 5)).shape == (1, 8, 4, 5)
+
+
+def test_dead_time_is_looked_at_when_the_detector_is_made():
+    with pytest.raises(UnitError, match="expected at least half a bin"):
+        sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_leaves_physical_numbers_alone(dtype):
+    """A model goes to half precision as a whole: its network does, times and rates do not."""
+    response = sensing.GaussianResponse(60 * PS, delay_s=3333 * PS, learnable=True)
+    budget = sensing.PhotonBudget(
+        sensing.Optics(f_number=2.0),
+        pulse_energy_j=1e-9,
+        wavelength_m=532e-9,
+        repetition_rate_hz=1e6,
+        cycles=10,
+        dark_count_rate_hz=1e5,
+        bin_width_s=50 * PS,
+    )
+    network = torch.nn.Conv3d(1, 1, 1)
+    chain = sensing.Compose([budget, sensing.ImpulseResponse(response, bin_width_s=50 * PS), network])
+    model = torch.nn.Sequential(chain, sensing.FreeRunningSPAD(10, 75e-9, bin_width_s=1e-9)).to(dtype)
+    assert network.weight.dtype == dtype
+    assert float(response.fwhm_s.detach()) == pytest.approx(60e-12, rel=1e-12)
+    assert float(response.delay_s.detach()) == pytest.approx(3333e-12, rel=1e-12)
+    assert float(budget.dark_count_rate_hz) == 1e5
+    assert float(model[1].dead_time_s) == pytest.approx(75e-9, rel=1e-12)
+    response.float()
+    assert response.log_fwhm_s.dtype == torch.float32
+
+
+def test_parameters_that_ran_away_are_named():
+    for value, words in ((math.nan, "expected finite parameters"), (-2.0, "at most .* bins")):
+        response = sensing.GaussianResponse(60 * PS, learnable=True)
+        torch.nn.init.constant_(response.log_fwhm_s, value)
+        with pytest.raises(UnitError, match=words):
+            sensing.ImpulseResponse(response, bin_width_s=20 * PS)(torch.zeros(1, 4, 1, 1))
+
+
+AXIS = tt.TimeAxis.from_seconds(0.0, 50 * PS, 8)
+HISTOGRAM = torch.ones(1, 8, 2, 3)
+
+
+@pytest.mark.parametrize(
+    "call, error, words",
+    [
+        (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ShapeError, "MeasuredResponse"),
+        (lambda: sensing.ComposedResponse([60e-12]), ShapeError, "GaussianResponse"),
+        (
+            lambda: sensing.PhotonBudget(
+                2.0, pulse_energy_j=1e-9, wavelength_m=532e-9, repetition_rate_hz=1e6, cycles=1, axis=AXIS
+            ),
+            UnitError,
+            "Optics",
+        ),
+        (lambda: sensing.ShotNoise("straight_through")(HISTOGRAM, generator=0), UnitError, "manual_seed"),
+        (lambda: sensing.Compose(sensing.ShotNoise()), ShapeError, r"\[\]"),
+        (lambda: sensing.SynchronousSPAD(10, gate=[0.0, 1.0]), ShapeError, "list"),
+        (lambda: sensing.ItofCorrelation("sine", (20e6,), AXIS), UnitError, "sine_code"),
+        (lambda: sensing.ItofCorrelation(sensing.sine_code(4), (20e6,), 50e-12), UnitError, "from_seconds"),
+        (lambda: sensing.GatedIntegration([1e-9], 1e-9, 50e-12), UnitError, "from_seconds"),
+        (lambda: sensing.distance_of_position(torch.ones(1, 2, 3), 50e-12), UnitError, "from_seconds"),
+        (
+            lambda: sensing.log_matched_filter(HISTOGRAM, sensing.GaussianResponse(1e-10).kernel(5e-11)),
+            ShapeError,
+            "first, kernel",
+        ),
+        (lambda: sensing.first_return(HISTOGRAM, torch.ones(8)), ShapeError, "threshold"),
+        (lambda: sensing.centre_of_mass(HISTOGRAM, background=torch.ones(1, 1, 2, 3)), ShapeError, "background"),
+        (lambda: losses.poisson_nll(HISTOGRAM.numpy(), HISTOGRAM), ShapeError, "ndarray"),
+    ],
+)
+def test_what_first_users_get_wrong_is_named(call, error, words):
+    with pytest.raises(error, match=f"expected .*{words}"):
+        call()
+
+
+# -------------------------------------------------------------------------------------------------------------- losses
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [losses.poisson_nll, lambda n, r, **k: losses.first_photon_nll(n, r, 10**6, **k)],
+    ids=["poisson", "first photon"],
+)
+def test_items_of_a_batch_do_not_touch(loss):
+    """A bright item next to a dim one: losses and gradients are those of each alone."""
+    mean = light(2, 1, 12, 2, 2) * torch.tensor([100.0, 1e-3], dtype=torch.float64).view(2, 1, 1, 1, 1)
+    counts = torch.poisson(mean * 10, generator=generator())
+
+    def both(r, n):
+        leaf = r.clone().requires_grad_()
+        value = loss(n, leaf, reduction="none")
+        return value.detach(), torch.autograd.grad(value.sum(), leaf)[0]
+
+    together = both(mean, counts)
+    for i in range(2):
+        for whole, alone in zip(together, both(mean[i : i + 1], counts[i : i + 1]), strict=True):
+            torch.testing.assert_close(whole[i : i + 1], alone, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_loss_of_half_precision_is_single(dtype):
+    """A network under autocast: 1e3 counts have a square that float16 cannot hold. 8 bits of the mean: 2 %."""
+    counts, mean = torch.full((1, 4, 1, 1), 1000.0), torch.full((1, 4, 1, 1), 3.0, dtype=dtype, requires_grad=True)
+    for loss in (losses.poisson_nll, lambda n, m: losses.read_noise_nll(n, m, 2.0)):
+        value = loss(counts, mean)
+        wanted = loss(counts.double(), mean.detach().double())
+        assert value.dtype == torch.float32
+        assert float(value.detach()) == pytest.approx(float(wanted), rel=0.02)
+        assert bool(torch.isfinite(torch.autograd.grad(value, mean)[0]).all())
+
+
+def test_floor_of_an_item_in_the_dark_is_usable():
+    mean = torch.stack([torch.ones(1, 4, 2, 2), torch.zeros(1, 4, 2, 2)]).requires_grad_()
+    loss = losses.poisson_nll(torch.ones_like(mean), mean, reduction="sum")
+    loss.backward()
+    assert bool(torch.isfinite(loss)) and float(mean.grad.abs().max()) < 1e4
+
+
+def test_counts_below_zero_keep_their_weight():
+    """A normal surrogate goes below 0: the mean loss over +n and -n is that of no counts."""
+    mean = 0.1 + light(1, 6, 1, 1)
+    pair = [losses.poisson_nll(sign * torch.full_like(mean, 0.5), mean, floor=0.0) for sign in (1, -1)]
+    torch.testing.assert_close(sum(pair) / 2, losses.poisson_nll(torch.zeros_like(mean), mean, floor=0.0))
