@@ -11,7 +11,7 @@ from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, free_running_state, nonparalyzable_histogram
 from torchtransient.sensing.banded_solve import solve_banded
 from torchtransient.sensing.constant_light import ConstantLight
-from torchtransient.sensing.exponential_moments import decay_moment, hit_moment
+from torchtransient.sensing.exponential_moments import moments
 from torchtransient.sensing.free_running import state_image
 from torchtransient.sensing.free_running_draws import BinChances, bin_chances, draw_path
 from torchtransient.sensing.krylov import gmres
@@ -54,11 +54,12 @@ def test_moments_of_exponentials():
     x = double([0.0, 1e-12, 1e-3, 0.5, 0.999999, 1.0, 1.000001, 7.0, 40.0])
     for power in (0, 1):
         decayed = torch.exp(-x[:, None] * z)
-        torch.testing.assert_close(decay_moment(power, x), (w * z**power * decayed).sum(-1), rtol=1e-13, atol=0)
+        torch.testing.assert_close(moments(x).decay[power], (w * z**power * decayed).sum(-1), rtol=1e-13, atol=0)
         hit = torch.where(x[:, None] > 0, -torch.expm1(-x[:, None] * z) / x[:, None].clamp_min(1e-300), z)
-        torch.testing.assert_close(hit_moment(power, x), (w * z**power * hit).sum(-1), rtol=1e-13, atol=0)
-        for moment in (decay_moment, hit_moment):
-            assert torch.autograd.gradcheck(lambda v, m=moment, p=power: m(p, v), x[2:].clone().requires_grad_())
+        torch.testing.assert_close(moments(x).hit[power], (w * z**power * hit).sum(-1), rtol=1e-13, atol=0)
+    assert torch.autograd.gradcheck(
+        lambda v: (*moments(v).decay, *moments(v).hit), double([1e-3, 0.5, 7.0, 40.0]).requires_grad_()
+    )
 
 
 @pytest.mark.parametrize("flux", FLUXES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -11,33 +12,24 @@ _TERMS = 20  # of the series, used below 1: the last is under 1e-19
 _SERIES_BELOW = 1.0
 
 
-def decay_moment(power: int, x: Tensor) -> Tensor:
-    """Integral over z from 0 to 1 of z^power exp(-x z), power 0 or 1, x >= 0, float64."""
-    small, near, far = _ranges(x)
-    decayed = torch.exp(-far)
-    closed = (1 - decayed) / far if power == 0 else (1 - (1 + far) * decayed) / far**2
-    weights = [1 / (math.factorial(n) * (n + power + 1)) for n in range(_TERMS)]
-    return torch.where(small, _alternating(weights, near), closed)
+@dataclass(frozen=True)
+class Moments:
+    """Integrals over z from 0 to 1: of z^power exp(-x z), and of z^power (1 - exp(-x z)) / x, for powers 0 and 1."""
+
+    decay: tuple[Tensor, Tensor]
+    hit: tuple[Tensor, Tensor]
 
 
-def hit_moment(power: int, x: Tensor) -> Tensor:
-    """Integral over z from 0 to 1 of z^power (1 - exp(-x z)) / x, power 0 or 1, x >= 0, float64."""
-    small, near, far = _ranges(x)
-    decayed = torch.exp(-far)
-    missed = (1 - decayed) / far if power == 0 else (1 - (1 + far) * decayed) / far**2
-    closed = (1 / (power + 1) - missed) / far
-    weights = [1 / (math.factorial(n + 1) * (n + power + 2)) for n in range(_TERMS)]
-    return torch.where(small, _alternating(weights, near), closed)
-
-
-def _ranges(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the series is used, and x with harmless values where it, or the closed form, is not."""
+def moments(x: Tensor) -> Moments:
+    """For x >= 0, float64. One of them is a series where x is small; the others follow by parts, adding up only."""
     small = x < _SERIES_BELOW
-    return small, torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
-
-
-def _alternating(weights: list[float], x: Tensor) -> Tensor:
-    total = torch.full_like(x, weights[-1])
+    near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
+    weights = [1 / (math.factorial(n + 1) * (n + 3)) for n in range(_TERMS)]
+    series = torch.full_like(x, weights[-1])
     for weight in reversed(weights[:-1]):
-        total = weight - x * total
-    return total
+        series = weight - near * series
+    closed = (0.5 - (1 - (1 + far) * torch.exp(-far)) / far**2) / far
+    hit_1 = torch.where(small, series, closed)
+    decay_1 = torch.where(small, 0.5 - near * series, (1 - (1 + far) * torch.exp(-far)) / far**2)
+    decay_0 = torch.exp(-x) + x * decay_1
+    return Moments((decay_0, decay_1), (decay_0 - decay_1, hit_1))

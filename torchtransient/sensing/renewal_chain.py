@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchtransient.sensing.exponential_moments import decay_moment, hit_moment
+from torchtransient.sensing.exponential_moments import moments
 
 # exp(+-x) of the running sums stays inside float64 below this flux; beyond, sums are made in blocks
 _SAFE_EXPONENT = 600.0
@@ -52,17 +52,13 @@ def bin_response(rate: Tensor, part: Tensor) -> BinResponse:
         old = (2 * first + 1) * rest[0] - 2 * rest[1]
         return torch.stack([near[0], _ROOT * young, rest[0], _ROOT * old], 1)
 
-    x = rate * first
-    kept = parts(
-        (first * decay_moment(0, x), first**2 * decay_moment(1, x)), (decay_moment(0, rate), decay_moment(1, rate))
-    )
-    waited = parts(
-        (first**2 * hit_moment(0, x), first**3 * hit_moment(1, x)), (hit_moment(0, rate), hit_moment(1, rate))
-    )
+    near, over = moments(rate * first), moments(rate)
+    kept = parts((first * near.decay[0], first**2 * near.decay[1]), over.decay)
+    waited = parts((first**2 * near.hit[0], first**3 * near.hit[1]), over.hit)
     one = torch.ones(1, 1, dtype=rate.dtype, device=rate.device)
     count = parts((first * one, first**2 * one / 2), (one, one / 2))
     place = parts((first**2 * one / 2, first**3 * one / 3), (one / 2, one / 3))
-    wait, decay = decay_moment(0, rate), torch.exp(-rate)
+    wait, decay = over.decay[0], torch.exp(-rate)
     return BinResponse(
         kept=kept,
         waited=waited,
