@@ -68,8 +68,7 @@ def add_afterpulses(
         gain, length = torch.fft.rfft(near), 2 * bins
     # rows of time next to each other: the copy costs less than a transform that strides
     rows = counts.movedim(TIME, -1).contiguous().to(torch.float64)
-    wide = filter_rows(rows, gain, length)
-    added = wide[..., :bins].movedim(-1, TIME).contiguous().to(counts.dtype)
+    added = filter_rows(rows, gain, length, 0, bins).movedim(-1, TIME).contiguous().to(counts.dtype)
     return added if only_added else counts + added
 
 

@@ -96,19 +96,18 @@ def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
     # lags lie on one side, and one side does not reach the other.
     length = bins if boundary == "periodic" else _good_length(2 * bins + taps)
     transfer = torch.fft.rfft(kernel.to(torch.float64), n=length)
-    y = filter_rows(rows.to(torch.float64), transfer, length)
-    return y.roll(first, -1)[..., :bins].to(rows.dtype)
+    return filter_rows(rows.to(torch.float64), transfer, length, first, bins).to(rows.dtype)
 
 
-def filter_rows(rows: Tensor, transfer: Tensor, length: int) -> Tensor:
-    """Rows (..., T), float64, times a transfer function, (..., length): results that rounding has put below zero are 0.
+def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: int) -> Tensor:
+    """Rows (..., T), float64, times a transfer function, circular in `length`, moved by `first`: (..., keep).
 
-    A transform leaves 1e-17 of either sign where there is no light, and a negative rate is none that a detector could
-    draw from. The gradient is that of the transform alone.
+    Results that rounding has put below zero are 0: a transform leaves 1e-17 of either sign where there is no light, and
+    a negative rate is none that a detector could draw from. The gradient is that of the transform alone.
     """
     if rows.numel() == 0:
-        return rows.new_zeros(*rows.shape[:-1], length)
-    y: Tensor = torch.fft.irfft(torch.fft.rfft(rows, n=length) * transfer, n=length)
+        return rows.new_zeros(*rows.shape[:-1], keep)
+    y: Tensor = torch.fft.irfft(torch.fft.rfft(rows, n=length) * transfer, n=length).roll(first, -1)[..., :keep]
     # the rounding of a transform is about eps log2(length) of the length of the row (Higham, chapter 24)
     scale = torch.linalg.vector_norm(rows.detach(), dim=-1, keepdim=True) * transfer.detach().abs().amax()
     slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
