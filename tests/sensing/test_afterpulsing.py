@@ -212,3 +212,14 @@ def test_draws_do_not_depend_on_the_number_of_threads(make):
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+@pytest.mark.parametrize("make", [lambda: Crosstalk(0.01), lambda: Afterpulsing(0.01, 30e-10, 0.0, bin_width_s=1e-10)])
+@pytest.mark.parametrize("level", [50.0, 50.5])
+def test_half_precision_images_whose_sum_overflows(make, level):
+    """Whole counts and means alike; the sum of all is beyond float16."""
+    x = torch.full((1, BINS, 32, 32), level, dtype=torch.float16)
+    y = make().sample(x, torch.Generator().manual_seed(0))
+    assert y.dtype == torch.float16
+    added, mean = float((y.float() - x.float()).mean()), float(make().extra(x.float()).mean())
+    assert added == pytest.approx(mean, abs=0.02)

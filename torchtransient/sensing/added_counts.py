@@ -64,7 +64,8 @@ class AddedCounts(RandomSensor):
             return self.trigger(counts, generator).to(x.dtype)
 
     def _total(self, counts: Tensor) -> float:
-        total = float(counts.sum(dtype=torch.float64))
+        # float64 would copy all of it, half precision would overflow
+        total = float(counts.sum(dtype=torch.promote_types(counts.dtype, torch.float32)))
         if not math.isfinite(total):
             raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
         return total

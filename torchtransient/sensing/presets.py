@@ -162,7 +162,8 @@ _SINGLE_PHOTON = (
             "lies within 10 bins, here six standard deviations of 1 ns fwhm",
             "Public frames of a VL53L8 by sidsoma (MIT licence, 2025): 4 x 4 zones of 128 bins, some 40 of them "
             "filled; by the driver the chip hands out at most 75 bins of 16 zones at a time",
-            "assumed: pulse and jitter together 1 ns; dead time 10 ns; 15 % efficiency; 0.2 nJ at 5 MHz, 2e5 cycles; "
+            "assumed: pulse and jitter together 1 ns; dead time 10 ns of a zone as one detector, "
+            "which overstates its pile-up; 15 % efficiency; 0.2 nJ at 5 MHz, 2e5 cycles; "
             "crosstalk 0.5 %; f/2, transmission 0.6, a zone of 100 SPADs of 10 um (1e-8 m2); 1e6 ambient photons and "
             "1e4 dark counts per second",
         ),
@@ -186,7 +187,8 @@ _SINGLE_PHOTON = (
             "echo of a wall in one of them, median of fits to nine zones: core of 129 ps, tails of 103 ps in 75 % and "
             "of 549 ps in 24 % of the light, 1.1 to 1.6 % of the peak left over (rms)",
             "Public drivers: 537 x 1024 = 549888 pulses per measurement by default",
-            "assumed: 940 nm; dead time 10 ns; 15 % efficiency; 0.2 nJ at 20 MHz; f/2, transmission 0.6, a zone of "
+            "assumed: 940 nm; dead time 10 ns of a zone as one detector, which overstates its pile-up; "
+            "15 % efficiency; 0.2 nJ at 20 MHz; f/2, transmission 0.6, a zone of "
             "100 SPADs of 10 um (1e-8 m2); 1e6 ambient photons and 1e4 dark counts per second; no crosstalk",
         ),
         stages=(
