@@ -31,25 +31,18 @@ def pulse_image(bins: int, size: int, flux: float) -> Tensor:
     return (flux * shape).unsqueeze(0)
 
 
-def all_effects(bins: int, size: int, cycles: int) -> Callable[[Tensor, torch.Generator], Tensor]:
-    """The chain of modules from rates to counts."""
+def effects(bins: int, size: int, cycles: int) -> tuple[Tensor, list[sensing.Sensor]]:
+    """Dark counts per cycle and bin, and the modules from rates to counts."""
     width_s = 50e-12
     g = torch.Generator().manual_seed(0)
     dark = sensing.hot_pixel_rates(size, size, median_hz=1e3, generator=g).float() * width_s
-    chain = [
+    chain: list[sensing.Sensor] = [
         sensing.TDC(sensing.random_code_widths(bins, 0.05, g), dither=True),
         sensing.SynchronousSPAD(cycles, gate=torch.linspace(0, 1, bins).mul(20).clamp(max=1), grad="straight_through"),
         sensing.Afterpulsing(0.01, 30e-9, 75e-9, bin_width_s=width_s, period_s=100e-9, grad="straight_through"),
         sensing.Crosstalk(0.005, grad="straight_through"),
     ]
-
-    def run(rate: Tensor, generator: torch.Generator) -> Tensor:
-        x = rate + dark
-        for module in chain:
-            x = module(x, generator=generator)
-        return x
-
-    return run
+    return dark, chain
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -68,15 +61,27 @@ def spread(values: list[float]) -> dict[str, float]:
 def synchronous(bins: int, size: int, cycles: int, repeats: int) -> dict[str, object]:
     """Chain and torch.poisson in turns."""
     rate = pulse_image(bins, size, 0.3)
-    run = all_effects(bins, size, cycles)
+    dark, chain = effects(bins, size, cycles)
+    converter, _, afterpulses, crosstalk = chain
     g = torch.Generator().manual_seed(1)
+
+    def run() -> Tensor:
+        x = rate + dark
+        for module in chain:
+            x = module(x, generator=g)
+        return x
+
     with torch.no_grad():
         mean = sensing.SynchronousSPAD(cycles).expected(rate)
         pile_up = sensing.SynchronousSPAD(cycles, grad="straight_through")
+        counts = pile_up(rate, generator=g)
         cases = {
-            "all effects, sampled": lambda: run(rate, g),
+            "all effects, sampled": run,
             "pile-up alone, sampled": lambda: pile_up(rate, generator=g),
             "pile-up alone, expected": lambda: pile_up.expected(rate),
+            "converter": lambda: converter(rate),
+            "afterpulses, sampled": lambda: afterpulses(counts, generator=g),
+            "crosstalk, sampled": lambda: crosstalk(counts, generator=g),
             "torch.poisson": lambda: torch.poisson(mean, generator=g),
         }
         times: dict[str, list[float]] = {name: [] for name in cases}

@@ -16,7 +16,8 @@ from torchtransient.sensing.thinning import sixteen_bits, thin
 _EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 _BLOCK = 1 << 15  # entries at a time, so that temporaries stay in the cache
-_CELLS = 1 << 16  # values of a 16 bit number
+_VALUES = 1 << 16  # of a 16 bit number
+_CELLS = 1 << 12  # of the table that they are looked up in: small enough to make for every call
 
 
 def add_crosstalk(
@@ -134,7 +135,7 @@ class _Neighbours:
         edges = (chance.cumsum(0) / chance.sum())[:-1]
         self._edges = edges.to(device)
         self._steps = steps
-        # by the first 16 bits of the uniform number: the step to the only neighbour, 0 if they do not tell
+        # by the first 12 bits of the uniform number: the step to the only neighbour, 0 if they do not tell
         starts = torch.arange(_CELLS + 1, dtype=torch.float64) / _CELLS
         first = torch.bucketize(starts[:-1], edges, right=True) + 1
         last = torch.bucketize(starts[1:], edges) + 1
@@ -146,11 +147,11 @@ class _Neighbours:
     def reached(self, start: Tensor, generator: torch.Generator | None) -> list[Tensor]:
         """Flat indices reached from detections at `start` (K,), in several tensors."""
         bits = sixteen_bits(start, generator)
-        step = self._only[bits.long().bitwise_and_(_CELLS - 1)]
+        step = self._only[bits.long().bitwise_and_(_VALUES - 1).bitwise_right_shift_(4)]
         unsure = (step == 0).nonzero().squeeze(-1)
-        cell = bits[unsure].double().add_(_CELLS / 2)
+        value = bits[unsure].double().add_(_VALUES / 2)
         u = torch.rand(unsure.shape, dtype=torch.float64, device=start.device, generator=generator)
-        subset = torch.bucketize(cell.add_(u).div_(_CELLS), self._edges, right=True) + 1
+        subset = torch.bucketize(value.add_(u).div_(_VALUES), self._edges, right=True) + 1
         origin = start[unsure]
         # a set that is not told yet points to the rim, which nobody sees
         found = [torch.where(step != 0, start + step, 0)]

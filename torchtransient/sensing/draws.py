@@ -21,6 +21,7 @@ from torchtransient.sensing.thinning import halve
 Result = TypeVar("Result")
 
 _PIECES = 4
+_SMALL_IMAGE = 1 << 12  # pixels, below which several images are drawn side by side
 _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs less than it saves
 WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
@@ -166,7 +167,7 @@ def _sample_tree(
         images = [_distribute(trials, image, chance, own) for image in piece]
         return torch.stack(images) if len(images) > 1 else images[0].unsqueeze(0)
 
-    if columns.shape[0] > 1 and pixels < 4 * columns.shape[0]:
+    if columns.shape[0] > 1 and pixels < _SMALL_IMAGE:
         # many small images: one wide one instead
         wide = columns.movedim(1, 0).reshape(1, bins, -1)
         counts = _in_columns(draw, wide, generator).view(bins, -1, pixels).movedim(0, 1)

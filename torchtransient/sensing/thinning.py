@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+_WORTH_TOSSING = 1 << 15  # draws, below which many short operations cost more than they save
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _ROOM = 2e-6  # for the rounding of probabilities and uniform numbers in single precision
 _HEAVY = 6.0  # expected events of an entry, above which torch.binomial is cheaper than inversion
@@ -141,13 +142,13 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
     """How many of `counts` go to the first of two places that gets each with probability `share`: binomial.
 
     No gradient. Exact for any share in [0, 1], cheap for counts below about 60 and shares near one half; other draws,
-    and all draws on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype, float32 or
-    float64.
+    few draws, and all draws on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype,
+    float32 or float64.
 
     A fair coin is tossed for every count; those on the side that is too unlikely are turned with |2 share - 1|.
     """
     n, p = counts.detach(), share.detach()
-    if n.device.type != "cpu":
+    if n.device.type != "cpu" or n.numel() < _WORTH_TOSSING:
         return torch.binomial(n, p.contiguous(), generator=generator)
     flat, shares = n.reshape(-1), p.reshape(-1)
     out = torch.empty_like(flat)
