@@ -66,15 +66,30 @@ def test_cuda_gives_the_same(entry):
             assert value.is_cuda
 
 
+class Mean(torch.nn.Module):
+    """The mean of a module as a `forward`, so that its parameters can be handed in."""
+
+    def __init__(self, module):
+        super().__init__()
+        self.module = module
+
+    def forward(self, x):
+        return tuple(p for p in parts(expected(self.module, x)) if p.is_floating_point() or p.is_complex())
+
+
 @each
 def test_gradcheck_of_the_expectation(entry):
-    module, x = entry.module(), entry.x()[:1].requires_grad_()
-    learnable = [p for p in module.parameters() if p.requires_grad]
+    """Both modes, in the input and in every learnable parameter."""
+    mean, x = Mean(entry.module()), entry.x()[:1].requires_grad_()
+    learnable = {name: p.detach().requires_grad_() for name, p in mean.named_parameters() if p.requires_grad}
 
-    def f(x, *_):
-        return tuple(p for p in parts(expected(module, x)) if p.is_floating_point() or p.is_complex())
+    def f(x, *values):
+        return torch.func.functional_call(mean, dict(zip(learnable, values, strict=True)), (x,))
 
-    assert torch.autograd.gradcheck(f, (x, *learnable), atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True)
+    inputs = (x, *learnable.values())
+    assert torch.autograd.gradcheck(
+        f, inputs, atol=1e-6, rtol=1e-4, nondet_tol=1e-12, fast_mode=True, check_forward_ad=True
+    )
 
 
 # these look at their values

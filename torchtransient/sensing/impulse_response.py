@@ -244,6 +244,8 @@ class MeasuredResponse(Response):
 
     shares: Tensor
 
+    share_logits: Tensor
+
     def __init__(
         self,
         counts: Tensor,
@@ -274,7 +276,7 @@ class MeasuredResponse(Response):
 
     def _shares(self) -> Tensor:
         if self.learnable:
-            logits: Tensor = self.get_parameter("share_logits")
+            logits: Tensor = self.share_logits
             return logits.double().softmax(0)
         return self.shares.double()
 

@@ -88,15 +88,58 @@ def _adjoint(chain: RenewalChain, pi: Tensor, gradient: Tensor) -> Tensor:
     return found
 
 
+def _tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
+    """Solution of (1 - F) x = right with counts that sum to 0, for `right` whose counts do."""
+
+    def operator(v: Tensor) -> Tensor:
+        return v - chain.step(v) + pi * _counts(chain, v)
+
+    found, residual = gmres(operator, right, torch.zeros_like(right), _TOLERANCE, _constant(chain, pi).solve)
+    rows = (~(residual <= _ENOUGH)).nonzero().flatten()
+    if rows.numel():
+        hard, p, r = RenewalChain(chain.rate[rows], chain.whole, chain.part), pi[rows], right[rows]
+        direct = solve_banded(hard, r, p[:, : chain.bins].argmax(-1), transposed=False)
+        direct = direct - p * _counts(hard, direct)
+        _check((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1).clamp_min(1e-300))
+        found = found.index_copy(0, rows, direct)
+    return found
+
+
+def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Tensor, by_part: Tensor) -> Tensor:
+    """Derivative of one step of the chain from `pi` along changes of the rate and of the fraction of a bin.
+
+    Backward twice: the gradient is linear in its weights, and its derivative by these is the one looked for.
+    """
+    with torch.enable_grad():
+        leaves = rate.detach().requires_grad_(), part.detach().requires_grad_()
+        value = RenewalChain(leaves[0], whole, leaves[1]).step(pi)
+        weights = torch.zeros_like(value, requires_grad=True)
+        gradients = torch.autograd.grad(value, leaves, weights, create_graph=True)
+        along = (gradients[0] * by_rate).sum() + gradients[1] * by_part
+        return torch.autograd.grad(along, weights)[0]
+
+
 class _StationaryPhases(torch.autograd.Function):
-    """rate (P, T) and the fraction of a bin -> stationary lines; backward by the implicit function theorem."""
+    """rate (P, T) and the fraction of a bin -> stationary lines; both modes by the implicit function theorem."""
 
     @staticmethod
     def forward(ctx: Any, rate: Tensor, part: Tensor, whole: int) -> Tensor:
         ctx.whole = whole
         pi = torch.cat([_stationary(RenewalChain(r, whole, part)) for r in torch.split(rate, _PIXELS_AT_ONCE)])
         ctx.save_for_backward(rate, part, pi)
+        ctx.save_for_forward(rate, part, pi)
         return pi
+
+    @staticmethod
+    def jvp(ctx: Any, by_rate: Tensor | None, by_part: Tensor | None, _: None) -> Tensor:
+        rate, part, pi = ctx.saved_tensors
+        by_rate = torch.zeros_like(rate) if by_rate is None else by_rate
+        by_part = torch.zeros_like(part) if by_part is None else by_part
+        found = []
+        for r, p, d in zip(*(torch.split(rows, _PIXELS_AT_ONCE) for rows in (rate, pi, by_rate)), strict=True):
+            right = _step_along(r, ctx.whole, part, p, d, by_part)
+            found.append(_tangent(RenewalChain(r, ctx.whole, part), p, right))
+        return torch.cat(found)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
