@@ -1,0 +1,76 @@
+"""Values by plugin: what a kernel looks up for the BSDF, shape, emitter or medium that a lane points to.
+
+A pointer of Dr.Jit is the number that its registry gave the plugin, so a table is an array that is gathered from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# The pointer type of each kind of plugin, as names: types change with the variant.
+_POINTERS = {
+    "BSDF": "BSDFPtr",
+    "Emitter": "EmitterPtr",
+    "Medium": "MediumPtr",
+    "PhaseFunction": "PhaseFunctionPtr",
+    "Sensor": "SensorPtr",
+    "Shape": "ShapePtr",
+}
+
+
+def registry_number(plugin: Any) -> int:
+    """The number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own."""
+    for kind, pointer in _POINTERS.items():
+        if isinstance(plugin, getattr(mi, kind)):
+            return int(dr.reinterpret_array(mi.UInt32, getattr(mi, pointer)(plugin))[0])
+    raise TypeError(f"registry_number: expected one of {', '.join(_POINTERS)}, got {type(plugin).__name__}.")
+
+
+class PointerTable:
+    """One value per listed plugin, ``default`` for all others and for null pointers.
+
+    ``values``: a Dr.Jit array with one entry per plugin, or one entry for all of them; derivatives go through where it
+    is attached. Or a list of whole numbers. ``default``: a Python number. A plugin that is listed twice takes its last
+    value. Build tables outside of loops.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(self, plugins: Sequence[Any], values: Any, default: float = 0) -> None:
+        numbers = [registry_number(plugin) for plugin in plugins]
+        size = 1 + max(numbers, default=0)
+        self.default = default
+        if dr.is_array_v(values):
+            self.values = dr.full(type(values), default, size)
+            if numbers:
+                dr.scatter(self.values, values, mi.UInt32(numbers))
+        else:
+            # Laid out here, it needs no kernel of its own.
+            entries = np.full(size, default, dtype=np.uint32)
+            entries[numbers] = values
+            self.values = mi.UInt32(entries)
+            dr.make_opaque(self.values)
+
+    @staticmethod
+    def marking(plugins: Sequence[Any]) -> PointerTable | None:
+        """A table that only tells which plugins are listed, for :meth:`lists`; None when none is: kernels then hold
+        nothing of the question.
+        """
+        return PointerTable(plugins, [1] * len(plugins)) if plugins else None
+
+    def look_up(self, pointer: Any, active: Any = True) -> Any:
+        """The values of an array of pointers; ``default`` where ``active`` is false."""
+        number = dr.reinterpret_array(mi.UInt32, pointer)
+        known = mi.Mask(active) & (number < dr.width(self.values))
+        found = dr.gather(type(self.values), self.values, number, known)
+        # A masked gather answers zero by itself.
+        return found if self.default == 0 else dr.select(known, found, self.default)
+
+    def lists(self, pointer: Any, active: Any = True) -> Any:
+        """Which of an array of pointers are listed, in a table of :meth:`marking`."""
+        return self.look_up(pointer, active) == 1
