@@ -14,7 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.integrators.media.media_facts import is_open
+from torchtransient.plugins.transport.media_contents import is_open
 
 # Streams of random numbers that start from the same number must differ.
 WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import drjit as dr
@@ -11,18 +10,13 @@ import mitsuba as mi
 from torchtransient.errors import GradientError
 
 
-class MediaFacts:
-    """Static choices for the walks through media.
+class MediaContents:
+    """The participating media of a scene. Does not change once built.
 
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``emitter_sampling``: every medium allows connections to emitters.
-
-    For derivatives: ``recorded`` (the path is kept), ``legs_change`` (a transmittance can change), ``keeps_entry`` (the
-    boundary before a vertex is kept, since the vertex may move with it).
-
-    ``rate_floor`` (1 / m, None when no extinction is differentiated) is the smallest rate at which collisions are
-    sampled: where the density is zero, its derivative is not, and is found by collisions alone.
+    lines go through several media. ``emitter_sampling``: every medium allows connections to emitters. ``extent``: the
+    size of the scene in metres.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -35,25 +29,15 @@ class MediaFacts:
         self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
         self.open_boundaries = open_boundaries
         self.extent = extent
-        self.rate_floor = None
-        self.recorded = False
-        self.legs_change = False
-        self.keeps_entry = False
-        self.hide_emitters = False
 
-    def with_gradients(self, geometry: bool) -> MediaFacts:
-        """The same facts with the gradients that the media's attached parameters ask for; ``geometry``: path lengths
-        change.
-        """
-        media = copy.copy(self)
-        density = any(_density_attached(medium) for medium in self.media)
-        media.recorded = True
-        media.legs_change = geometry or density
-        media.keeps_entry = geometry and self.open_boundaries
-        if density:
-            # Opaque: as a literal, every change of the scene's size would compile another kernel.
-            media.rate_floor = dr.opaque(mi.Float, 0.5 / self.extent)
-        return media
+    @property
+    def one_stretch(self) -> bool:
+        """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
+        return not (self.heterogeneous or self.open_boundaries)
+
+    def density_attached(self) -> bool:
+        """Whether a parameter that changes an extinction carries gradients."""
+        return any(_density_attached(medium) for medium in self.media)
 
     def check_spheres(self, sphere_lights: bool) -> None:
         """Where path lengths change, spherical lights (``sphere_lights``) are sampled by connections alone, which every
@@ -65,14 +49,33 @@ class MediaFacts:
                 "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
             )
 
-    @property
-    def one_stretch(self) -> bool:
-        """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
-        return not (self.heterogeneous or self.open_boundaries)
+
+class FlightSettings:
+    """How the walks through media are made in one job: the contents, and what derivatives ask of them.
+
+    ``recorded``: the path is kept. ``extinction_changes``: a transmittance can change. ``keeps_entry``: the boundary
+    before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
+    differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
+    not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
+    """
+
+    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool):
+        self.at_sensor, self.emitter_sampling = contents.at_sensor, contents.emitter_sampling
+        self.homogeneous, self.heterogeneous = contents.homogeneous, contents.heterogeneous
+        self.open_boundaries, self.one_stretch = contents.open_boundaries, contents.one_stretch
+        self.hide_emitters = hide_emitters
+        self.recorded = wanted is not None
+        self.geometry = self.recorded and wanted.geometry
+        self.extinction_changes = self.recorded and (wanted.geometry or wanted.extinction)
+        self.keeps_entry = self.geometry and contents.open_boundaries
+        self.rate_floor = None
+        if self.recorded and wanted.extinction:
+            # Opaque: as a literal, every change of the scene's size would compile another kernel.
+            self.rate_floor = dr.opaque(mi.Float, 0.5 / contents.extent)
 
 
-def media_facts(scene: Any, sensor: Any) -> MediaFacts | None:
-    """The facts of a scene's media, None when it has none."""
+def media_of(scene: Any, sensor: Any) -> MediaContents | None:
+    """The media of a scene, None when it has none."""
     shapes = shapes_of_scene(scene)
     found = [sensor.get_medium() if sensor is not None else None]
     for shape in shapes:
@@ -83,7 +86,7 @@ def media_facts(scene: Any, sensor: Any) -> MediaFacts | None:
         return None
     box = scene.bbox()
     extent = float(dr.norm(box.extents())) if box.valid() else 1.0
-    return MediaFacts(list(media.values()), found[0], any(is_open(shape) for shape in shapes), max(extent, 1e-6))
+    return MediaContents(list(media.values()), found[0], any(is_open(shape) for shape in shapes), max(extent, 1e-6))
 
 
 def _density_attached(medium: Any) -> bool:
