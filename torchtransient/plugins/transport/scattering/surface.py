@@ -76,6 +76,7 @@ class Surface(Scattering):
         weight = self.upright(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
+            u_delay=vertex.u_delay,
             delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         )  # fmt: skip
         step.unconnected = step.delta
