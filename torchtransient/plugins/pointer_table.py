@@ -34,21 +34,21 @@ def registry_number(plugin: Any) -> int:
 class PointerTable:
     """One value per listed plugin, ``default`` for all others and for null pointers.
 
-    ``values``: a Dr.Jit array with one entry per plugin, or one entry for all of them; derivatives go through where it
-    is attached. Or a list of whole numbers. ``default``: a Python number. A plugin that is listed twice takes its last
-    value. Build tables outside of loops.
+    ``values``: one per plugin, a list of whole numbers or of Dr.Jit arrays of width one; derivatives go through where
+    those are attached. ``default``: a Python number. A plugin that is listed twice takes its last value. Build tables
+    outside of loops.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, plugins: Sequence[Any], values: Any, default: float = 0) -> None:
+    def __init__(self, plugins: Sequence[Any], values: Sequence[Any], default: float = 0) -> None:
         numbers = [registry_number(plugin) for plugin in plugins]
         size = 1 + max(numbers, default=0)
         self.default = default
-        if dr.is_array_v(values):
-            self.values = dr.full(type(values), default, size)
-            if numbers:
-                dr.scatter(self.values, values, mi.UInt32(numbers))
+        if values and dr.is_array_v(values[0]):
+            self.values = dr.full(type(values[0]), default, size)
+            for number, value in zip(numbers, values, strict=True):
+                dr.scatter(self.values, value, mi.UInt32(number))
         else:
             # Laid out here, it needs no kernel of its own.
             entries = np.full(size, default, dtype=np.uint32)

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.bsdfs.mueller import across_plane, metal_reflection
+from torchtransient.plugins.node_walk import objects_of
 
 _TEXTURES = ("eta", "k", "specular_reflectance")
 
@@ -24,7 +25,7 @@ class DiffConductor(mi.BSDF):
         mi.BSDF.__init__(self, props)
         given = {name: props[name] for name in ("material", *_TEXTURES) if name in props}
         # Materials are looked up by Mitsuba itself, so that the table and its spelling are the installed version's.
-        textures = _textures_of(mi.load_dict({"type": "conductor", **given}))
+        textures = dict(objects_of(mi.load_dict({"type": "conductor", **given})))
         self.eta, self.k, self.specular_reflectance = (textures[name] for name in _TEXTURES)
         self.m_components = [mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide]
         self.m_flags = self.m_components[0]
@@ -62,20 +63,6 @@ class DiffConductor(mi.BSDF):
 
     def to_string(self) -> str:
         return "DiffConductor[\n" + ",\n".join(f"  {name} = {getattr(self, name)}" for name in _TEXTURES) + "\n]"
-
-
-def _textures_of(bsdf: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-
-    class Callback(mi.TraversalCallback):
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            found[name] = value
-
-        put_object = put
-        put_value = put
-
-    bsdf.traverse(Callback())
-    return found
 
 
 register("bsdf", "diff_conductor", DiffConductor)

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.pointer_table import PointerTable, registry_number
 from torchtransient.plugins.polarized import faded
 
 DECAY_NODES = 4097
@@ -106,12 +107,9 @@ class DelayTable:
     """
 
     def __init__(self, bsdfs):
-        numbers = [_number(bsdf) for bsdf in bsdfs]
-        rows = np.zeros(max(numbers) + 1, dtype=np.uint32)
-        rows[numbers] = 1 + np.arange(len(bsdfs))
-        self._rows = mi.UInt32(rows)
-        self._late = mi.UInt32([_number(bsdf.nested) for bsdf in bsdfs])
-        self._at_once = mi.UInt32([_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
+        self._rows = PointerTable(bsdfs, range(1, len(bsdfs) + 1))
+        self._late = mi.UInt32([registry_number(bsdf.nested) for bsdf in bsdfs])
+        self._at_once = mi.UInt32([registry_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
         probabilities, decays = [], []
         for bsdf in bsdfs:
             elastic, late = (float(dr.slice(dr.detach(weight), 0)) for weight in bsdf.weights())
@@ -128,7 +126,7 @@ class DelayTable:
             self.lifetimes = _gathered([bsdf.lifetime for bsdf in bsdfs])
             self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in bsdfs])
             self.late_weights = _gathered([bsdf.weights()[1] for bsdf in bsdfs])
-        dr.make_opaque(self._rows, self._late, self._at_once, self._probability, self._decay_start, self._decay)
+        dr.make_opaque(self._late, self._at_once, self._probability, self._decay_start, self._decay)
 
     @property
     def shifts(self) -> bool:
@@ -141,14 +139,12 @@ class DelayTable:
 
     def answer(self, bsdf, u, wavelengths) -> Answer:
         """How surfaces with BSDFs ``bsdf`` answer, for two uniform numbers ``u``."""
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
-        known = number < dr.width(self._rows)
-        row = dr.gather(mi.UInt32, self._rows, number, known)
-        there = known & (row > 0)
+        row = self._rows.look_up(bsdf)
+        there = row > 0
         row = dr.select(there, row - 1, 0)
         p = dr.gather(mi.Float, self._probability, row, there)
         late = there & (u.x < p)
-        pointer = dr.select(late, dr.gather(mi.UInt32, self._late, row, late), number)
+        pointer = dr.select(late, dr.gather(mi.UInt32, self._late, row, late), dr.reinterpret_array(mi.UInt32, bsdf))
         pointer = dr.select(there & ~late, dr.gather(mi.UInt32, self._at_once, row, there), pointer)
         late_weight = dr.gather(mi.Float, self.late_weights, row, late) * dr.rcp(dr.select(late, p, 1))
         once_weight = dr.gather(mi.Float, self.elastic_weights, row, there) * dr.rcp(dr.select(late | ~there, 1, 1 - p))
@@ -186,10 +182,6 @@ def _gathered(values):
     for i, value in enumerate(values):
         dr.scatter(table, value, mi.UInt32(i))
     return table
-
-
-def _number(bsdf) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
 
 
 def delays_of(bsdfs):

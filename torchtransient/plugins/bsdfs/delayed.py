@@ -15,6 +15,7 @@ from torchtransient.plugins.bsdfs import delay_table
 from torchtransient.plugins.bsdfs.delay_table import SpectralShift
 from torchtransient.plugins.bsdfs.ior import opaque
 from torchtransient.plugins.films.pulsed_filter import numbers_of
+from torchtransient.plugins.parameter_effect import VALUE, ParameterEffect, declare_effects
 from torchtransient.pulses import Pulse
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -218,3 +219,11 @@ def _shift(props: Any) -> SpectralShift | None:
 
 
 register("bsdf", "delayed", DelayedBSDF)
+declare_effects(
+    DelayedBSDF,
+    {
+        "lifetime": ParameterEffect(moves_length=True, role="delay", trusted=True),
+        "quantum_yield": VALUE,
+        "elastic_fraction": VALUE,
+    },
+)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
 
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
@@ -118,3 +119,6 @@ class DiffDielectric(mi.BSDF):
 
 
 register("bsdf", "diff_dielectric", DiffDielectric)
+# Edges that are seen through the interface move with its index.
+_INDEX = ParameterEffect(moves_length=True, moves_silhouette=True, role="index", trusted=True)
+declare_effects(DiffDielectric, {"eta": _INDEX})

@@ -13,9 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
-
-# Transmits with a non-symmetric lobe, but the two sides of a fibre are the same medium.
-_NOT_AN_INTERFACE = ("Hair",)
+from torchtransient.plugins.mitsuba_compat import has_equal_sides
+from torchtransient.plugins.node_walk import bsdfs_below as bsdfs_below
+from torchtransient.plugins.node_walk import bsdfs_of_scene as bsdfs_of_scene
+from torchtransient.plugins.pointer_table import PointerTable
 
 
 class RefractionTable:
@@ -30,9 +31,8 @@ class RefractionTable:
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
-    def __init__(self, size: int, entries: list[tuple[int, Any]]) -> None:
-        self.size = size
-        self.entries = entries
+    def __init__(self, entries: list[tuple[Any, Any]]) -> None:
+        self._entries = entries
         self.refresh()
 
     @staticmethod
@@ -43,64 +43,29 @@ class RefractionTable:
         Raises SceneError for a blend of two refractive BSDFs with different indices, where a connection has no single
         optical length, and for a refractive plugin that does not expose ``eta``.
         """
-        size, entries = 1, []
-        for bsdf in bsdfs if bsdfs is not None else bsdfs_of_scene(scene):
-            number = int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
-            size = max(size, number + 1)
-            leaf = _refractive_leaf(bsdf)
-            if leaf is not None:
-                entries.append((number, leaf))
-        return RefractionTable(size, entries) if entries else None
+        found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
+        leaves = ((bsdf, _refractive_leaf(bsdf)) for bsdf in found)
+        entries = [(bsdf, leaf) for bsdf, leaf in leaves if leaf is not None]
+        return RefractionTable(entries) if entries else None
 
     def refresh(self) -> None:
         """Read the indices again; to be called outside of loops, once per render."""
         with dr.resume_grad():
-            table = dr.ones(mi.Float, self.size)
-            for number, leaf in self.entries:
-                dr.scatter(table, _index_of(leaf), mi.UInt32(number))
-        self.table = table
+            indices = [_index_of(leaf) for _, leaf in self._entries]
+            self._indices = PointerTable([bsdf for bsdf, _ in self._entries], indices, default=1)
+
+    @property
+    def table(self) -> Any:
+        """The indices as one array, attached where a plugin's is."""
+        return self._indices.values
 
     def relative_index(self, bsdf: Any, si: Any, wo: Any, active: Any = True) -> Any:
         """Index of the medium on ``wo``'s side over that on ``si.wi``'s side: 1 where both are on the same side.
 
         ``bsdf``: array of BSDF pointers; ``wo``: direction in the local frame of ``si``.
         """
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
-        crosses = active & (si.wi.z * wo.z < 0) & (number < self.size)
-        eta = dr.select(crosses, dr.gather(mi.Float, self.table, number, crosses), 1.0)
+        eta = self._indices.look_up(bsdf, active & (si.wi.z * wo.z < 0))
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))
-
-
-def bsdfs_of_scene(scene: Any) -> list[Any]:
-    """The outermost BSDFs of a scene, those of shape groups included, each once."""
-    shapes = scene.shapes()
-    if any(shape.class_name() == "Instance" for shape in shapes):
-        # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
-        return bsdfs_below(scene)
-    found = {bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
-    return list(found.values())
-
-
-def bsdfs_below(node: Any) -> list[Any]:
-    """The outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order."""
-    found: dict[int, Any] = {}
-    visited: set[int] = set()
-
-    class Callback(mi.TraversalCallback):
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if not isinstance(value, mi.Object) or value.ptr in visited:
-                return
-            visited.add(value.ptr)
-            if isinstance(value, mi.BSDF):
-                found[value.ptr] = value
-            else:
-                value.traverse(Callback())  # a callback cannot be entered twice
-
-        put_object = put
-        put_value = put
-
-    node.traverse(Callback())
-    return list(found.values())
 
 
 def _refractive_leaf(bsdf: Any) -> Any | None:
@@ -114,7 +79,7 @@ def _refractive_leaf(bsdf: Any) -> Any | None:
         nested = bsdfs_below(node)
         if nested:
             pending.extend(child for child in nested if _has_refraction_lobe(child))
-        elif node.class_name() not in _NOT_AN_INTERFACE:
+        elif not has_equal_sides(node):
             leaves.append(node)
     indices = {round(float(dr.slice(dr.detach(_index_of(leaf)), 0)), 6) for leaf in leaves}
     if len(indices) > 1:

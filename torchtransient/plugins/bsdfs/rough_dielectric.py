@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
 
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
@@ -262,3 +263,5 @@ def _widening(wi: Any) -> Any:
 
 
 register("bsdf", "diff_rough_dielectric", DiffRoughDielectric)
+# Directions are held fixed while the index moves, so what is seen through the interface stays where it is.
+declare_effects(DiffRoughDielectric, {"eta": ParameterEffect(moves_length=True, role="index", trusted=True)})

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 
 
 class AngularAreaLight(mi.Emitter):
@@ -94,3 +95,5 @@ class AngularAreaLight(mi.Emitter):
 
 
 register("emitter", "angulararea", AngularAreaLight)
+# Its shape moves it, by the shape's own parameters.
+declare_effects(AngularAreaLight, {ANY_KEY: VALUE})

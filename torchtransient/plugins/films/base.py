@@ -9,6 +9,7 @@ import numpy as np
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.lane import AdjointLane, Lane
 from torchtransient.plugins.films.response import SensorResponse
+from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -223,3 +224,7 @@ class TimeResolvedFilm(mi.Film):
         y, pdf_y = distribution.sample_pdf(sample.y)
         weight = rfilter.eval(x) * rfilter.eval(y) / (pdf_x * pdf_y * integral * integral)
         return mi.Point2f(x, y), weight
+
+
+# Where the film's axis and window lie; nothing of it carries gradients.
+declare_effects(TimeResolvedFilm, {ANY_KEY: VALUE})

@@ -10,6 +10,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.mitsuba_compat import bounds_of
+
 
 class DistantReference:
     """Sphere whose tangent planes distant light leaves at t = 0."""
@@ -26,12 +28,7 @@ def distant_reference(scene) -> DistantReference:
     """The sphere around all shapes of ``scene``."""
     box = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
-        bounds = shape.bbox()
-        if not bounds.valid() and isinstance(shape, mi.Mesh):
-            # Mitsuba leaves out the bounds of a mesh that it merged from rectangles, and the scene's bounds lack it.
-            shape.recompute_bbox()
-            bounds = shape.bbox()
-        box.expand(bounds)
+        box.expand(bounds_of(shape))
     if not box.valid():
         return DistantReference((0.0, 0.0, 0.0), 0.0)
     sphere = box.bounding_sphere()

@@ -7,6 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.mitsuba_compat import is_batch, is_distant, near_clip, starts_off_itself
+from torchtransient.plugins.node_walk import objects_of
+
 
 class View:
     """One sensor, and the lanes that look through it: several for a ``batch``, whose children share a film.
@@ -20,24 +23,17 @@ class View:
 
     def length(self, ray: Any) -> Any:
         """Distance in metres from the sensor's origin to ``ray.o``, attached where the sensor is."""
-        kind = self.sensor.class_name()
         if is_distant(self.sensor):
             # From the tangent plane that the wave reaches last to where Mitsuba happens to start the ray.
             return self.reference.length(ray.o, -ray.d)
-        if kind in ("RadianceMeter", "IrradianceMeter"):
-            # Their rays start a little off the sensor.
+        if starts_off_itself(self.sensor):
             return mi.math.RayEpsilon * dr.norm(ray.d)
-        near = getattr(self.sensor, "near_clip", None)
+        near = near_clip(self.sensor)
         if near is None:
             return mi.Float(0)
         # The near clip plane in the world: an orthographic camera may be scaled along its axis.
         axis = self.sensor.world_transform() @ mi.Vector3f(0, 0, 1)
-        return near() * dr.squared_norm(axis) / dr.dot(axis, ray.d)
-
-
-def is_distant(sensor: Any) -> bool:
-    """Whether the sensor sits at infinity."""
-    return sensor.class_name().startswith("DistantSensor")
+        return near * dr.squared_norm(axis) / dr.dot(axis, ray.d)
 
 
 def views(sensor: Any, position: Any, reference: Any) -> list[View]:
@@ -59,20 +55,9 @@ def views(sensor: Any, position: Any, reference: Any) -> list[View]:
 
 def sensors_of(sensor: Any) -> list[Any]:
     """The children of a ``batch`` in their order on the film, or the sensor itself."""
-    if sensor.class_name() != "BatchSensor":
+    if not is_batch(sensor):
         return [sensor]
-    found = []
-
-    class Callback(mi.TraversalCallback):
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if isinstance(value, mi.Sensor):
-                found.append(value)
-
-        put_object = put
-        put_value = put
-
-    sensor.traverse(Callback())
-    return found
+    return [child for _, child in objects_of(sensor) if isinstance(child, mi.Sensor)]
 
 
 def shapes_of_sensors(sensor: Any) -> list[Any]:
@@ -83,8 +68,8 @@ def shapes_of_sensors(sensor: Any) -> list[Any]:
 def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, position: Any, aperture: Any) -> Any:
     """Primary rays and their weights, attached to the sensor.
 
-    The children of a batch are asked one by one once one of them is attached: derivatives through the virtual call
-    that the plugin makes end the process in forward mode (Dr.Jit 1.5).
+    The children of a batch are asked one by one once one of them is attached, see
+    :func:`~torchtransient.plugins.mitsuba_compat.is_batch`.
     """
     if len(seen) == 1 or not any(dr.grad_enabled(value) for _, value in mi.traverse(sensor)):
         return sensor.sample_ray_differential(time=time, sample1=wavelength, sample2=position, sample3=aperture)

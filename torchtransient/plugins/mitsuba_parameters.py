@@ -1,0 +1,155 @@
+"""The rows of Mitsuba's own plugins in the table of parameters. Classes and keys are those of Mitsuba 3.9.1."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, normal_texture
+from torchtransient.plugins.node_walk import bsdfs_below
+from torchtransient.plugins.parameter_effect import (
+    ANY_KEY,
+    CORRECT,
+    SILHOUETTES,
+    VALUE,
+    ParameterEffect,
+    Row,
+    Site,
+    declare_effects,
+)
+
+VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+# What moves the rays of a sensor.
+SENSOR_KEYS = (
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+)
+# What a medium has that does not change how far light gets.
+_NO_EXTINCTION = ("albedo", "phase_function")
+
+SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", reason=SILHOUETTES, trusted=True)
+SENSOR = replace(SHAPE, role="sensor")
+# Shadow edges move with a light, too.
+EMITTER = replace(SHAPE, role="emitter", reason=CORRECT)
+NORMAL = replace(SHAPE, role="normal", reason=CORRECT, trusted=False)
+MEDIUM = ParameterEffect(moves_medium=True, role="medium")
+INDEX = ParameterEffect(
+    moves_length=True,
+    moves_silhouette=True,
+    role="index",
+    biased=True,
+    reason="biased where light is refracted: the path length does not follow this index",
+    trusted=True,
+)
+PRINCIPLED_INDEX = replace(
+    INDEX,
+    reason="biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md",
+)
+RIGID_ONLY = replace(
+    SHAPE,
+    biased=True,
+    reason=f"{SILHOUETTES}; rigid motion only: the area of an emitting mesh is not differentiated",
+)
+
+
+def index_by_stand_in(plugin: str) -> ParameterEffect:
+    """The index of refraction of a plugin of Mitsuba that is built as one of ours when the key is asked for."""
+    twin = DIFFERENTIABLE_PLUGINS[plugin]
+    return ParameterEffect(
+        moves_length=True,
+        moves_silhouette=plugin == "dielectric",
+        role="index",
+        reason=f"{CORRECT}; built as {twin} when asked for, which follows the index through direction, weight and "
+        "length",
+        trusted=True,
+        stand_in=twin,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------- conditions
+
+
+def _emits_from_vertices(site: Site) -> bool:
+    shape = site.node
+    return bool(shape.is_emitter() and shape.is_mesh() and not shape.has_vertex_texcoords())
+
+
+def _turns_delta_lobes(bsdf: object) -> bool:
+    """Whether a BSDF with a delta lobe has its frame turned by a texture."""
+    return normal_texture(bsdf) is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # type: ignore[attr-defined]
+
+
+def _places_normals(site: Site) -> bool:
+    """Whether the texture coordinates of a mesh place normals of a delta lobe."""
+    outer = site.node.bsdf()
+    waiting = [] if outer is None else [outer]
+    while waiting:
+        bsdf = waiting.pop()
+        if _turns_delta_lobes(bsdf):
+            return True
+        waiting += bsdfs_below(bsdf)
+    return False
+
+
+def _is_normal(site: Site) -> bool:
+    """Whether a texture holds normals or heights of a delta lobe."""
+    return any(
+        isinstance(holder, mi.BSDF) and normal_texture(holder) == name and _turns_delta_lobes(holder)
+        for holder, name in site.owners
+    )
+
+
+def _is_extinction(site: Site) -> bool:
+    """Whether a plugin is part of a medium's extinction."""
+    return any(isinstance(holder, mi.Medium) and name not in _NO_EXTINCTION for holder, name in site.owners)
+
+
+IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
+IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium, outside of albedo and phase function")
+
+# ---------------------------------------------------------------------------------------------------------------- rows
+
+_EMITTING = Row(RIGID_ONLY, _emits_from_vertices, "an emitting mesh without texture coordinates")
+
+declare_effects("Shape", {"to_world": SHAPE})
+declare_effects(
+    "Mesh",
+    {
+        "to_world": (_EMITTING, Row(SHAPE)),
+        "vertex_positions": (_EMITTING, Row(SHAPE)),
+        "vertex_normals": (_EMITTING, Row(SHAPE)),
+        "vertex_texcoords": (Row(NORMAL, _places_normals, "a normal or bump map over a delta lobe"), Row(VALUE)),
+    },
+)
+for _curve in ("BSplineCurve", "LinearCurve"):
+    declare_effects(_curve, {"control_points": replace(SHAPE, trusted=False)})
+declare_effects("SDFGrid", {"grid": replace(SHAPE, trusted=False)})
+
+declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
+
+# Of an emitter that no shape carries. Projectors and infinitely distant lights are marked as not differentiable.
+declare_effects("Emitter", {"to_world": replace(EMITTER, trusted=False), "position": replace(EMITTER, trusted=False)})
+declare_effects("PointLight", {"position": EMITTER})
+declare_effects("SpotLight", {"to_world": EMITTER})
+
+declare_effects("BSDF", {"eta": INDEX})
+declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})
+declare_effects("RoughDielectric", {"eta": index_by_stand_in("roughdielectric")})
+declare_effects("Principled", {"eta": PRINCIPLED_INDEX, "specular": PRINCIPLED_INDEX})
+declare_effects(
+    "RoughPlastic",
+    {
+        "alpha": ParameterEffect(
+            biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated", trusted=True
+        )
+    },
+)
+
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION)})
+declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
+declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -1,0 +1,119 @@
+"""Walks over the objects of a built scene: what a plugin shows in its ``traverse``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+
+from torchtransient.plugins.mitsuba_compat import is_instance
+
+
+class ShownValue(NamedTuple):
+    """One parameter of a plugin as Mitsuba hands it over: ``handle`` is the value itself where ``cpptype`` is None
+    (plugins written in Python), else an address inside the plugin.
+    """
+
+    key: str
+    handle: Any
+    flags: int
+    cpptype: Any
+
+    def read(self, node: Any) -> Any:
+        """The value now, attached where it is; ``node`` is the plugin that showed it."""
+        return self.handle if self.cpptype is None else mi.get_property(self.handle, self.cpptype, node)
+
+
+@functools.cache
+def _collector(base: type) -> type:
+    """A callback that collects what one plugin shows; made once for each variant, since making a class takes longer
+    than asking a plugin.
+    """
+
+    class Collector(base):  # type: ignore[misc, valid-type]
+        def __init__(self) -> None:
+            super().__init__()
+            self.values: list[ShownValue] = []
+            self.objects: list[tuple[str, Any, int]] = []
+
+        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+            if isinstance(value, mi.Object):
+                self.objects.append((name, value, int(flags)))
+            elif value is not None:
+                self.values.append(ShownValue(name, value, int(flags), cpptype))
+
+        # Older plugins call these two.
+        put_object = put
+        put_value = put
+
+    return Collector
+
+
+def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
+    """(parameters, objects) of one plugin, objects as (name, object, flags)."""
+    collector = _collector(mi.TraversalCallback)()
+    node.traverse(collector)
+    return collector.values, collector.objects
+
+
+def objects_of(node: Any) -> list[tuple[str, Any]]:
+    """The objects that a plugin holds, by name and in order."""
+    return [(name, value) for name, value, _ in shown_by(node)[1]]
+
+
+def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
+    """The objects of a kind below a plugin, each once and in order. ``through``: also those inside others found."""
+    found: dict[int, Any] = {}
+    visited: set[int] = set()
+
+    def enter(above: Any) -> None:
+        for _, value in objects_of(above):
+            if value.ptr in visited:
+                continue
+            visited.add(value.ptr)
+            if isinstance(value, kind):
+                found[value.ptr] = value
+                if not through:
+                    continue
+            enter(value)
+
+    enter(node)
+    return list(found.values())
+
+
+def bsdfs_below(node: Any) -> list[Any]:
+    """The outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order."""
+    return objects_below(node, mi.BSDF, through=False)
+
+
+def bsdfs_of_scene(scene: Any) -> list[Any]:
+    """The outermost BSDFs of a scene, those of shape groups included, each once."""
+    shapes = scene.shapes()
+    if any(is_instance(shape) for shape in shapes):
+        # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
+        return bsdfs_below(scene)
+    return list({bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}.values())
+
+
+def shapes_of_scene(scene: Any) -> list[Any]:
+    """All shapes of a scene, those of shape groups included."""
+    shapes = list(scene.shapes())
+    if not any(is_instance(shape) for shape in shapes):
+        return shapes
+    return objects_below(scene, mi.Shape)
+
+
+def owners_of(node: Any, holders: dict[int, list[tuple[Any, str]]]) -> Iterator[tuple[Any, str]]:
+    """Everything that holds ``node``, directly or not, as (plugin, the name it has for what leads to ``node``), nearest
+    first. ``holders``: by address, who holds an object under which name.
+    """
+    waiting: list[Any] = [node]
+    seen: set[int] = set()
+    while waiting:
+        for holder, name in holders.get(waiting.pop(0).ptr, ()):
+            yield holder, name
+            if holder.ptr not in seen:
+                seen.add(holder.ptr)
+                waiting.append(holder)

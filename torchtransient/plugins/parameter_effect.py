@@ -1,0 +1,135 @@
+"""What a parameter of a plugin can move, as rows by plugin class and key that every plugin module enters for itself.
+
+The questions are asked of :mod:`.parameters`; the rows of Mitsuba's plugins stand in :mod:`.mitsuba_parameters`.
+
+Which row counts for a parameter, first match wins:
+
+1. classes from the most special to the most general: the name by which Mitsuba calls the plugin (``Rectangle``,
+   ``PointLight``), then the Python classes (``DiffDielectric``, ``Mesh``, ``Shape``, ``Object``);
+2. in each class the rows of the key itself, then those of ``"*"``;
+3. among several rows of one key the first whose condition holds.
+
+A parameter without a row is a value: it changes how bright something is and moves nothing. A mark of Mitsuba's that a
+parameter is read-only always counts, one that it is not differentiable counts unless the row is ``trusted``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchtransient.errors import PluginRegistrationError
+
+CORRECT = "correct"
+SILHOUETTES = "correct except where silhouettes move (no boundary term)"
+ANY_KEY = "*"
+ROLES = ("shape", "normal", "emitter", "sensor", "index", "delay", "medium", "value")
+
+
+@dataclass(frozen=True)
+class ParameterEffect:
+    """What a parameter can move, and how good its derivative is.
+
+    ``moves_length``: it can change an optical path length. ``moves_silhouette``: it can move a visibility edge, seen
+    directly, in a mirror or through glass. ``moves_medium``: it can change an extinction (transmittances, sampled
+    distances), which albedo and phase function do not.
+
+    ``role``: which part of the geometry it moves. "shape": points of a surface; "normal": the frame that a delta lobe
+    works in; "emitter": an emitter without a shape; "sensor": the sensor and its rays; "index": an index of refraction;
+    "delay": a lifetime; "medium": an extinction; "value": none.
+
+    ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, besides the missing
+    boundary term of ``moves_silhouette``. ``reason``: the state in words.
+
+    ``trusted``: the derivative is right although Mitsuba marks the parameter as not differentiable. ``stand_in``: name
+    of the plugin that is built in place of Mitsuba's when the derivative is asked for.
+    """
+
+    moves_length: bool = False
+    moves_silhouette: bool = False
+    moves_medium: bool = False
+    role: str = "value"
+    supported: bool = True
+    biased: bool = False
+    reason: str = CORRECT
+    trusted: bool = False
+    stand_in: str = ""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves anything at all."""
+        return self.moves_length or self.moves_silhouette or self.moves_medium
+
+
+VALUE = ParameterEffect()
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where a parameter is: the plugin ``node`` that has it under the name ``key``, and what holds the plugin, directly
+    or not, as (holder, name there), nearest first. A plugin that is shared has several holders.
+    """
+
+    node: Any
+    key: str
+    owners: tuple[tuple[Any, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table. It counts where ``when`` holds; ``condition`` says in words when that is."""
+
+    effect: ParameterEffect
+    when: Callable[[Site], bool] | None = None
+    condition: str = ""
+
+
+# class name -> key -> rows in the order of precedence
+_rows: dict[str, dict[str, tuple[Row, ...]]] = {}
+
+
+def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | Sequence[Row]]) -> None:
+    """Enter the parameters of a plugin class into the table; called by the module that defines the plugin.
+
+    ``plugin``: the class, or the name by which Mitsuba calls it. ``effects``: by key (the last name of the parameter,
+    "*" for all others), an effect, or rows with conditions. Calling it again replaces the entries of the same keys, as
+    happens when a module is executed again for another variant. Raises PluginRegistrationError for an unknown role.
+    """
+    name = plugin if isinstance(plugin, str) else plugin.__name__
+    for key, given in effects.items():
+        rows = (Row(given),) if isinstance(given, ParameterEffect) else tuple(given)
+        for row in rows:
+            if row.effect.role not in ROLES:
+                raise PluginRegistrationError(
+                    f"declare_effects: parameter '{key}' of {name}: expected a role out of {', '.join(ROLES)}, got "
+                    f"{row.effect.role!r}."
+                )
+        _rows.setdefault(name, {})[key] = rows
+
+
+def all_rows() -> Iterator[tuple[str, str, Row]]:
+    """(class, key, row) for the whole table, in the order of entry."""
+    for name, by_key in _rows.items():
+        for key, rows in by_key.items():
+            for row in rows:
+                yield name, key, row
+
+
+def lineage(node: Any) -> tuple[str, ...]:
+    """The names of a plugin's classes, the most special first."""
+    names = [cls.__name__ for cls in type(node).__mro__]
+    own = node.class_name().split("[")[0]
+    # Mitsuba calls a plugin written in Python by the class that it derives from.
+    return tuple(names if own in names else [own, *names])
+
+
+def matching_effect(site: Site) -> ParameterEffect:
+    """The effect of the row that counts for a parameter."""
+    for name in lineage(site.node):
+        by_key = _rows.get(name, {})
+        for key in (site.key, ANY_KEY):
+            for row in by_key.get(key, ()):
+                if row.when is None or row.when(site):
+                    return row.effect
+    return VALUE
