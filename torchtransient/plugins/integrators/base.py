@@ -10,6 +10,7 @@ from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
+from torchtransient.plugins.parameters import check_slope, moving_names
 from torchtransient.plugins.polarized import turning_throughput
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
@@ -19,11 +20,12 @@ from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import forward, tangents_of
 from torchtransient.plugins.transport.derivative.reverse import reverse
 from torchtransient.plugins.transport.derivative.wanted import Wanted
-from torchtransient.plugins.transport.media_contents import media_of
 from torchtransient.plugins.transport.sinks.film import FilmSink
 from torchtransient.plugins.transport.sinks.record import RecordSink
 from torchtransient.plugins.transport.walk import walk
 from torchtransient.plugins.transport.world import PathSettings, World
+
+UNLIMITED = 0xFFFFFFFF
 
 
 class PrimaryRays:
@@ -54,7 +56,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         max_depth = int(props.get("max_depth", 6))
         if max_depth < -1:
             raise SceneError(f"max_depth: expected -1 (no limit) or a number >= 0, got {max_depth}.")
-        self.max_depth = max_depth if max_depth != -1 else 0xFFFFFFFF
+        self.max_depth = max_depth if max_depth != -1 else UNLIMITED
         self.rr_depth = int(props.get("rr_depth", 5))
         if self.rr_depth <= 0:
             raise SceneError(f"rr_depth: expected a number >= 1, got {self.rr_depth}.")
@@ -97,7 +99,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
             )
-        if not self.walks_through_media and media_of(scene, sensor) is not None:
+        if not self.walks_through_media and self.contents(scene, sensor).media is not None:
             raise SceneError(
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
@@ -272,9 +274,14 @@ class TransientIntegrator(mi.CppADIntegrator):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-            wanted = Wanted(scene, sensor, contents)
-        self._check_differentiable(film, wanted)
-        return contents, wanted
+            effects = contents.parameters(scene).attached()
+        check_slope(moving_names(effects), film.has_slope, film.temporal_filter, film.slope_remedy)
+        if self.max_depth == UNLIMITED:
+            raise GradientError(
+                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
+                "finite number, for instance to where the remaining throughput no longer matters."
+            )
+        return contents, Wanted(effects, sensor, contents)
 
     def _record(self, world, film, rays):
         """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
@@ -367,18 +374,6 @@ class TransientIntegrator(mi.CppADIntegrator):
         _, w, t, c = expected
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
 
-    def _check_differentiable(self, film, wanted):
-        if wanted.geometry and not film.has_slope:
-            raise GradientError(
-                "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
-                f"needs a response over time with a slope; the film has {film.temporal_filter!r}. {film.slope_remedy}"
-            )
-        if self.max_depth == 0xFFFFFFFF:
-            raise GradientError(
-                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
-                "finite number, for instance to where the remaining throughput no longer matters."
-            )
-
     def to_string(self):
         return (
             f"{type(self).__name__}[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
@@ -388,12 +383,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
 def settle_tangents(world):
     """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
-    attached = [value for _, value in mi.traverse(world.scene) if dr.grad_enabled(value)]
-    contents = world.contents
-    if contents.refraction is not None and dr.grad_enabled(contents.refraction.table):
-        attached.append(contents.refraction.table)
-    if contents.delays is not None:
-        attached += contents.delays.attached()
+    attached = world.contents.parameters(world.scene).attached_values()
+    attached += [table for table in world.tables() if dr.grad_enabled(table)]
     if not attached:
         return
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)

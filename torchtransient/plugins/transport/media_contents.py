@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import GradientError
+from torchtransient.plugins.node_walk import shapes_of_scene
 
 
 class MediaContents:
@@ -34,10 +35,6 @@ class MediaContents:
     def one_stretch(self) -> bool:
         """Whether a straight line needs no loop: one medium up to the next surface, with one analytic step."""
         return not (self.heterogeneous or self.open_boundaries)
-
-    def density_attached(self) -> bool:
-        """Whether a parameter that changes an extinction carries gradients."""
-        return any(_density_attached(medium) for medium in self.media)
 
     def check_spheres(self, sphere_lights: bool) -> None:
         """Where path lengths change, spherical lights (``sphere_lights``) are sampled by connections alone, which every
@@ -87,36 +84,6 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
     box = scene.bbox()
     extent = float(dr.norm(box.extents())) if box.valid() else 1.0
     return MediaContents(list(media.values()), found[0], any(is_open(shape) for shape in shapes), max(extent, 1e-6))
-
-
-def _density_attached(medium: Any) -> bool:
-    """Whether a parameter that changes the extinction carries gradients: all but those of albedo and phase function."""
-    others = ("albedo", "phase_function")
-    return any(key.split(".")[0] not in others and dr.grad_enabled(value) for key, value in mi.traverse(medium))
-
-
-def shapes_of_scene(scene: Any) -> list[Any]:
-    """All shapes, those of shape groups included."""
-    shapes = list(scene.shapes())
-    if not any(shape.class_name() == "Instance" for shape in shapes):
-        return shapes
-    found: dict[int, Any] = {}
-    visited: set[int] = set()
-
-    class Callback(mi.TraversalCallback):
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if not isinstance(value, mi.Object) or value.ptr in visited:
-                return
-            visited.add(value.ptr)
-            if isinstance(value, mi.Shape):
-                found[value.ptr] = value
-            value.traverse(Callback())  # a callback cannot be entered twice
-
-        put_object = put
-        put_value = put
-
-    scene.traverse(Callback())
-    return list(found.values())
 
 
 def is_open(shape: Any) -> bool:

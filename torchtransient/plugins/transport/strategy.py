@@ -5,8 +5,8 @@ One turn of the loop (:func:`.walk.bounce`) asks a *segment* for the vertex at t
 next one, and the connections for events; a *sink* decides what becomes of events and vertices.
 
 Every strategy has three forms side by side: the primal one; ``fields`` and ``record``, what of it cannot be recomputed
-and is kept for derivatives; and the ``attached`` one, which re-evaluates a recorded vertex with derivatives. Forward and
-reverse mode follow from the last one.
+and is kept for derivatives; and the ``attached`` one, which re-evaluates a recorded vertex with derivatives. Forward
+and reverse mode follow from the last one.
 
 Shapes: every Float is one number per lane; ``value`` is per colour (``mi.UnpolarizedSpectrum``), a Stokes vector in
 polarized variants.
@@ -75,6 +75,10 @@ class Strategy:
 
     def prepare(self, world: Any) -> None:
         """Once a job, outside of traced code: what all lanes share."""
+
+    def tables(self) -> list[Any]:
+        """What ``prepare`` has computed of parameters: attached where they are."""
+        return []
 
     def fields(self, world: Any) -> dict[str, Any]:
         """Types of the numbers that ``attached`` cannot recompute, by name. Random numbers of its own are called
@@ -149,7 +153,7 @@ class Connection(Strategy):
         """A direction in which scattering is asked for, None where none is."""
         return None
 
-    def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Answer | None, zeros: bool) -> Event:
+    def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
         """The event. ``zeros`` (static): events of value zero matter, too."""
         raise NotImplementedError
 

@@ -1,4 +1,4 @@
-"""What a walk is told: the scene, its contents, the settings of the integrator and the strategies, fixed for one job."""
+"""What a walk is told: scene, contents, settings of the integrator and strategies, fixed for one job."""
 
 from __future__ import annotations
 
@@ -45,6 +45,10 @@ class World:
     def strategies(self) -> list[Any]:
         """All strategies, each once."""
         return [self.segment, *self.connections, self.scattering]
+
+    def tables(self) -> list[Any]:
+        """What the strategies have computed of the scene's parameters."""
+        return [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property
     def index_changes(self) -> bool:

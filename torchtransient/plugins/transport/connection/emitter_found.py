@@ -80,7 +80,7 @@ class EmitterFound(Connection):
         return None if not claims else claims[0] if len(claims) == 1 else dr.any(claims)
 
     def _ahead(self, world, vertex, step, wanted):
-        v, si, following = vertex.v, vertex.scattered_si, vertex.v.after()
+        si, following = vertex.scattered_si, vertex.v.after()
         mis = following.of(self.name)["mis"]
         lit = step.ahead & (mis > 0)
         if wanted.sphere_lights:

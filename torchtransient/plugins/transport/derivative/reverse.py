@@ -20,7 +20,7 @@ from torchtransient.plugins.transport.sinks.record import RecordedVertex
 
 
 def step_back(world, layout, store, block, ray, k, live, adjoint, following):
-    """(adjoint of the Carry that arrives at vertex ``k``, where the vertex lies); gradients of parameters accumulate."""
+    """(adjoint of the Carry that arrives at vertex ``k``, where the vertex lies); parameters get their gradients."""
     wanted = world.wanted
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following

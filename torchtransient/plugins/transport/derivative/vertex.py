@@ -1,9 +1,9 @@
 """One recorded vertex as a function ``Carry -> (EventTerms, Carry)``, put together from what the strategies say.
 
 The sampled path is held fixed in this sense: a vertex slides along the ray that found it when its surface moves, and
-against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on light
-sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray, that ray
-itself is attached.
+against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on
+light sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray,
+that ray itself is attached.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class AttachedVertex(Local):
 
     ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``carry`` (with the throughput at the vertex),
     ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``, ``delay``,
-    ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` (behind its delay) and ``turn``.
+    ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind
+    its delay) and ``turn``.
     """
 
 

@@ -1,60 +1,50 @@
-"""Which derivatives a job asks for."""
+"""Which derivatives a job asks for, from what the scene's attached parameters move."""
 
 from __future__ import annotations
 
-import drjit as dr
+from collections.abc import Sequence
+from typing import Any
+
 import mitsuba as mi
 
-from torchtransient.plugins.sensors.origin import shapes_of_sensors
-
-SENSOR_KEYS = (
-    "to_world",
-    "x_fov",
-    "principal_point_offset_x",
-    "principal_point_offset_y",
-    "aperture_radius",
-    "focus_distance",
-)
+from torchtransient.plugins.parameter_effect import ParameterEffect
+from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
 
 
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``geometry``: path lengths change. ``light``: the position of a light without a shape does. ``emitter_shape``: the
-    shape of a light moves. ``sphere_lights``: path lengths change and some lights are spheres. ``sensor``: the sensor
-    moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on, behind delta lobes or a
-    sensor that moves. ``extinction``: that of a medium changes. ``carried``: the fields of the
-    :class:`~..carry.Carry` that derivatives go through.
+    ``geometry``: path lengths change. ``light``: an emitter without a shape moves. ``emitter_shape``: the shape of a
+    light does. ``sphere_lights``: path lengths change and some lights are spheres. ``sensor``: the sensor moves.
+    ``index``: an index of refraction changes. ``ray``: the ray itself is handed on, behind delta lobes or a sensor that
+    moves. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry` that
+    derivatives go through.
+
+    ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """
 
-    def __init__(self, scene, sensor, contents):
-        shapes = any(shape.parameters_grad_enabled() for shape in scene.shapes())
-        # An instance does not speak of its own transformation.
-        shapes |= any(_attached(s, ("to_world",)) for s in scene.shapes() if s.class_name() == "Instance")
-        self.emitter_shape = any(s.is_emitter() and s.parameters_grad_enabled() for s in scene.shapes())
-        self.light = any(_attached(e, ("position", "to_world")) for e in scene.emitters() if e.get_shape() is None)
-        self.sensor = _attached(sensor, SENSOR_KEYS) or any(
-            shape is not None and shape.parameters_grad_enabled() for shape in shapes_of_sensors(sensor)
-        )
-        self.index = any(_attached(bsdf, ("eta",)) for bsdf in contents.bsdfs)
-        if contents.refraction is not None:
-            self.index |= dr.grad_enabled(contents.refraction.table)
-        late = contents.delays is not None and dr.grad_enabled(contents.delays.lifetimes)
-        self.geometry = shapes or self.light or self.sensor or self.index or late
+    def __init__(self, effects: Sequence[tuple[Any, str, ParameterEffect]], sensor: Any, contents: Any) -> None:
+        def moved(role):
+            return [node for node, _, effect in effects if effect.role == role]
+
+        sensors = {one.ptr for one in sensors_of(sensor)}
+        carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
+        self.geometry = any(effect.moves_length for _, _, effect in effects)
+        self.light, self.index = bool(moved("emitter")), bool(moved("index"))
+        self.emitter_shape = any(isinstance(node, mi.Shape) and node.is_emitter() for node in moved("shape"))
+        self.sensor = any(node.ptr in sensors for node in moved("sensor"))
+        self.sensor |= any(node.ptr in carriers for node in moved("shape"))
         self.sphere_lights = self.geometry and contents.sphere_lights
         self.ray = self.geometry and (contents.delta or self.sensor)
-        self.extinction = contents.media is not None and contents.media.density_attached()
-        self.carried = ("β",)
+        self.extinction = any(effect.moves_medium for _, _, effect in effects)
+        self.carried: tuple[str, ...] = ("β",)
         if self.geometry:
-            self.carried += ("slope", "w") + (("x",) if contents.media is not None else ())
+            self.carried += ("slope", "w")
+        if self.geometry and contents.media is not None:
+            self.carried += ("x",)
         if self.ray:
             self.carried += ("o", "d")
         if self.index:
             self.carried += ("η",)
         if contents.media is not None:
             contents.media.check_spheres(self.sphere_lights)
-
-
-def _attached(plugin, names):
-    """Whether one of the parameters called ``names`` of a plugin or its children carries gradients."""
-    return any(key.split(".")[-1] in names and dr.grad_enabled(value) for key, value in mi.traverse(plugin))

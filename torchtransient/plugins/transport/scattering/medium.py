@@ -49,7 +49,8 @@ class SurfaceOrMedium(Surface):
             if p is not None:
                 f, pdf = phase.eval_pdf(ctx, mei, p.d, p.active & scatter)
                 f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
-                answer.value, answer.pdf = dr.select(scatter, f, answer.value), dr.select(scatter, finite(pdf), answer.pdf)
+                answer.value = dr.select(scatter, f, answer.value)
+                answer.pdf = dr.select(scatter, finite(pdf), answer.pdf)
         out, w, pdf = phase.sample(ctx, mei, step.u_lobe, step.u_dir, active)
         pdf = finite(pdf, DELTA_LIKE)
         w = dr.select(pdf > 0, finite(mi.unpolarized_spectrum(w)) * σ_s, 0)

@@ -16,33 +16,33 @@ from torchtransient.plugins.transport.strategy import Answer, Local, Scattering,
 class Surface(Scattering):
     """What all vertices do in vacuum; those in media are told apart in :class:`.medium.SurfaceOrMedium`.
 
-    ``guides`` draw some of the next vertices in the BSDF's place: each has a ``share`` of the samples, ``prepare(world)``,
-    ``draw(vertex, sampler) -> (point, whether it is chosen)`` and ``density(vertex, ray, leg, active)``, the density per
-    solid angle with which it draws what ``ray`` has found.
+    ``guides`` draw some of the next vertices in the BSDF's place: each has a ``share`` of the samples,
+    ``prepare(world)``, ``draw(vertex, sampler) -> (point, whether it is chosen)`` and ``density(vertex, ray, leg,
+    active)``, the density per solid angle with which it draws what ``ray`` has found.
     """
 
     def __init__(self, guides=()):
         self.guides = list(guides)
 
     def prepare(self, world):
+        contents = world.contents
+        self.refraction = None if contents.refraction is None else contents.refraction.read()
+        self.delays = None if contents.delays is None else contents.delays.read()
         for guide in self.guides:
             guide.prepare(world)
 
     # ------------------------------------------------------------------------------------------------- primal
 
     def arrive(self, world, path, vertex, sampler):
-        delays = world.contents.delays
-        vertex.u_delay = None if delays is None else sampler.next_2d()
-        vertex.delay = self.delay(world, vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
+        vertex.u_delay = None if self.delays is None else sampler.next_2d()
+        vertex.delay = self.delay(vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
         vertex.bsdf = vertex.delay.bsdf
         vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
         vertex.connectable = self.connectable(world, vertex)
 
-    @staticmethod
-    def delay(world, bsdf, u, wavelengths):
+    def delay(self, bsdf, u, wavelengths):
         """Whether a surface scatters late: which BSDF takes its place, when, and with which weight."""
-        delays = world.contents.delays
-        return DelaySample(bsdf) if delays is None else delays.answer(bsdf, u, wavelengths)
+        return DelaySample(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
 
     @staticmethod
     def behind(delay, *interactions):
@@ -71,7 +71,7 @@ class Surface(Scattering):
             else:
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
             value = self.upright(world, bsdf, si, wo, vertex.delay.scaled(value))
-            answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(world, bsdf, si, wo)))
+            answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo)))
         bs, weight = sample or bsdf.sample(ctx, si, u_lobe, u_dir, vertex.goes_on)
         weight = self.upright(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
@@ -105,7 +105,11 @@ class Surface(Scattering):
         value = scattering(value, turn_out(si, path.ray.d), turn_in(si, wo, step.out))
         step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
-        step.eta = dr.select(smooth, self.relative_index(world, vertex.bsdf, si, wo), step.eta)
+        step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, si, wo), step.eta)
+
+    def tables(self):
+        delays = [] if self.delays is None else self.delays.attached()
+        return delays if self.refraction is None else [self.refraction.table, *delays]
 
     # ---------------------------------------------------------------------------------------- scene contents
 
@@ -117,11 +121,9 @@ class Surface(Scattering):
             return value
         return from_mirrored(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
 
-    @staticmethod
-    def relative_index(world, bsdf, si, wo):
+    def relative_index(self, bsdf, si, wo):
         """Index on the side of ``wo`` over that on the side of ``si.wi``."""
-        refraction = world.contents.refraction
-        return mi.Float(1) if refraction is None else refraction.relative_index(bsdf, si, wo)
+        return mi.Float(1) if self.refraction is None else self.refraction.relative_index(bsdf, si, wo)
 
     @staticmethod
     def probability(world, bsdf, bs):
@@ -135,7 +137,7 @@ class Surface(Scattering):
         fields = {"delta": mi.Bool}
         if world.contents.delta:
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
-        if world.contents.delays is not None:
+        if self.delays is not None:
             fields["u_delay"] = mi.Point2f
         if self.guides:
             fields["pdf"] = mi.Float
@@ -151,7 +153,7 @@ class Surface(Scattering):
         v, si = vertex.v, vertex.si
         vertex.turn = turn_out(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
-        vertex.delay = self.delay(world, vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
+        vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
         vertex.bsdf = vertex.delay.bsdf
         (vertex.scattered_si,) = self.behind(vertex.delay, si)
         vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
@@ -163,7 +165,7 @@ class Surface(Scattering):
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
         value = self.upright(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
-        return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(world, vertex.bsdf, si, wo))
+        return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
         """Value and density towards the local direction ``wo``, in the world ``out``."""

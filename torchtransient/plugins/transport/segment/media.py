@@ -97,8 +97,8 @@ class Media(Vacuum):
 
     def record(self, vertex):
         leg, of_ray = vertex.leg, Local(ray=vertex.ray, leg=vertex.leg["pi"])
-        media = {name: dr.reinterpret_array(mi.UInt32, leg[key]) for name, key in (("begin", "begin"), ("end", "medium"))}
-        values = super().record(of_ray) | media
+        begin, end = (dr.reinterpret_array(mi.UInt32, leg[key]) for key in ("begin", "medium"))
+        values = super().record(of_ray) | {"begin": begin, "end": end}
         values |= {"scatter": leg["scatter"], "t_end": leg["t"], "weight": leg["weight"]}
         return values | (intersection_numbers(leg["entry"], "entry_") if "entry" in leg else {})
 
