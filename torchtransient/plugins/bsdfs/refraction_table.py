@@ -19,7 +19,7 @@ _NOT_AN_INTERFACE = ("Hair",)
 
 
 class RefractionTable:
-    """Relative indices of the BSDFs of one scene, read anew by ``refresh`` when parameters may have changed.
+    """Relative indices of the BSDFs of one scene, as they were when the table was made: every render makes its own.
 
     Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``,
     ``principled`` with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``,
@@ -53,7 +53,7 @@ class RefractionTable:
         return RefractionTable(size, entries) if entries else None
 
     def refresh(self) -> None:
-        """Read the indices again; to be called outside of loops, once per render."""
+        """Read the indices; outside of loops."""
         with dr.resume_grad():
             table = dr.ones(mi.Float, self.size)
             for number, leaf in self.entries:

@@ -239,14 +239,14 @@ class TransientIntegrator(mi.CppADIntegrator):
                 if progress_callback:
                     dr.sync_thread()
                     progress_callback((i + 1) / len(jobs))
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
     def _render_pass(self, scene, sensor, film, job):
         sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
         match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, self.max_depth)
+        lane = film.create_block(job, base, match, self.max_depth)
         first = self._first_opl(seen, film, ray)
         facts = self.facts(scene, sensor)
         L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
@@ -309,7 +309,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             flat, offset, strides = self._adjoint_layout(film, g_transient)
             base = row * strides[0] + column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
-        lane = film.adjoint_lane(transient, base, steady, match)
+        lane = film.create_adjoint_block(transient, base, steady, match)
         first = self._first_opl(seen, film, ray)
         a_o, a_d, a_first, a_turn = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
         if facts.sensor_moves:
@@ -339,14 +339,14 @@ class TransientIntegrator(mi.CppADIntegrator):
             for job in jobs:
                 self._forward_pass(scene, sensor, film, job, facts)
                 dr.eval(film.bands[job.band][2], film.steady)
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
     def _forward_pass(self, scene, sensor, film, job, facts):
         sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
         match = self.channel_match(seen, film, ray, ray_weight, scale)
         base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, self.max_depth, tangents=True)
+        lane = film.create_block(job, base, match, self.max_depth, tangents=True)
         first = self._first_opl(seen, film, ray)
         t_ray, d_first, t_turn = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0), None
         if facts.sensor_moves:
@@ -379,7 +379,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if facts.geometry and not film.has_slope:
             raise GradientError(
                 "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
-                f"needs a response over time with a slope; the film has {film.temporal_filter!r}. {film.slope_remedy}"
+                f"needs a response over time with a slope; the film has {film.response_name!r}. {film.slope_remedy}"
             )
         if self.max_depth == 0xFFFFFFFF:
             raise GradientError(
