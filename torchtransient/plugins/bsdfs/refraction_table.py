@@ -19,7 +19,7 @@ _NOT_AN_INTERFACE = ("Hair",)
 
 
 class RefractionTable:
-    """Relative indices of the BSDFs of one scene, as they were when the table was made: every render makes its own.
+    """Relative indices of the BSDFs of one scene, read when the table is made and by ``refresh``.
 
     Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``,
     ``principled`` with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``,

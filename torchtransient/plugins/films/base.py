@@ -34,8 +34,6 @@ class TimeResolvedFilm(mi.Film):
     exhaustive_scan = False
     keeps_steady = True
     has_window = True
-    # Films without a temporal filter answer so.
-    temporal_filter = ""
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
     has_slope = True
     pulses = ()
@@ -61,6 +59,11 @@ class TimeResolvedFilm(mi.Film):
         return self.channel_count()
 
     # ------------------------------------------------------------------------------------- for integrators
+
+    @property
+    def temporal_filter(self) -> str:
+        """A film without a filter answers so."""
+        return ""
 
     @property
     def response_name(self) -> str:
