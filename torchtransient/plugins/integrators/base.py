@@ -221,14 +221,14 @@ class TransientIntegrator(mi.CppADIntegrator):
                 if progress_callback:
                     dr.sync_thread()
                     progress_callback((i + 1) / len(jobs))
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
     def _render_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
-        block = film.lane(job, base, match, self.max_depth)
+        block = film.create_block(job, base, match, self.max_depth)
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), FilmSink(block))
         self._add_steady(film, match.to_channels(kept["L"]), pixel)
         if film.outside is not None:
@@ -302,7 +302,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             flat, offset, strides = self._adjoint_layout(film, g_transient)
             base = rays.row * strides[0] + rays.column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
-        block = film.adjoint_lane(transient, base, steady, match)
+        block = film.create_adjoint_block(transient, base, steady, match)
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         if world.wanted.sensor:
             with dr.resume_grad():
@@ -332,14 +332,14 @@ class TransientIntegrator(mi.CppADIntegrator):
             for job in jobs:
                 self._forward_pass(world, sensor, film, job)
                 dr.eval(film.bands[job.band][2], film.steady)
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
     def _forward_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
-        block = film.lane(job, base, match, self.max_depth, tangents=True)
+        block = film.create_block(job, base, match, self.max_depth, tangents=True)
         tangent = self._tangent_of(world, rays)
         dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
         self._add_steady(film, match.to_channels(dL), pixel)

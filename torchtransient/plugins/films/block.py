@@ -12,15 +12,15 @@ from torchtransient.plugins.films.colour import mean_of
 from torchtransient.plugins.polarized import light_type
 
 
-class Lane:
-    """Where samples write, with which weight.
+class FilmBlock:
+    """The samples of one pass: which band of the film they write to, from which entry on, with which weight.
 
     A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
     one; whoever launched the loop calls ``finish`` when all of it is recorded. A histogram writes every event at once.
     """
 
-    def __init__(self, film, cube, base, match):
-        self.film, self.cube, self.base, self.match = film, cube, base, match
+    def __init__(self, film, band: int, base, match):
+        self.film, self.band, self.base, self.match = film, band, base, match
 
     def begin(self):
         """What the film carries along a path: loop state, handed back at every event."""
@@ -29,14 +29,14 @@ class Lane:
     def put(self, events, opl, value, active):
         """Write a contribution; returns what fell before and after the window (mean over channels)."""
         channels = self.match.to_channels(value)
-        before, after = self.film.put(self.cube, self.base, opl, channels, active)
+        before, after = self.film.put(self.band, self.base, opl, channels, active)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
         """Forward mode: write ``k df + f k' dtau``."""
         d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
-        self.film.put_slope(self.cube, self.base, opl, d, slope, active)
+        self.film.put_slope(self.band, self.base, opl, d, slope, active)
 
     def end(self, events):
         """The paths are over."""
@@ -45,7 +45,7 @@ class Lane:
         """Bring what was written to the film. Called outside of the loop, may launch a kernel."""
 
 
-class AdjointLane:
+class AdjointBlock:
     """Reads ``A(tau)`` and ``A'(tau)`` of the incoming adjoint for the samples in flight."""
 
     def __init__(self, film, response, base, steady, match):
