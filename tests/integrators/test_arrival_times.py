@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from plain_scenes import T, camera, load, runs
 
+from support.plain_scenes import T, camera, load, runs
 from torchtransient import plugins
 
 

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import T, film, homogeneous, load, rgb, runs, volume
 
+from support.media_scenes import T, film, homogeneous, load, rgb, runs, volume
 from torchtransient.plugins.integrators.path_record import read_vertex
 from torchtransient.testing.statistics import z_test
 

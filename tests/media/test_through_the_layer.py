@@ -8,9 +8,9 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from media_scenes import block, camera, clouds, homogeneous
 
 import torchtransient as tt
+from support.media_scenes import block, camera, clouds, homogeneous
 from torchtransient.render.variant import active_variant
 
 VARIANT = "llvm_ad_rgb"

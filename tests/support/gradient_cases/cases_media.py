@@ -5,7 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from gradient_cases import Case, area_light, move, move_point, room, scale_texture, set_color, transform
+
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, room, transform
+from support.gradient_cases.unknowns import move, move_point, scale_texture, set_color
 
 
 def homogeneous(sigma_t=0.8, albedo=0.7, g=0.4, **arguments):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-from gradient_cases import Case, area_light, camera, film, move, room, set_color
+
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, camera, film, room
+from support.gradient_cases.unknowns import move, set_color
 
 BANDS = {
     "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},
@@ -101,7 +104,6 @@ CASES = [
         0.02,
         "llvm_ad_spectral",
         2048,
-        fd_spp=2048,
     ),
     Case(
         "banded_lamp_spectrum",
@@ -112,7 +114,6 @@ CASES = [
         0.2,
         "llvm_ad_spectral",
         2048,
-        fd_spp=2048,
     ),
     Case(
         "banded_wall",
@@ -123,7 +124,6 @@ CASES = [
         2e-3,
         "llvm_ad_spectral",
         2048,
-        fd_spp=2048,
     ),
     Case(
         "wall_under_short_pulse",
@@ -133,7 +133,6 @@ CASES = [
         0.0,
         2e-3,
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
         "wall_under_long_pulse",
@@ -145,18 +144,8 @@ CASES = [
         0.0,
         2e-3,
         spp=2048,
-        fd_spp=2048,
     ),
-    Case(
-        "gated_wall",
-        "shape to_world, time gates",
-        gated_room,
-        move("wall.to_world", (0, 0, 1)),
-        0.0,
-        5e-4,
-        spp=2048,
-        fd_spp=2048,
-    ),
+    Case("gated_wall", "shape to_world, time gates", gated_room, move("wall.to_world", (0, 0, 1)), 0.0, 5e-4, spp=2048),
     Case(
         "gated_side_albedo",
         "diffuse albedo, time gates",
@@ -165,7 +154,6 @@ CASES = [
         0.8,
         0.02,
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
         "wall_without_steady_image",
@@ -175,7 +163,6 @@ CASES = [
         0.0,
         2e-3,
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
         "lifetime",
@@ -185,7 +172,6 @@ CASES = [
         0.4,
         5e-3,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "lifetime_of_a_measured_decay",
@@ -195,7 +181,6 @@ CASES = [
         0.4,
         5e-3,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "quantum_yield",
@@ -205,7 +190,6 @@ CASES = [
         0.7,
         0.05,
         spp=8192,
-        fd_spp=8192,
     ),
     Case(
         "no_quantum_yield",
@@ -215,7 +199,6 @@ CASES = [
         0.0,
         0.05,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "elastic_fraction",
@@ -225,7 +208,6 @@ CASES = [
         0.4,
         0.02,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "albedo_inside_a_delay",
@@ -235,7 +217,6 @@ CASES = [
         0.5,
         0.02,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "delayed_wall_moves",
@@ -245,7 +226,6 @@ CASES = [
         0.0,
         4e-3,
         spp=8192,
-        fd_spp=8192,
     ),
     Case(
         "lifetime_under_an_area_light",
@@ -255,7 +235,6 @@ CASES = [
         0.4,
         5e-3,
         spp=4096,
-        fd_spp=4096,
     ),
     Case(
         "fluorescent_lifetime",
@@ -266,7 +245,6 @@ CASES = [
         5e-3,
         "llvm_ad_spectral",
         8192,
-        fd_spp=8192,
     ),
     Case(
         "fluorescent_yield",
@@ -277,7 +255,6 @@ CASES = [
         0.05,
         "llvm_ad_spectral",
         8192,
-        fd_spp=8192,
     ),
     Case(
         "area_light_over_a_delayed_wall_moves",
@@ -287,7 +264,6 @@ CASES = [
         0.0,
         5e-3,
         spp=32768,
-        fd_spp=32768,
     ),
     Case(
         "polarized_lifetime",
@@ -298,7 +274,6 @@ CASES = [
         5e-3,
         "llvm_ad_mono_polarized",
         8192,
-        fd_spp=8192,
     ),
     Case(
         "polarized_fluorescent_yield",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from cases_media import SIGMA_T, block, homogeneous
-from cases_polar import METAL, metal_room
-from gradient_cases import Case, area_light, camera, glass_slab, move, move_point, room, rotate, set_color
+from support.gradient_cases.cases_media import SIGMA_T, block, homogeneous
+from support.gradient_cases.cases_polar import METAL, metal_room
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, camera, glass_slab, room
+from support.gradient_cases.unknowns import move, move_point, rotate, set_color
 
 ROW = "through a phasor film: albedo, light, geometry, index"
 GRID = {"frequency_first": 0.0, "frequency_step": 0.37, "frequency_count": 5}
@@ -41,7 +43,6 @@ CASES = [
         0.0,
         2e-3,
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
         "phasor_wall_rgb",
@@ -52,7 +53,6 @@ CASES = [
         2e-3,
         "llvm_ad_rgb",
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
         "phasor_wall_spectral",
@@ -63,26 +63,11 @@ CASES = [
         2e-3,
         "llvm_ad_spectral",
         spp=2048,
-        fd_spp=2048,
     ),
     Case(
-        "phasor_point_light",
-        ROW,
-        lambda: seen_as_phasors(room()),
-        move_point("light.position", (0, 0.3, 1)),
-        0.0,
-        4e-3,
+        "phasor_point_light", ROW, lambda: seen_as_phasors(room()), move_point("light.position", (0, 0.3, 1)), 0.0, 4e-3
     ),
-    Case(
-        "phasor_area_light_moves",
-        ROW,
-        lit_by_a_panel,
-        move("light.to_world", (0.2, 0.1, 1)),
-        0.0,
-        5e-3,
-        spp=4096,
-        fd_spp=4096,
-    ),
+    Case("phasor_area_light_moves", ROW, lit_by_a_panel, move("light.to_world", (0.2, 0.1, 1)), 0.0, 5e-3, spp=4096),
     Case(
         "phasor_camera_turns",
         ROW,
@@ -101,7 +86,6 @@ CASES = [
         0.8,
         0.02,
         spp=8192,
-        fd_spp=8192,
     ),
     Case(
         "phasor_polarized_metal_moves",
@@ -112,7 +96,6 @@ CASES = [
         2e-3,
         "llvm_ad_mono_polarized",
         spp=2048,
-        fd_spp=2048,
     ),
-    Case("phasor_glass_index", ROW, glass, set_color("slab.bsdf.eta"), 1.5, 4e-3, spp=8192, fd_spp=8192),
+    Case("phasor_glass_index", ROW, glass, set_color("slab.bsdf.eta"), 1.5, 4e-3, spp=8192),
 ]

@@ -1,7 +1,7 @@
 """Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
 markers.
 
-The cases are those of ``tests/integrators/all_cases.py``: what the table says is what the tests check.
+The cases are those of ``tests/support/gradient_cases``: what the table says is what the tests check.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NOT_SUPPORTED = (
 
 def measure(case):
     """One case: (reverse mode, its error, finite difference, its error, forward over reverse mode)."""
-    from gradient_cases import Problem
+    from support.gradient_cases.problem import Problem
 
     problem = Problem(case)
     reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
@@ -76,11 +76,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="names of cases")
     arguments = parser.parse_args()
 
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "integrators")]
-    from all_cases import ALL_CASES
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
     from tqdm import tqdm
 
     import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
+    from support.gradient_cases.all_cases import ALL_CASES  # isort: skip
 
     rows = defaultdict(list)
     for case in tqdm(

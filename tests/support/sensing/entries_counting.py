@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import torch
-from contract import Entry
 
+from support.sensing.contract import Entry
 from torchtransient import sensing
 from torchtransient.errors import GradientError, ShapeError, UnitError
 

@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-from gradient_cases import (
-    Case,
-    area_light,
-    camera,
-    glass_slab,
-    mirror_room,
-    move,
-    move_point,
-    room,
-    rotate,
-    set_color,
-    transform,
-)
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, camera, glass_slab, mirror_room, room, transform
+from support.gradient_cases.unknowns import move, move_point, rotate, set_color
 
 VARIANT = "llvm_ad_mono_polarized"
 SPECTRAL = "llvm_ad_spectral_polarized"
