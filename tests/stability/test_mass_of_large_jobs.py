@@ -10,7 +10,7 @@ import pytest
 from torchtransient import plugins
 
 FILM = "torchtransient.plugins.films.base.MAX_SINGLE_PRECISION_SAMPLES"
-LANES = "torchtransient.plugins.integrators.base.MAX_LANES"
+LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
 
 
 @pytest.fixture(autouse=True)

@@ -83,7 +83,7 @@ class Problem:
         case.apply(changes, mi.Float(case.value))
         self.base = {key: dr.copy(self.params[key]) for key in changes}
         # The first look fixes the reference sphere of distant lights.
-        self.scene.integrator().facts(self.scene)
+        self.scene.integrator().reference(self.scene)
 
     def install(self, x):
         """Write the unknown; ``x`` may be attached."""
