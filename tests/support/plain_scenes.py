@@ -52,3 +52,10 @@ def check(a, b):
     result = two_sample_z_test(a, b, rounding=1e-5)
     assert result.passed, str(result)
     assert result.chi2_z < 4.5, str(result)  # equal channels make it small
+
+
+def as_mitsuba(value):
+    """A scene dictionary of ``tt.scenes`` as ``mi.load_dict`` takes it: 4 x 4 arrays become transforms."""
+    if isinstance(value, dict):
+        return {key: as_mitsuba(child) for key, child in value.items()}
+    return mi.ScalarTransform4f(value) if isinstance(value, np.ndarray) and value.shape == (4, 4) else value

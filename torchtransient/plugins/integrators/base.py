@@ -9,6 +9,7 @@ from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
+from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
 from torchtransient.plugins.parameters import check_slope, moving_names
 from torchtransient.plugins.polarized import turning_throughput
@@ -130,6 +131,13 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
         return World(scene, contents, settings, self.strategies(contents), wanted, window)
+
+    def frozen_state(self, scene, sensor=0) -> list:
+        """The arrays that kernels of this scene read beside its parameters, for ``dr.freeze(..., state_fn=...)``: see
+        :mod:`..frozen_state`.
+        """
+        sensor, film = self.resolve(scene, sensor)
+        return arrays_below([self.contents(scene, sensor), vars(film)])
 
     def reference(self, scene):
         """The sphere around the scene as it was first seen, which light from and to infinity is timed by: moving a

@@ -1,0 +1,86 @@
+"""Strategies that the library does not have, written as an author of a new one would: one class each.
+
+Integrators with them are registered by :mod:`.toy_integrators`.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import product, scattered
+from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, distance, solid_angle_over_area
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
+
+
+class SecondEmitterSample(EmitterSampled):
+    """A second point on a light, with random numbers of its own."""
+
+    name = "second_emitter_sample"
+
+
+class OwnPointLight(Connection):
+    """An isotropic point light that is no part of the scene: nothing else can find it, so it needs no weights."""
+
+    name = "own_point_light"
+
+    def __init__(self, position, intensity):
+        self.position, self.intensity = position, intensity
+
+    def propose(self, world, path, vertex, sampler):
+        p = mi.Point3f(self.position)
+        to = p - vertex.at.p
+        ds = Local(p=p, d=dr.normalize(to), dist=dr.norm(to))
+        return Proposal(d=ds.d, active=vertex.goes_on & vertex.connectable, ds=ds, u=mi.Point2f(0.5), sampler=sampler)
+
+    def connect(self, world, path, vertex, proposal, answer, zeros):
+        ds = proposal.ds
+        value = product(path.β, answer.value) * (self.intensity / dr.square(ds.dist))
+        opl = vertex.delay.after(path.τ) + mi.Float64(ds.dist * path.η * answer.eta)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, proposal.active)
+        return Event(value=dr.select(active, value * T, 0), opl=opl, active=active, depth=path.depth + 2, T=T)
+
+    def fields(self, world):
+        return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if world.contents.media is not None else {})
+
+    def record(self, sample):
+        return {"lit": sample.event.active, "T": sample.event.T}
+
+    def attached(self, world, vertex, step, wanted):
+        r, si, p = vertex.v.of(self.name), vertex.scattered_si, mi.Point3f(self.position)
+        lit = r["lit"]
+        fixed = dr.normalize(dr.detach(p - si.p))
+        out = direction_to(si.p, p, lit, fixed)
+        towards = world.scattering.evaluate(world, vertex, out, lit)
+        length = distance(si.p, p, lit)
+        value = scattered(towards.value, vertex.turn) * (self.intensity / dr.square(length)) * r.get("T", 1)
+        end = Local(p=p, d=fixed, far=mi.Bool(False), ahead=False)
+        value *= world.segment.attached_transmittance(world, vertex, end, lit)
+        slope = vertex.scattered_slope
+        if wanted.geometry:
+            slope = slope + slope_only(vertex.carry.η * towards.eta * length)
+        opl = vertex.scattered_opl + mi.Float64(dr.detach(length * towards.eta) * vertex.v.η)
+        return [EventTerm(value=product(vertex.carry.β, dr.select(lit, value, 0)), slope=slope, opl=opl, active=lit)]
+
+
+class AreaOfShape:
+    """A guide: some of the next vertices are drawn uniformly over the area of the shape called ``shape_id``."""
+
+    def __init__(self, shape_id, share):
+        self.shape_id, self.share = shape_id, share
+
+    def prepare(self, world):
+        self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
+        self.per_area = 1 / self.shape.surface_area()
+
+    def draw(self, vertex, sampler):
+        chosen = sampler.next_1d() < self.share
+        return self.shape.sample_position(0.0, sampler.next_2d()).p, chosen
+
+    def density(self, vertex, ray, leg, active):
+        on_it = active & leg.is_valid() & (leg.shape == mi.ShapePtr(self.shape))
+        si = leg.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_it)
+        per_area = solid_angle_over_area(vertex.at.p, si.p, si.n, on_it)
+        return dr.select(on_it & (per_area > 0), self.per_area / per_area, 0)

@@ -1,0 +1,105 @@
+"""What a scene contains is looked up once a scene and does not change afterwards."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from support.gradient_cases.scenes import room
+from torchtransient.plugins.transport.contents import SceneContents
+from torchtransient.plugins.transport.derivative.wanted import Wanted
+
+VARIANT = "llvm_ad_mono"
+
+
+@pytest.fixture
+def scene():
+    return mi.load_dict(room(depth=3), optimize=False)
+
+
+def contents_of(scene):
+    return scene.integrator().contents(scene, scene.sensors()[0])
+
+
+def test_does_not_change(scene):
+    contents = contents_of(scene)
+    with pytest.raises(AttributeError, match="does not change once built"):
+        contents.delta = True
+    with pytest.raises(AttributeError, match="does not change once built"):
+        contents.something = 1
+
+
+def test_built_once_a_scene(scene, monkeypatch):
+    """Renders, backward and forward passes, in several launches and for several seeds, share one look-up."""
+    built = []
+
+    class Counted(SceneContents):
+        def __init__(self, *args):
+            built.append(args)
+            super().__init__(*args)
+
+    module = type(scene.integrator()).__mro__[1].__module__
+    monkeypatch.setattr(f"{module}.SceneContents", Counted)
+    monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 8)
+    integrator, params = scene.integrator(), mi.traverse(scene)
+    shape = scene.sensors()[0].film().cube_shape()
+    for seed in range(2):
+        integrator.render(scene, seed=seed, spp=4)
+        key = "side.bsdf.reflectance.value"
+        value = type(params[key])(params[key])
+        dr.enable_grad(value)
+        params[key] = value
+        params.update()
+        integrator.render_backward(scene, params, (None, dr.ones(mi.TensorXf, shape)), seed=seed, spp=4)
+        dr.set_grad(params[key], 1.0)
+        integrator.render_forward(scene, params, seed=seed, spp=4)
+    assert len(built) == 1
+
+
+def test_of_another_scene_is_looked_up_anew():
+    first, second = (mi.load_dict(room(bsdf=bsdf, depth=3), optimize=False) for bsdf in (None, {"type": "conductor"}))
+    integrator = mi.load_dict({"type": "transient_path", "max_depth": 3})
+    for scene, delta in ((first, False), (second, True), (first, False)):
+        assert integrator.contents(scene, scene.sensors()[0]).delta is delta
+
+
+def test_keeps_no_scene_alive():
+    """The scene owns the integrator: one that kept the scene would never be freed."""
+    scene = mi.load_dict(room(depth=3), optimize=False)
+    contents_of(scene).parameters(scene)
+    integrator = weakref.ref(scene.integrator())
+    gc.disable()
+    try:
+        del scene
+        assert integrator() is None
+    finally:
+        gc.enable()
+
+
+def test_wanted_follows_what_parameters_move(scene):
+    contents, sensor = contents_of(scene), scene.sensors()[0]
+    params = mi.traverse(scene)
+
+    def wanted(*keys):
+        for key in keys:
+            dr.enable_grad(params[key])
+            params.set_dirty(key)
+        params.update()
+        found = Wanted(contents.parameters(scene).attached(), sensor, contents)
+        for key in keys:
+            dr.disable_grad(params[key])
+        params.update()
+        return found
+
+    colour = wanted("side.bsdf.reflectance.value")
+    assert colour.carried == ("β",) and not colour.geometry
+    pose = wanted("wall.to_world")
+    assert pose.geometry and not pose.ray and pose.carried == ("β", "slope", "w")
+    camera = wanted("sensor.to_world")
+    assert camera.sensor and camera.ray and set(camera.carried) == {"β", "slope", "w", "o", "d"}
+    light = wanted("light.position")
+    assert light.light and light.geometry and not light.emitter_shape

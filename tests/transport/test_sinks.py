@@ -1,0 +1,103 @@
+"""The same walk into every sink: what the film gets, the list holds, and the adjoint weighs."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.plain_scenes import as_mitsuba
+from torchtransient.plugins.transport.sinks.adjoint_sum import AdjointSumSink
+from torchtransient.plugins.transport.sinks.event_list import EventListSink
+from torchtransient.plugins.transport.sinks.sink import Sink
+from torchtransient.plugins.transport.walk import walk
+from torchtransient.scenes import cornell_box
+
+VARIANT = "llvm_ad_mono"
+SPP, SEED = 8, 3
+
+
+def scene_of(kind, depth=5):
+    """A Cornell box, one with fog in it, or one with a body of glass."""
+    result = as_mitsuba(cornell_box(resolution=5, num_bins=60, bin_width_opl=0.1, max_depth=depth))
+    if kind == "fog":
+        result["integrator"] = result["integrator"] | {"type": "transient_prbvolpath"}
+        fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.8}
+        result["small-box"] = result["small-box"] | {"bsdf": {"type": "null"}, "interior": fog}
+    if kind == "glass":
+        result["small-box"] = result["small-box"] | {"bsdf": {"type": "dielectric"}}
+    return mi.load_dict(result, optimize=False)
+
+
+def traced(scene, sink_of):
+    """The paths of one pass into the sink that ``sink_of(film, rays, job)`` makes: (sink, what it kept)."""
+    integrator = scene.integrator()
+    with dr.suspend_grad():
+        sensor, film = integrator.resolve(scene, 0)
+        job = integrator.passes(sensor, film, SEED, SPP)[0][0]
+        rays = integrator.start(scene, sensor, film, job)
+        sink = sink_of(integrator, film, rays, job)
+        world = integrator.world(scene, sensor, integrator.contents(scene, sensor))
+        _, kept = walk(world, rays.sampler, dr.detach(rays.ray), integrator.first_opl(film, rays), sink)
+        dr.eval(kept)
+        return sink, kept
+
+
+@pytest.mark.parametrize("kind", ["plain", "fog", "glass"])
+def test_adjoint_sum_is_the_product_with_the_render(kind):
+    scene = scene_of(kind)
+    _, cube = scene.integrator().render(scene, seed=SEED, spp=SPP)
+    weights = np.cos(0.3 * np.arange(int(np.prod(cube.shape)))).astype(np.float32)
+
+    def sink_of(integrator, film, rays, job):
+        base, _ = integrator.pixel_indices(film, job, rays)
+        match = integrator.channel_match(film, rays)
+        return AdjointSumSink(film.create_adjoint_block((mi.Float(weights), 1, 1), base, [mi.Float(0)], match))
+
+    _, kept = traced(scene, sink_of)
+    expected = float((np.array(cube, dtype=np.float64).ravel() * weights).sum())
+    assert np.array(kept["sum"], dtype=np.float64).sum() == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["plain", "fog", "glass"])
+def test_depth_of_an_event_is_that_of_the_render_that_has_it(kind):
+    def sink_of(integrator, film, rays, job):
+        match = integrator.channel_match(film, rays)
+        return EventListSink(dr.width(rays.row), 32, lambda value: dr.mean(value * match.weight))
+
+    sink, _ = traced(scene_of(kind), sink_of)
+    assert int(np.array(sink.used).max()) <= 32
+    depth, energy = np.array(sink.depth), np.array(sink.energy, dtype=np.float64)
+    shares = []
+    for most in range(1, 6):
+        scene = scene_of(kind, depth=most)
+        image = np.array(scene.integrator().render(scene, seed=SEED, spp=SPP)[0], dtype=np.float64)
+        shares.append(image.sum())
+        assert energy[(depth > 0) & (depth <= most)].sum() == pytest.approx(image.sum(), rel=1e-4, abs=1e-9)
+    assert shares[-1] > shares[1] > 0
+
+
+def test_every_event_has_a_place_in_the_list():
+    """A list that is too short says so, and keeps what there was room for."""
+    _, kept = traced(scene_of("plain"), lambda *_: EventListSink(5 * 5 * SPP, 1, dr.mean))
+    assert int(np.array(kept["used"]).max()) > 1
+
+
+def test_a_sink_of_one_s_own():
+    """Sinks are told of every event, whatever strategy found it, and of every vertex."""
+
+    class Counter(Sink):
+        def begin(self, world):
+            return {"events": mi.UInt32(0), "vertices": mi.UInt32(0)}
+
+        def event(self, kept, event):
+            kept["events"] = kept["events"] + dr.select(event.active, mi.UInt32(1), 0)
+
+        def vertex(self, kept, path, samples):
+            kept["vertices"] = kept["vertices"] + dr.select(path.active, mi.UInt32(1), 0)
+
+    _, kept = traced(scene_of("plain"), lambda *_: Counter())
+    vertices, events = np.array(kept["vertices"]), np.array(kept["events"])
+    assert vertices.min() >= 1 and vertices.max() <= 5
+    assert 0 < events.max() <= 2 * vertices.max()
