@@ -111,6 +111,10 @@ class ParameterTracker:
         else:
             self._fixed += [(node, v._replace(flags=v.flags | inherited)) for v in differentiable]
 
+    def effect_of(self, node: Any, key: str, flags: int = 0) -> ParameterEffect:
+        """As the function of this name, with everything that holds the plugin ``node``."""
+        return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
+
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]
         for node, inherited in self._shown_anew:
@@ -121,8 +125,7 @@ class ParameterTracker:
     def attached(self) -> list[tuple[Any, str, ParameterEffect]]:
         """(plugin, key, effect) of the parameters that carry gradients now."""
         return [
-            (node, shown.key, effect_of(node, shown.key, shown.flags, tuple(owners_of(node, self._holders))))
-            for node, shown, _ in self._carrying()
+            (node, shown.key, self.effect_of(node, shown.key, shown.flags)) for node, shown, _ in self._carrying()
         ]
 
     def attached_values(self) -> list[Any]:
@@ -144,21 +147,21 @@ def _is_attribute(node: Any, key: str) -> bool:
 # ----------------------------------------------------------------------------------------------------------- the slope
 
 
-def check_slope(moving: Sequence[str], has_slope: bool, response: str, remedy: str = "") -> None:
-    """Raise ``GradientError`` where a derivative through the time of flight has no slope to go through.
-
-    ``moving``: names of the parameters with a derivative that can change a path length (``moves_length``).
-    ``has_slope`` and ``response``: of the film, whose temporal filter or gate the latter names. ``remedy``: what to do,
-    the end of the message.
-    """
-    if moving and not has_slope:
-        raise GradientError(
-            f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's response over time, "
-            f"{response!r} has no slope: the derivative through the time of flight would be lost. "
-            + (remedy or "Use temporal_filter='auto', 'tent' or 'gaussian'.")
-        )
-
-
 def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:
-    """Names of the parameters out of :func:`attached_effects` that can change a path length."""
-    return list(dict.fromkeys(f"{node.id()}.{key}".lstrip(".") for node, key, effect in effects if effect.moves_length))
+    """Which parameters out of :func:`attached_effects` need a response over time with a slope: those that can change a
+    path length.
+    """
+    named = ((f"{node.id()}.{key}".lstrip("."), effect) for node, key, effect in effects)
+    return list(dict.fromkeys(name for name, effect in named if effect.moves_length))
+
+
+def no_slope(moving: Sequence[str], response: str, remedy: str) -> GradientError:
+    """The error for a derivative through the time of flight that the film's response over time does not have.
+
+    ``moving``: names of the parameters that can change a path length. ``response``: what the film calls its response,
+    its temporal filter or kind of gate. ``remedy``: what to do.
+    """
+    return GradientError(
+        f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's {response!r} has no "
+        f"slope: the derivative through the time of flight would be lost. {remedy}"
+    )
