@@ -55,7 +55,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
     found = []
     for name, (handle, cpptype, node, flags) in params.properties.items():
         value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
-        if dr.grad_enabled(value):
+        if can_carry_gradients(value) and dr.grad_enabled(value):
             key = name.rsplit(".", 1)[-1]
             found.append((node, key, effect_of(node, key, flags, _owners_by_name(params.hierarchy, node, name))))
     return found
@@ -105,7 +105,7 @@ class ParameterTracker:
                     waiting.append((value, inherited | flags))
 
     def _note(self, node: Any, values: list[ShownValue], inherited: int) -> None:
-        differentiable = [v for v in values if _can_carry_gradients(v.read(node))]
+        differentiable = [v for v in values if can_carry_gradients(v.read(node))]
         if any(v.cpptype is None or _is_attribute(node, v.key) for v in differentiable):
             self._shown_anew.append((node, inherited))
         else:
@@ -133,10 +133,11 @@ class ParameterTracker:
         return [value for _, _, value in self._carrying()]
 
 
-def _can_carry_gradients(value: Any) -> bool:
+def can_carry_gradients(value: Any) -> bool:
+    """Whether a parameter is of real numbers that Dr.Jit differentiates, instead of a plain or whole number."""
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
-    return bool(dr.is_diff_v(value) and dr.is_float_v(value))
+    return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
 def _is_attribute(node: Any, key: str) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
 from torchtransient.render.build import BuiltScene
 
@@ -128,7 +129,9 @@ def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node:
 
 
 def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
-    current = built.params[key]
+    # Not by `built.params[key]`, which fails for parameters that are not set, such as the absorption of hair.
+    handle, cpptype, _, _ = built.params.properties[key]
+    current = ShownValue(key, handle, 0, cpptype).read(node)
     name = key.rsplit(".", 1)[-1]
     kind, shape = classify(key, current)
     few = shape is None or int(np.prod(shape, dtype=np.int64)) <= _MAX_LISTED
@@ -162,6 +165,8 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
     """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
     import drjit as dr
 
+    if current is None:
+        return "plain", None
     if is_transform(current):
         size = len(current.matrix)
         return "transform" if dr.is_jit_v(current.matrix) else "plain", (size, size)
@@ -188,6 +193,8 @@ def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
 
     if is_transform(current):
         current = current.matrix
+    elif current is None:
+        return None
     elif not dr.is_array_v(current):
         return current if shape == () else type(current).__name__
     # Arrays of width one come with a trailing dimension of one.
