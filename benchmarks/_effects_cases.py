@@ -110,7 +110,7 @@ def gate() -> dict[str, Any]:
 MEDIA = (("integrator", "transient_prbvolpath"),)
 PHASOR = (("film", "phasor_hdr_film"),)
 ALBEDO, WHITE, WALL = "red.reflectance.value", "white.reflectance.value", "red-wall.to_world"
-RGB, SPECTRAL = "llvm_ad_rgb", "llvm_ad_spectral"
+SPECTRAL = "llvm_ad_spectral"
 POLARIZED_MONO, POLARIZED_SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
 VOLUME, SMOOTH = integrator("transient_prbvolpath"), with_glass_and_metal
 

@@ -2,6 +2,8 @@
 
 The rules: every side runs in one call of one script, A B A B; warm-up before the first timed run; the timed region ends
 after `dr.eval` and `dr.sync_thread`; seeds are pinned; medians and interquartile ranges are reported, never a best run.
+Measured is the checkout that this file belongs to, in child processes too, whatever is installed: import this module
+before `torchtransient`.
 """
 
 from __future__ import annotations
@@ -21,6 +23,9 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+sys.path.insert(0, str(ROOT))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
 
 
 def arguments(description: str | None, *, peer: bool = True) -> argparse.ArgumentParser:
@@ -37,26 +42,17 @@ def arguments(description: str | None, *, peer: bool = True) -> argparse.Argumen
     return parser
 
 
-class Worker:
-    """A `_worker.py` process. `python` runs it; the environment is inherited, but for PYTHONPATH in foreign ones."""
+class ChildProcess:
+    """A process that reads one JSON object per line and answers each with one line; it speaks first."""
 
-    def __init__(self, library: str, variant: str, python: str | None = None) -> None:
-        environment = dict(os.environ)
-        if library != "torchtransient":
-            environment.pop("PYTHONPATH", None)
-        self.process = subprocess.Popen(
-            [python or sys.executable, str(HERE / "_worker.py"), library, variant],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
-        self.versions = self._answer()
+    def __init__(self, command: Sequence[str], **popen: Any) -> None:
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **popen)
+        self.greeting = self._answer()
 
     def ask(self, **request: Any) -> dict[str, Any]:
-        """Send one request and wait for its answer; RuntimeError when the worker ended instead."""
+        """Send one request and wait for its answer; RuntimeError when the process ended instead."""
         if self.process.stdin is None:
-            raise RuntimeError("the worker has no input")
+            raise RuntimeError("the process has no input")
         self.process.stdin.write(json.dumps(request) + "\n")
         self.process.stdin.flush()
         return self._answer()
@@ -64,7 +60,7 @@ class Worker:
     def _answer(self) -> dict[str, Any]:
         line = self.process.stdout.readline() if self.process.stdout else ""
         if not line:
-            raise RuntimeError(f"the worker ended with exit code {self.process.wait()}; its messages are above")
+            raise RuntimeError(f"a process ended with exit code {self.process.wait()}; its messages are above")
         answer: dict[str, Any] = json.loads(line)
         return answer
 
@@ -73,6 +69,45 @@ class Worker:
         if self.process.stdin:
             self.process.stdin.close()
         self.process.wait(timeout=60)
+
+
+class Worker(ChildProcess):
+    """A `_worker.py` process. `python` runs it; `checkout` has the package that it imports.
+
+    With `cache`, an empty folder, Dr.Jit finds no kernel of an earlier run. A foreign library runs in the environment
+    of its own `python`.
+    """
+
+    def __init__(
+        self, library: str, variant: str, python: str | None = None, checkout: Path = ROOT, cache: Path | None = None
+    ) -> None:
+        environment = dict(os.environ)
+        ours = library == "torchtransient"
+        if ours:
+            environment["PYTHONPATH"] = os.pathsep.join((str(checkout), environment["PYTHONPATH"]))
+        else:
+            del environment["PYTHONPATH"]
+        if cache is not None:
+            environment["DRJIT_CACHE_DIR"] = str(cache)
+        command = [python or sys.executable, str(HERE / "_worker.py"), library, variant]
+        super().__init__(command, env=environment, cwd=checkout if ours else None)
+        package = self.greeting.pop("package")
+        self.versions = self.greeting
+        if ours:
+            self.versions["commit"] = commit_of(checkout)
+            if Path(package).resolve() != (checkout / "torchtransient").resolve():
+                raise RuntimeError(f"expected the package of {checkout}, the worker imported {package}")
+
+
+def commit_of(checkout: Path) -> str | None:
+    """Which commit a checkout is at, with a `+` when files differ from it; None outside of git."""
+    git = ["git", "-C", str(checkout)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], check=True, capture_output=True, text=True)
+        state = subprocess.run([*git, "status", "--porcelain", "-uno"], check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit.stdout.strip() + ("+" if state.stdout else "")
 
 
 def encoded(node: Any) -> Any:
@@ -106,9 +141,10 @@ def interleave(cases: Mapping[str, Callable[[int], float]], repeats: int, warm_u
 
 
 def summary(values: Sequence[float]) -> dict[str, Any]:
-    """Median, quartiles and the values themselves."""
+    """Median, quartiles, extremes and the values themselves."""
     low, high = np.percentile(values, [25, 75])
-    return {"median": statistics.median(values), "q25": float(low), "q75": float(high), "runs": list(values)}
+    quartiles = {"median": statistics.median(values), "q25": float(low), "q75": float(high)}
+    return {**quartiles, "min": min(values), "max": max(values), "runs": list(values)}
 
 
 def ratio(seconds: Mapping[str, Sequence[float]], name: str, anchor: str, bar: float | None = None) -> dict[str, Any]:
@@ -142,6 +178,11 @@ def _without_verdicts(node: Any) -> Any:
     return node
 
 
+def spread(row: Mapping[str, Any]) -> str:
+    """Quartiles and extremes of a summary, to print."""
+    return f"[{row['q25']:.3f}, {row['q75']:.3f}]  ({row['min']:.3f} to {row['max']:.3f})"
+
+
 def report(name: str, settings: Mapping[str, Any], results: Mapping[str, Any], path: Path | None) -> None:
     """Print `results` as a table and write everything as JSON if a path was given. A quick run judges no bar."""
     if settings.get("quick"):
@@ -153,9 +194,21 @@ def report(name: str, settings: Mapping[str, Any], results: Mapping[str, Any], p
         print(f"  {case:<44} {row['median']:>10.4f} s   [{row['q25']:.4f}, {row['q75']:.4f}]")
     for row in results.get("ratios", []):
         bar = "" if "bar" not in row else f"   bar {row['bar']:.2f}: {'reached' if row['within'] else 'MISSED'}"
-        print(f"  {row['of']} / {row['to']}: {row['median']:.3f}   [{row['q25']:.3f}, {row['q75']:.3f}]{bar}")
+        print(f"  {row['of']} / {row['to']}: {row['median']:.3f}   {spread(row)}{bar}")
+    for row in results.get("first_calls", []):
+        print(f"  first call of {row['row']}:")
+        for side in (side for side in ("torchtransient", "baseline") if side in row):
+            found = row[side]
+            counts = f"{found['kernels']} kernels, {found['launches']} launches"
+            kernels = f"{counts}, {found['operations']} operations, {found['ir_bytes']} bytes"
+            times = f"{found['seconds']['median']:.3f} s, compiled in {found['compile_seconds']['median']:.3f} s"
+            print(f"    {side:<16} {kernels}; {times}")
+        for what in ("seconds", "compile_seconds"):
+            over = row.get(f"{what}_over_baseline")
+            if over:
+                print(f"    {what} over baseline: {over['median']:.3f}   {spread(over)}")
     for key, value in results.items():
-        if key not in ("cases", "ratios"):
+        if key not in ("cases", "ratios", "first_calls"):
             print(f"  {key}: {value}")
     if path is not None:
         data = {"benchmark": name, "settings": dict(settings), **results}

@@ -5,6 +5,7 @@ the named library, so that each side of a comparison runs in its own environment
   {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
   {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
+  {"do": "first", "what": "render" or "backward", "name", "spp", "seed"}   with its kernels -> {"seconds", "kernels"}
   {"do": "memory"}                                                                     -> {"peak_bytes"}
 A scene is a Mitsuba dictionary with {"matrix": 4x4} for transforms, or {"xml": path, "parameters": {...}}.
 """
@@ -97,6 +98,14 @@ class Job:
         gradients = {key: np.array(value, dtype=np.float64).ravel().tolist() for key, value in found.items()}
         return {"seconds": seconds, "gradients": gradients}
 
+    def first(self, what, spp, seed):
+        """A render or backward pass with the kernels that it launched, each once."""
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            answer = getattr(self, what)(spp, seed)
+            history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+        return {"seconds": answer["seconds"], "kernels": kernels_of(history)}
+
     def attach(self):
         """Fresh leaves: the value itself, or how far a transform is shifted along its direction."""
         leaves = {}
@@ -120,6 +129,22 @@ def pattern(image):
     return mi.TensorXf(dr.sin(dr.arange(mi.Float, size) * 0.01) / size, image.shape)
 
 
+def kernels_of(history):
+    """Hash, sizes, seconds of code generation and compilation, and launches of every kernel, in the order of launch."""
+    kernels = {}
+    for entry in history:
+        ir = entry["ir"] if isinstance(entry["ir"], str) else entry["ir"].getvalue()
+        kernel = {
+            "hash": str(entry["hash"]),
+            "operations": entry["operation_count"],
+            "ir_bytes": len(ir),
+            "compile_seconds": 1e-3 * (entry["codegen_time"] + entry["backend_time"]),
+            "launches": 0,
+        }
+        kernels.setdefault(kernel["hash"], kernel)["launches"] += 1
+    return list(kernels.values())
+
+
 def answer_to(request, jobs):
     """Carry out one request."""
     match request["do"]:
@@ -130,6 +155,8 @@ def answer_to(request, jobs):
             return jobs[request["name"]].render(request["spp"], request["seed"])
         case "backward":
             return jobs[request["name"]].backward(request["spp"], request["seed"])
+        case "first":
+            return jobs[request["name"]].first(request["what"], request["spp"], request["seed"])
         case "memory":
             return {"peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}
     raise ValueError(f"unknown request {request['do']!r}")
@@ -140,7 +167,8 @@ def main():
     jobs = {}
     start(library, variant)
     versions = {"python": sys.version.split()[0], "mitsuba": mi.__version__, "drjit": dr.__version__}
-    print(json.dumps(versions), file=ANSWERS)
+    package = os.path.dirname(sys.modules[library].__file__)
+    print(json.dumps({**versions, "package": package}), file=ANSWERS)
     for line in sys.stdin:
         # An error ends the process: its trace is on stderr, and the driver stops at the missing answer.
         print(json.dumps(answer_to(json.loads(line), jobs)), file=ANSWERS)

@@ -9,47 +9,24 @@ different; the factor then compares two scenes). `--docs` writes `docs/effects.m
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 from _effects_cases import CASES, Case
-from _runner import HERE, arguments, environment, summary
+from _runner import HERE, ChildProcess, arguments, environment, summary
 
 DOCS = HERE.parent / "docs"
 # Rounds whose times are not kept: the first compiles.
 WARM_UP = 2
 
 
-class CaseProcess:
+class CaseProcess(ChildProcess):
     """A case in a process of its own."""
 
     def __init__(self, case: Case, resolution: int, spp: int) -> None:
-        command = [sys.executable, str(HERE / "_effects_cases.py"), case.name, str(resolution), str(spp)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.unavailable: str | None = self._answer()["unavailable"]
-
-    def ask(self, **request: Any) -> dict[str, Any]:
-        """Send one request and wait for the answer."""
-        if self.process.stdin is None:
-            raise RuntimeError("the process of a case has no input")
-        self.process.stdin.write(json.dumps(request) + "\n")
-        self.process.stdin.flush()
-        return self._answer()
-
-    def _answer(self) -> dict[str, Any]:
-        line = self.process.stdout.readline() if self.process.stdout else ""
-        if not line:
-            raise RuntimeError(f"a case ended with exit code {self.process.wait()}; its messages are above")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
-
-    def close(self) -> None:
-        """Let the process end."""
-        if self.process.stdin:
-            self.process.stdin.close()
-        self.process.wait(timeout=60)
+        super().__init__([sys.executable, str(HERE / "_effects_cases.py"), case.name, str(resolution), str(spp)])
+        self.unavailable: str | None = self.greeting["unavailable"]
 
 
 def measure(case: Case, plain: CaseProcess, options: Any, resolution: int, spp: int, repeats: int) -> dict[str, Any]:

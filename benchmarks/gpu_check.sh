@@ -15,5 +15,4 @@ if ! "$python" -c 'import torch, sys; sys.exit(not torch.cuda.is_available())'; 
     echo "gpu_check: torch has no CUDA here; install a torch build with CUDA (the default constraints take the CPU build)." >&2
     exit 3
 fi
-export PYTHONPATH="$(dirname "$here")${PYTHONPATH:+:$PYTHONPATH}"
 exec "$python" "$here/gpu_check.py" "$@"

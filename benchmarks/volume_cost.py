@@ -3,17 +3,21 @@
 Cornell box, 128 x 128, 64 spp, depth 8, 300 bins, with a homogeneous medium in a block of its own (an open boundary),
 with the same density found by delta tracking, and in the whole room (the walls bound it, the camera stands in it). Bar:
 1.10 x `prbvolpath` with the homogeneous block. `prbvolpath` does not know of media around a sensor, so the fog is
-compared with `volpath` alone. With `--peer-python` the peer runs between our runs.
+compared with `volpath` alone. `--gradients` times render and backward pass, too. With `--peer-python` the peer runs
+between our runs.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from _runner import Worker, arguments, encoded, environment, interleave, ratio, report, steady, summary
+from _comparison import OURS, PEER, Comparison, Row, comparison_arguments, wants_gradients, with_tent
+from _runner import steady
 
 from torchtransient.scenes import cornell_box
 
-BAR = 1.10
+BARS = {("block", "prbvolpath"): 1.10}
+DENSITY = "cloud.interior_medium.sigma_t.value.value"
+WALL = {"red-wall.to_world": [1.0, 0.0, 0.0]}
 
 
 def with_block(scene: dict, medium: dict) -> dict:
@@ -49,37 +53,35 @@ def scenes_of(resolution: int, spp: int) -> dict[str, dict]:
     }
 
 
+def rows(scenes: dict[str, dict]) -> list[Row]:
+    """Every scene, and the same for Mitsuba's own integrators."""
+    found = []
+    for name, scene in scenes.items():
+        integrators = ("volpath",) if name == "fog" else ("volpath", "prbvolpath")
+        bars = {f"{name}, {integrator}": BARS.get((name, integrator)) for integrator in integrators}
+        found.append(Row(name, scene, against=bars))
+        found += [Row(f"{name}, {i}", steady(scene, i), control=True) for i in integrators]
+    return found
+
+
+def backward_rows(scenes: dict[str, dict]) -> list[Row]:
+    """Render and backward pass: the density, and with it the position of a wall."""
+    return [
+        Row("block: density", scenes["block"], (DENSITY,), against={"block": None}),
+        Row("block: density and wall", with_tent(scenes["block"]), (DENSITY,), WALL, {"block": None}),
+        Row("tracked block: density", scenes["tracked block"], (DENSITY,), against={"tracked block": None}),
+    ]
+
+
 def main() -> None:
-    options = arguments(__doc__).parse_args()
+    options = comparison_arguments(__doc__, gradients=True).parse_args()
     resolution, spp = (16, 4) if options.quick else (128, 64)
-    repeats = options.repeats or (2 if options.quick else 9)
     scenes = scenes_of(resolution, spp)
-    libraries = {"torchtransient": Worker("torchtransient", options.variant)}
-    if options.peer_python:
-        libraries["mitransient"] = Worker("mitransient", options.variant, options.peer_python)
-    cases, pairs = {}, []
-    for library, worker in libraries.items():
-        for name, scene in scenes.items():
-            jobs = {f"{library}: {name}": scene, f"{library}: {name}, volpath": steady(scene, "volpath")}
-            if name != "fog":
-                jobs[f"{library}: {name}, prbvolpath"] = steady(scene, "prbvolpath")
-            for job, description in jobs.items():
-                worker.ask(do="load", name=job, scene=encoded(description))
-                cases[job] = lambda seed, w=worker, n=job: w.ask(do="render", name=n, spp=spp, seed=seed)["seconds"]
-            pairs += [(f"{library}: {name}", job) for job in jobs if job != f"{library}: {name}"]
-    seconds = interleave(cases, repeats)
-    bars = {("torchtransient: block", "torchtransient: block, prbvolpath"): BAR}
-    ratios = [ratio(seconds, *pair, bars.get(pair)) for pair in pairs]
-    for worker in libraries.values():
-        worker.close()
-    settings = {"resolution": resolution, "spp": spp, "max_depth": 8, "repeats": repeats, "quick": options.quick}
-    results = {
-        "cases": {name: summary(values) for name, values in seconds.items()},
-        "ratios": ratios,
-        "environment": environment(options.variant),
-        "workers": {library: worker.versions for library, worker in libraries.items()},
-    }
-    report("volume_cost", settings, results, options.json)
+    comparison = Comparison(options, spp)
+    comparison.add(OURS, rows(scenes) + (backward_rows(scenes) if wants_gradients(options) else []))
+    comparison.add(PEER, rows(scenes))
+    settings = {"resolution": resolution, "spp": spp, "max_depth": 8}
+    comparison.run("volume_cost", settings, options.json)
 
 
 if __name__ == "__main__":

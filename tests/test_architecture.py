@@ -1,11 +1,13 @@
-"""Imports go down the levels of the package or stay in their room; the two pillars meet in `render/` only.
+"""Imports go down the levels of the package or stay in their room, without circles; the two pillars meet in `render/`.
 
-Every import of every file is read with `ast`, the ones inside functions too.
+Every import of every file is read with `ast`, the ones inside functions too. Tests share through `tests/support`, and
+benchmarks do without tests.
 """
 
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -13,16 +15,18 @@ import pytest
 import torchtransient
 
 PACKAGE = Path(torchtransient.__file__).parent
+TESTS = Path(__file__).parent
+BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0,
-    "plugins": 1, "sensing": 1, "nlos": 1, "losses": 1, "metrics": 1, "vis": 1,
+    "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
-    "data": 4, "accuracy": 4, "testing": 4,
+    "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
     "cli": 5,
 }  # fmt: skip
-TORCH_PILLAR = {"sensing", "nlos", "losses", "metrics", "vis"}
+TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "vis"}
 MITSUBA = {"mitsuba", "drjit"}
 # Packages that a room does without: the one pillar's world in the other, and everything bound to a variant at level 0.
 FORBIDDEN = {
@@ -31,12 +35,14 @@ FORBIDDEN = {
     "errors": {"torch", *MITSUBA},
     "units": MITSUBA,
     "axes": MITSUBA,
+    "capture": MITSUBA,
     "stokes": MITSUBA,
     "interfaces": {"torch", *MITSUBA},
     **dict.fromkeys(TORCH_PILLAR, MITSUBA),
 }
 HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich"}
 FILES = sorted(PACKAGE.rglob("*.py"))
+MOST_LINES = {"file": 400, "function": 160}
 
 
 def dotted(path):
@@ -49,11 +55,13 @@ def room_of(module):
     return parts[1] if len(parts) > 1 and parts[1] != "__init__" else None
 
 
-def imports(path, package=PACKAGE):
-    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+def imports(path, package=PACKAGE, *, for_types=True):
+    """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`.
+
+    `for_types`: those under `if TYPE_CHECKING:` too.
+    """
     here = ("torchtransient", *path.relative_to(package).parent.parts)
-    for node in ast.walk(tree):
+    for node in nodes(ast.parse(path.read_text(encoding="utf-8")), for_types):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -62,6 +70,45 @@ def imports(path, package=PACKAGE):
             module = ".".join((*base, *((node.module,) if node.module else ())))
             for alias in node.names:
                 yield node.lineno, f"{module}.{alias.name}"
+
+
+def nodes(tree, for_types):
+    """The nodes of a syntax tree, with or without what stands under `if TYPE_CHECKING:`."""
+    for node in ast.iter_child_nodes(tree):
+        yield node
+        if not for_types and isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            for other in node.orelse:
+                yield other
+                yield from nodes(other, for_types)
+        else:
+            yield from nodes(node, for_types)
+
+
+def import_circles(package=PACKAGE):
+    """The sets of modules that import each other, in whatever order and wherever the imports stand."""
+    files = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = ("torchtransient", *path.relative_to(package).with_suffix("").parts)
+        files[".".join(parts).removesuffix(".__init__")] = path
+    edges = {}
+    for module, path in files.items():
+        names = {name for _, name in imports(path, package, for_types=False)}
+        # A name of a package that is no module of its own stands in the package's `__init__`.
+        edges[module] = {name if name in files else name.rpartition(".")[0] for name in names} & set(files) - {module}
+    reached = {module: reachable(module, edges) for module in edges}
+    circles = {frozenset(m for m in reached[module] if module in reached[m]) for module in edges}
+    return sorted(sorted(circle) for circle in circles if circle)
+
+
+def reachable(start, edges):
+    """All that follows from one node of a graph; the node itself only when a circle leads back to it."""
+    found, waiting = set(), list(edges[start])
+    while waiting:
+        module = waiting.pop()
+        if module not in found:
+            found.add(module)
+            waiting.extend(edges[module])
+    return found
 
 
 def violations(path, package=PACKAGE):
@@ -108,6 +155,61 @@ def test_heavy_packages_are_imported_where_they_are_used(path):
         assert not {n.split(".")[0] for n in names} & HEAVY, f"{path.name}:{node.lineno}"
 
 
+def test_no_circle_of_imports():
+    circles = import_circles()
+    circles = [circle for circle in circles if not all(m.startswith("torchtransient.render.") for m in circle)]
+    assert circles == []
+
+
+def test_sizes():
+    """A file holds one subject and a function one step; a sampling loop is the longest there is."""
+    for path in FILES:
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= MOST_LINES["file"], dotted(path)
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
+
+
+def from_tests(path):
+    """What a file takes from the tests: imports of their modules, and paths into their folder."""
+    own = {p.stem for p in TESTS.glob("*") if not p.name.startswith("_")} | {"tests"}
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (f"import {a.name}" for a in node.names if a.name.split(".")[0] in own)
+        elif isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] in own:
+            yield f"from {node.module}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield from (f"the path {node.value}" for part in re.split(r"[/\\\\]", node.value) if part == "tests")
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda p: p.stem)
+def test_benchmarks_do_without_tests(path):
+    assert list(from_tests(path)) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["from support.gradient_cases.problem import Case", "import tests.support", "import support", 'FOLDER = "tests"',
+     "def f():\n    from support import cubes", 'sys.path.append("../tests/support")'],
+)  # fmt: skip
+def test_what_benchmarks_may_not_do(tmp_path, line):
+    path = tmp_path / "script.py"
+    path.write_text(line + "\n", encoding="utf-8")
+    assert len(list(from_tests(path))) == 1
+
+
+def test_tests_share_through_their_support():
+    """A bare name of another test file depends on which folders are on the path."""
+    shared = {p.stem for p in TESTS.rglob("*.py") if p.parent != TESTS} - {"__init__"}
+    for path in TESTS.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
+
+
 def test_every_package_has_a_level():
     rooms = {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
     assert rooms <= set(LEVEL)
@@ -129,6 +231,13 @@ def test_every_package_has_a_level():
         ("plugins", "from torchtransient import vis", "imports 'vis'"),
         ("scenes", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
         ("testing", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
+        ("capture", "def f():\n    import mitsuba as mi", "must not know mitsuba"),
+        ("capture", "from torchtransient.reconstruction import fk", "imports 'reconstruction'"),
+        ("reconstruction", "import mitsuba as mi", "must not know mitsuba"),
+        ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
+        ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
+        ("render", "from torchtransient.nlos import simulate", "imports 'nlos'"),
+        ("nlos", "from torchtransient.data import result_file", "imports 'data'"),
         ("toolbox", "import os", "has no level"),
     ],
 )
@@ -142,18 +251,46 @@ def test_the_rules_bite(tmp_path, room, line, message):
 
 
 @pytest.mark.parametrize(
-    "line",
+    ("room", "line"),
     [
-        "import mitsuba as mi",
-        "import mitsuba.python.ad.integrators.common as common",
-        "from mitsuba.python.ad.integrators.common import RBIntegrator",
-        "from torchtransient.errors import SceneError",
-        "from ..errors import SceneError",
-        "from . import _registry",
+        ("plugins", "import mitsuba as mi"),
+        ("plugins", "import mitsuba.python.ad.integrators.common as common"),
+        ("plugins", "from mitsuba.python.ad.integrators.common import RBIntegrator"),
+        ("plugins", "from torchtransient.errors import SceneError"),
+        ("plugins", "from ..errors import SceneError"),
+        ("plugins", "from . import _registry"),
+        ("capture", "import torch"),
+        ("reconstruction", "import torch"),
+        ("reconstruction", "from torchtransient.capture import Scan"),
+        ("nlos", "import mitsuba as mi"),
+        ("nlos", "from torchtransient.capture import Scan, Capture"),
+        ("nlos", "from torchtransient.reconstruction import fk"),
+        ("nlos", "from torchtransient.render.renderer import TransientRenderer"),
     ],
 )
-def test_what_plugins_may_import(tmp_path, line):
-    path = tmp_path / "plugins" / "module.py"
+def test_what_rooms_may_import(tmp_path, room, line):
+    path = tmp_path / room / "module.py"
     path.parent.mkdir()
     path.write_text(line + "\n", encoding="utf-8")
     assert list(violations(path, tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "closed"),
+    [
+        ("from torchtransient.vis import second", "from torchtransient.vis.first import a", True),
+        ("import torchtransient.vis.second", "from . import first", True),
+        ("def f():\n    from torchtransient.vis.second import b", "from .first import a", True),
+        ("from torchtransient.vis.second import b", "", False),
+        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", False),
+        ("if TYPE_CHECKING:\n    import os\nelse:\n    from .second import b", "from .first import a", True),
+        ("from torchtransient.vis import name", "", True),  # the package's `__init__` imports both
+    ],
+)
+def test_circles_are_found(tmp_path, first, second, closed):
+    folder = tmp_path / "vis"
+    folder.mkdir()
+    texts = {"__init__": "from .first import a\nfrom .second import b", "first": first, "second": second}
+    for name, text in texts.items():
+        (folder / f"{name}.py").write_text(text + "\n", encoding="utf-8")
+    assert bool(import_circles(tmp_path)) == closed

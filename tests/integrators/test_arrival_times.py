@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from plain_scenes import T, camera, load, runs
 
+from support.plain_scenes import T, camera, load, runs
 from torchtransient import plugins
 
 
@@ -97,7 +97,7 @@ def test_clock_of_distant_light_does_not_depend_on_merged_shapes():
     spheres = []
     for optimize in (False, True):
         scene = mi.load_dict(description, optimize=optimize)
-        spheres.append(scene.integrator().facts(scene).distant)
+        spheres.append(scene.integrator().reference(scene))
     np.testing.assert_allclose(
         [*spheres[0].center, spheres[0].radius], [*spheres[1].center, spheres[1].radius], rtol=1e-6
     )
@@ -109,7 +109,7 @@ def test_clock_of_a_second_scene_is_its_own():
     integrator = mi.load_dict({"type": "transient_path"})
     for size in (1.0, 2.0, 3.0, 1.5):
         scene = mi.load_dict({"type": "scene", "wall": wall(size=size), "sky": {"type": "constant"}})
-        assert integrator.facts(scene).distant.radius == pytest.approx(size * np.sqrt(2), rel=1e-6)
+        assert integrator.reference(scene).radius == pytest.approx(size * np.sqrt(2), rel=1e-6)
         del scene
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradient_cases import camera, film, room
 from scipy.stats import gamma
 
 import torchtransient as tt
+from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError

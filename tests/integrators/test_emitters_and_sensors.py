@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from lights_and_sensors import (
+
+from support.lights_and_sensors import (
     HALF,
     LIGHTS,
     RHO,
@@ -24,7 +25,6 @@ from lights_and_sensors import (
     plane,
     scene,
 )
-
 from torchtransient import plugins
 from torchtransient._collection import no_collection
 from torchtransient.testing.statistics import two_sample_z_test

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from all_cases import ALL_CASES
-from gradient_cases import Problem
+
+from support.gradient_cases.all_cases import ALL_CASES
+from support.gradient_cases.problem import Problem
 
 SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from plain_scenes import T, camera, check, load, mitsuba_runs, runs
 
+from support.plain_scenes import T, camera, check, load, mitsuba_runs, runs
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError, VariantError
 

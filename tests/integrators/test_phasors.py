@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from plain_scenes import T, camera, load
 
+from support.plain_scenes import T, camera, load
 from torchtransient import plugins
 from torchtransient.plugins.films import phasor_events
 from torchtransient.testing.statistics import two_sample_z_test, z_test

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
 
+from support.media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.testing.statistics import two_sample_z_test
 

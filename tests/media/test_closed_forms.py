@@ -4,9 +4,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import T, film, homogeneous, load, rgb, runs, volume
 
-from torchtransient.plugins.integrators.path_record import read_vertex
+from support.media_scenes import T, film, homogeneous, load, rgb, runs, volume
+from torchtransient.plugins.transport.derivative.wanted import Wanted
+from torchtransient.plugins.transport.sinks.record import RecordedVertex, RecordSink
+from torchtransient.plugins.transport.walk import walk
 from torchtransient.testing.statistics import z_test
 
 VARIANT = "llvm_ad_mono"
@@ -28,20 +30,22 @@ def vertices(scene, lanes, seed):
     ones of a path that has ended are infinitely far in time.
     """
     integrator, sensor = scene.integrator(), scene.sensors()[0]
-    facts = integrator.facts(scene, sensor).with_gradients(scene, sensor)
+    contents = integrator.contents(scene, sensor)
+    world = integrator.world(scene, sensor, contents, Wanted([], sensor, contents))
     sampler = sensor.sampler().clone()
     sampler.seed(seed, lanes)
     with dr.suspend_grad():
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
         ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
-        count, store = integrator.trace(scene, sampler, ray, mi.Float64(0), None, facts, record=True)
+        sink = RecordSink()
+        count, store = walk(world, sampler, ray, mi.Float64(0), sink)
         points, lengths, weights = [], [], []
         for k in range(integrator.max_depth):
             there = mi.UInt32(k) < count
-            v = read_vertex(store, mi.UInt32(k), there, ray.time, ray.wavelengths)
-            points.append(v.ray(v.medium.t))
+            v = RecordedVertex(sink.layout, store, mi.UInt32(k), there, ray)
+            points.append(v.ray(v.t))
             lengths.append(dr.select(there, v.τ, dr.inf))
-            weights.append(v.β[0])
+            weights.append(v.β[0] * v.weight[0])
         dr.eval(points, lengths, weights)
     stack = [np.array(p).T for p in points], [np.array(x) for x in lengths], [np.array(x) for x in weights]
     return [np.stack(x, axis=1) for x in stack]

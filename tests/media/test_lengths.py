@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from media_scenes import T, block, camera, clouds, film, homogeneous, load, runs, volume
 
+from support.media_scenes import T, block, camera, clouds, film, homogeneous, load, runs, volume
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 VARIANT = "llvm_ad_mono"

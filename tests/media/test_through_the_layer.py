@@ -8,9 +8,9 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from media_scenes import block, camera, clouds, homogeneous
 
 import torchtransient as tt
+from support.media_scenes import block, camera, clouds, homogeneous
 from torchtransient.render.variant import active_variant
 
 VARIANT = "llvm_ad_rgb"
@@ -159,7 +159,7 @@ def test_dropped_scenes_stay_until_a_kernel_is_traced(monkeypatch, explode):
 
     Scenes that hang in reference cycles are left to the collector, which runs whenever enough objects were made.
     """
-    from torchtransient.plugins.integrators.media import free_flight
+    from torchtransient.plugins.transport.segment import free_flight
 
     class Cycle:
         pass
@@ -218,7 +218,7 @@ def test_scenes_are_freed_at_once():
 
 
 def test_a_scene_dropped_by_another_thread_waits_for_the_trace(monkeypatch):
-    from torchtransient.plugins.integrators.media import free_flight
+    from torchtransient.plugins.transport.segment import free_flight
 
     def renderer():
         scene = steady_scene("volpath", **block(homogeneous(1.0, 0.8)))

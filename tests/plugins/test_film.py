@@ -13,6 +13,7 @@ from scipy.special import erf
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.films.temporal_filter import make_temporal_filter
+from torchtransient.testing.film_storage import storage
 
 FILTERS = [("box", 0.5), ("tent", 0.5), ("gaussian", 0.2), ("gaussian", 0.5), ("gaussian", 1.3), ("gaussian", 3.0)]
 BINS, WIDTH, START = 40, 0.25, 2.0
@@ -55,9 +56,9 @@ def exact_weights(name, stddev, x):
 def put_each(film, x, value=1.0):
     """Every arrival ``x`` (in bins) in a pixel of its own: histograms (n, T, C) and the fractions before and after."""
     n, channels = len(x), film.channel_count()
-    cube = dr.zeros(mi.Float, n * film.entries_per_pixel())
+    cube = storage(film, n * film.entries_per_pixel())
     base = dr.arange(mi.UInt32, n) * film.entries_per_pixel()
-    before, after = film.put(cube, base, mi.Float64(x * WIDTH), [mi.Float(value)] * channels, mi.Bool(True))
+    before, after = film.put(0, base, mi.Float64(x * WIDTH), [mi.Float(value)] * channels, mi.Bool(True))
     return np.array(cube, dtype=float).reshape(n, BINS, channels), np.array(before), np.array(after)
 
 
@@ -96,8 +97,8 @@ def test_read_is_the_transpose_of_put(name, stddev, layout):
     value, g = rng.normal(size=(3, n)), rng.normal(size=(pixels, BINS, 3))
     active = mi.Bool(rng.random(n) > 0.1)
     opl = mi.Float64(x * WIDTH)
-    cube = dr.zeros(mi.Float, pixels * BINS * 3)
-    film.put(cube, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
+    cube = storage(film, pixels * BINS * 3)
+    film.put(0, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
     if layout == "film":
         adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (BINS * 3)
     else:  # (C, T, pixels), as a torch gradient comes
@@ -144,8 +145,8 @@ def test_forward_splat_is_the_transpose_of_value_and_slope(name, stddev):
     n = 300
     opl, active = mi.Float64(rng.uniform(-4, BINS + 4, n) * WIDTH), mi.Bool(True)
     df, f_dtau, g = rng.normal(size=(3, n)), rng.normal(size=(3, n)), rng.normal(size=BINS * 3)
-    cube = dr.zeros(mi.Float, BINS * 3)
-    film.put_slope(cube, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in f_dtau], active)
+    cube = storage(film, BINS * 3)
+    film.put_slope(0, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in f_dtau], active)
     A, slope = film.read((mi.Float(g), 3, 1), mi.UInt32(0), opl, active)
     read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * f_dtau[c]).sum(dtype=float) for c in range(3))
     stored = np.array(cube, dtype=float)
@@ -159,9 +160,8 @@ def test_exhaustive_layout():
     row, column, laser_row, laser_column, k = 1, 2, 3, 1, 17
     base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
     value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
-    flat = film.bands[0][2]
     film.put(
-        flat, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
+        0, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
     )
     steady, transient = film.develop()
     assert steady.shape == (2, 3, 3)

@@ -13,6 +13,7 @@ from torchtransient import plugins
 from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.testing.film_storage import storage
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room
 from torchtransient.testing.statistics import two_sample_z_test
 
@@ -51,9 +52,9 @@ def expected(film, x):
 def test_weights_are_those_of_the_gates(name):
     film, x = make_film(SETS[name]), arrivals()
     size = film.entries_per_pixel()
-    cube = dr.zeros(mi.Float, len(x) * size)
+    cube = storage(film, len(x) * size)
     value = [mi.Float(1), mi.Float(2), mi.Float(-1)]
-    film.put(cube, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), value, mi.Bool(x < 22))
+    film.put(0, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), value, mi.Bool(x < 22))
     got = np.array(cube, dtype=float).reshape(len(x), -1, 3)
     want = expected(film, x) * (x < 22)[:, None]
     np.testing.assert_allclose(got[..., 0], want, atol=1e-4)
@@ -71,8 +72,8 @@ def test_read_is_the_transpose_of_put(name, layout, steady):
     pixel, value = rng.integers(0, pixels, n), rng.normal(size=(3, n))
     g, g_steady = rng.normal(size=(pixels, gates, 3)), rng.normal(size=(pixels, 3)) * steady
     active, opl = mi.Bool(rng.random(n) > 0.1), mi.Float64(x - START)
-    cube = dr.zeros(mi.Float, pixels * gates * 3)
-    film.put(cube, mi.UInt32(pixel) * (gates * 3), opl, [mi.Float(v) for v in value], active)
+    cube = storage(film, pixels * gates * 3)
+    film.put(0, mi.UInt32(pixel) * (gates * 3), opl, [mi.Float(v) for v in value], active)
     if layout == "film":
         adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (gates * 3)
     else:
@@ -99,9 +100,9 @@ def test_slopes():
     # but for the few arrivals at a kink
     assert np.sort(error)[-8] < 0.03 * np.abs(difference).max()
     df, fdtau = np.random.default_rng(3).normal(size=(2, 3, len(x)))
-    cube = dr.zeros(mi.Float, 9)
+    cube = storage(film, 9)
     lists = [mi.Float(v) for v in df], [mi.Float(v) for v in fdtau]
-    film.put_slope(cube, mi.UInt32(0), mi.Float64(x - START), *lists, mi.Bool(True))
+    film.put_slope(0, mi.UInt32(0), mi.Float64(x - START), *lists, mi.Bool(True))
     A, slope = read(0.0)
     want = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * fdtau[c]).sum() for c in range(3))
     assert (np.array(cube).reshape(3, 3) * g).sum() == pytest.approx(want, rel=1e-4)
@@ -112,8 +113,8 @@ def test_a_pulse_opens_a_gate_softly():
     assert film.has_slope
     size = film.entries_per_pixel()
     x = np.array([5.9, 6.0, 6.1, 6.5, 7.0])
-    cube = dr.zeros(mi.Float, len(x) * size)
-    film.put(cube, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), [mi.Float(1)] * 3, mi.Bool(True))
+    cube = storage(film, len(x) * size)
+    film.put(0, dr.arange(mi.UInt32, len(x)) * size, mi.Float64(x - START), [mi.Float(1)] * 3, mi.Bool(True))
     weights = np.array(cube).reshape(len(x), 3)[:, 0]
     # half maximum of the density is at 1.177 standard deviations
     np.testing.assert_allclose(weights, [0.1195, 0.5, 0.8805, 1.0, 0.5], atol=2e-3)

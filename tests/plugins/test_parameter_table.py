@@ -22,9 +22,9 @@ from torchtransient.plugins.parameters import (
     ParameterTracker,
     attached_effects,
     can_carry_gradients,
+    check_slope,
     effect_of,
     moving_names,
-    no_slope,
 )
 from torchtransient.testing.every_plugin import LEFT_OUT, every_plugin
 
@@ -383,6 +383,7 @@ def test_one_message_for_a_missing_slope():
     params = attach(scene, "box.vertex_positions", "group.part.bsdf.eta")
     names = moving_names(attached_effects(params))
     assert sorted(names) == ["box.vertex_normals", "box.vertex_positions", "bsdf.eta"]
-    error = no_slope(["wall.to_world"], "box", "Do that.")
-    assert isinstance(error, GradientError)
-    assert all(part in str(error) for part in ("'wall.to_world'", "'box' has no slope", "Do that."))
+    check_slope([], False, "box", "")
+    check_slope(["wall.to_world"], True, "tent", "")
+    with pytest.raises(GradientError, match=r"'wall.to_world', 'x'.*'box' has no slope.*Do that\."):
+        check_slope(["wall.to_world", "x"], False, "box", "Do that.")

@@ -10,6 +10,7 @@ import pytest
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins.films import phasor_events
+from torchtransient.testing.film_storage import storage
 
 START = 2.0
 GRID = {"frequency_first": -0.4, "frequency_step": 0.11, "frequency_count": 37}
@@ -128,23 +129,23 @@ def exact_sums(frequencies, opl, value, active, pixels, slope=None):
 
 
 def summed(film, job, opl, value, active, depth, slope=None):
-    """What the film's lane makes of these events: (pixels of the pass, F, C)."""
+    """What the film's block makes of these events: (pixels of the pass, F, C)."""
     film.prepare()
     width, channels = int(film.crop_size()[0]), film.channel_count()
     paths = width * job.rows * job.spp
     pixel = dr.arange(mi.UInt32, paths) // job.spp + job.first_row * width
     base = pixel * film.entries_per_pixel()
-    lane = film.lane(job, base, Copies(), depth, tangents=slope is not None)
-    events = lane.begin()
+    block = film.create_block(job, base, Copies(), depth, tangents=slope is not None)
+    events = block.begin()
     for e in range(len(opl)):
         v = [mi.Float(value[e, c]) for c in range(channels)]
         if slope is None:
-            lane.put(events, mi.Float64(opl[e]), v, mi.Bool(active[e]))
+            block.put(events, mi.Float64(opl[e]), v, mi.Bool(active[e]))
         else:
             s = [mi.Float(slope[e, c]) for c in range(channels)]
-            lane.put_slope(events, mi.Float64(opl[e]), v, s, mi.Bool(active[e]))
-    lane.end(events)
-    lane.finish()
+            block.put_slope(events, mi.Float64(opl[e]), v, s, mi.Bool(active[e]))
+    block.end(events)
+    block.finish()
     flat = np.array(film.bands[0][2], dtype=np.float64).reshape(-1, film.frequency_count(), channels, 2)
     result = flat[..., 0] + 1j * flat[..., 1]
     window = slice(job.first_row * width, (job.first_row + job.rows) * width)
@@ -172,8 +173,8 @@ def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     slope = rng.normal(size=value.shape) if tangents else None
     roomy = summed(film, Job(0, 1, 5), opl, value, active, 5, slope)
     monkeypatch.setattr(phasor_events, "MAX_EVENTS", 4)
-    lane = film.lane(Job(0, 1, 5), mi.UInt32(0), Copies(), 5, tangents)
-    assert lane.slots == 4 and lane.overflows
+    block = film.create_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 5, tangents)
+    assert block.slots == 4 and block.overflows
     tight = summed(film, Job(0, 1, 5), opl, value, active, 5, slope)
     scale = np.abs(roomy).max()
     np.testing.assert_allclose(tight, roomy, atol=2e-6 * scale)
@@ -194,10 +195,10 @@ def test_tangents(frequencies):
 def test_zero_contributions_take_no_room():
     film = make_film(1, 1, **LIST)
     film.prepare()
-    lane = film.lane(Job(0, 1, 2), mi.UInt32(0, 0), Copies(), 4)
-    events = lane.begin()
-    lane.put(events, mi.Float64(1.0), [mi.Float(0), mi.Float(0), mi.Float(0, 1)], mi.Bool(True))
-    lane.put(events, mi.Float64(1.0), [mi.Float(1)] * 3, mi.Bool(False, True))
+    block = film.create_block(Job(0, 1, 2), mi.UInt32(0, 0), Copies(), 4)
+    events = block.begin()
+    block.put(events, mi.Float64(1.0), [mi.Float(0), mi.Float(0), mi.Float(0, 1)], mi.Bool(True))
+    block.put(events, mi.Float64(1.0), [mi.Float(1)] * 3, mi.Bool(False, True))
     assert np.array(events["count"]).tolist() == [0, 2]
 
 
@@ -205,9 +206,9 @@ def test_zero_contributions_take_no_room():
 
 
 def put_directly(film, pixel, opl, value, active):
-    cube = dr.zeros(mi.Float, (int(pixel.max()) + 1) * film.entries_per_pixel())
+    cube = storage(film, (int(pixel.max()) + 1) * film.entries_per_pixel())
     base = mi.UInt32(pixel) * film.entries_per_pixel()
-    film.put(cube, base, mi.Float64(opl), [mi.Float(v) for v in value], mi.Bool(active))
+    film.put(0, base, mi.Float64(opl), [mi.Float(v) for v in value], mi.Bool(active))
     return np.array(cube, dtype=np.float64)
 
 

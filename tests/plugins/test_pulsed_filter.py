@@ -10,6 +10,7 @@ import pytest
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
+from torchtransient.testing.film_storage import storage
 
 VARIANT = "llvm_ad_rgb"
 BINS, WIDTH, START = 60, 0.25, 2.0
@@ -54,9 +55,9 @@ def make_film(**arguments):
 
 def put_each(film, x):
     n, channels = len(x), film.channel_count()
-    cube = dr.zeros(mi.Float, n * film.entries_per_pixel())
+    cube = storage(film, n * film.entries_per_pixel())
     base = dr.arange(mi.UInt32, n) * film.entries_per_pixel()
-    before, after = film.put(cube, base, mi.Float64(x * WIDTH), [mi.Float(1)] * channels, mi.Bool(True))
+    before, after = film.put(0, base, mi.Float64(x * WIDTH), [mi.Float(1)] * channels, mi.Bool(True))
     return np.array(cube, dtype=float).reshape(n, BINS, channels), np.array(before), np.array(after)
 
 
@@ -115,8 +116,8 @@ def test_read_is_the_transpose_of_put(kernel, layout):
     value, g = rng.normal(size=(3, n)), rng.normal(size=(pixels, BINS, 3))
     active = mi.Bool(rng.random(n) > 0.1)
     opl = mi.Float64(x * WIDTH)
-    cube = dr.zeros(mi.Float, pixels * BINS * 3)
-    film.put(cube, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
+    cube = storage(film, pixels * BINS * 3)
+    film.put(0, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
     if layout == "film":
         adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (BINS * 3)
     else:
@@ -153,8 +154,8 @@ def test_put_slope_is_the_transpose_of_the_slope(kernel):
     n = 300
     x, g = rng.uniform(-4, BINS + 4, n), rng.normal(size=(BINS, 3))
     df, fdtau = rng.normal(size=(2, 3, n))
-    opl, cube = mi.Float64(x * WIDTH), dr.zeros(mi.Float, BINS * 3)
-    film.put_slope(cube, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in fdtau], mi.Bool(True))
+    opl, cube = mi.Float64(x * WIDTH), storage(film, BINS * 3)
+    film.put_slope(0, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in fdtau], mi.Bool(True))
     A, slope = film.read((mi.Float(g.ravel()), 3, 1), mi.UInt32(0), opl, mi.Bool(True))
     read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * fdtau[c]).sum() for c in range(3))
     stored = np.array(cube, dtype=float).reshape(BINS, 3)

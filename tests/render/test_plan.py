@@ -5,10 +5,10 @@ import time
 
 import mitsuba as mi
 import numpy as np
-import plan_scenes
 import pytest
 
 import torchtransient as tt
+from support import plan_scenes
 from torchtransient.errors import GradientError, SceneError, UnitError, VariantError
 from torchtransient.render.plan import census_of
 

@@ -3,12 +3,12 @@
 import json
 
 import numpy as np
-import plan_scenes
 import pytest
 import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support import plan_scenes
 from torchtransient.cli.main import main
 from torchtransient.errors import SceneError
 from torchtransient.render.build import BuildOptions

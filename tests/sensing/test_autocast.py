@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from contract import parts
-from test_contract import each
 
+from support.sensing.all_entries import each
+from support.sensing.contract import parts
 from torchtransient import TimeAxis, sensing
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from event_driven import dense_limit, last_phases, total_variation
 
+from support.sensing.event_driven import dense_limit, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, free_running_state, nonparalyzable_histogram
 from torchtransient.sensing.banded_solve import solve_banded

@@ -23,8 +23,8 @@ from torchtransient.sensing import (
     ShotNoise,
     sine_code,
 )
-from torchtransient.sensing.compose import adjoint, linearity_error
 from torchtransient.sensing.gated import GatedIntegration
+from torchtransient.sensing.linear_part import adjoint, linearity_error
 
 AXIS = TimeAxis(1.0, 0.1, 32)
 

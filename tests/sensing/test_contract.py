@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from copy import deepcopy
 
-import entries_cameras
-import entries_counting
 import pytest
 import torch
-from contract import LOOSE, expected, parts, pickled, through_state_dict
 
+from support.sensing.all_entries import ENTRIES, each
+from support.sensing.contract import LOOSE, expected, parts, pickled, through_state_dict
 from torchtransient.sensing import ScoreFunction
 
-ENTRIES = [*entries_counting.ENTRIES, *entries_cameras.ENTRIES]
-each = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: e.name)
 each_random = pytest.mark.parametrize("entry", [e for e in ENTRIES if e.random], ids=lambda e: e.name)
 each_policy = pytest.mark.parametrize(
     "entry, policy", [(e, p) for e in ENTRIES if e.random for p in e.policies], ids=lambda v: getattr(v, "name", v)

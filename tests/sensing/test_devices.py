@@ -12,11 +12,12 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.sensing import DEVICES, Device, build_stage, device, read_itof
-from torchtransient.sensing.compose import Compose, deepinv_physics
+from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.impulse_response import GaussianResponse, ImpulseResponse
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import sine_code
+from torchtransient.sensing.physics import deepinv_physics
 
 each = pytest.mark.parametrize("name", sorted(DEVICES))
 

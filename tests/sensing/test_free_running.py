@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from event_driven import arrivals, chi2_per_dof, dense_limit, detections, histogram, total_variation
 
+from support.sensing.event_driven import arrivals, chi2_per_dof, dense_limit, detections, histogram, total_variation
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing import (
     FreeRunningSPAD,

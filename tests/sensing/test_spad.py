@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from event_driven import chi2_per_dof, synchronous
 from scipy import stats
 
+from support.sensing.event_driven import chi2_per_dof, synchronous
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     ScoreFunction,

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import block, camera, clouds, film, homogeneous, load, runs, volume
 
+from support.media_scenes import block, camera, clouds, film, homogeneous, load, runs, volume
 from torchtransient.testing.statistics import z_test
 
 VARIANT = "llvm_ad_mono"

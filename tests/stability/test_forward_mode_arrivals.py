@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradient_cases import room
-from media_scenes import film, homogeneous, load
 
+from support.gradient_cases.scenes import room
+from support.media_scenes import film, homogeneous, load
 from torchtransient.testing.statistics import two_sample_z_test
 
 VARIANT = "llvm_ad_mono"

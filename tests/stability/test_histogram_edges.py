@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
+from torchtransient.testing.film_storage import storage
 
 BINS = 16
 
@@ -27,9 +28,9 @@ def put(opl, width, filter="box"):
     )
     n = len(opl)
     # guards on both sides: an index that wrapped would land there
-    cube = dr.zeros(mi.Float, (n + 2) * BINS)
+    cube = storage(film, (n + 2) * BINS)
     base = (dr.arange(mi.UInt32, n) + 1) * BINS
-    before, after = film.put(cube, base, mi.Float64(opl), [mi.Float(1)], mi.Bool(True))
+    before, after = film.put(0, base, mi.Float64(opl), [mi.Float(1)], mi.Bool(True))
     cube = np.array(cube).reshape(n + 2, BINS)
     assert not cube[0].any() and not cube[-1].any()
     return cube[1:-1], np.array(before), np.array(after)

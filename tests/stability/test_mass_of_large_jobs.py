@@ -10,7 +10,7 @@ import pytest
 from torchtransient import plugins
 
 FILM = "torchtransient.plugins.films.base.MAX_SINGLE_PRECISION_SAMPLES"
-LANES = "torchtransient.plugins.integrators.base.MAX_LANES"
+LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
 
 
 @pytest.fixture(autouse=True)
@@ -29,8 +29,8 @@ def mass(samples, count, packets=True):
     value = dr.opaque(mi.Float, np.float32(1 / (1.3 * count)))
     index = dr.arange(mi.UInt32, count)
     x = mi.Float64(index & 3) + 0.5 if not packets else dr.full(mi.Float64, 0.5, count)
-    film.put(film.bands[0][2], mi.UInt32(0), x, [value], mi.Bool(True))
-    film.settle()
+    film.put(0, mi.UInt32(0), x, [value], mi.Bool(True))
+    film.finish_render()
     total = np.array(film.bands[0][2], dtype=float).sum()
     return total / (float(np.array(value)[0]) * count) - 1
 

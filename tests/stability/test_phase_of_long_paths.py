@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
+from torchtransient.testing.film_storage import storage
 
 WAVELENGTHS = [0.1, 0.01, 0.0015]
 CYCLES = 1e-4
@@ -43,9 +44,9 @@ def test_turns_are_counted_in_double_precision(opl):
     """
     film = mi.load_dict(film_of(1 / np.array(WAVELENGTHS)))
     lengths = opl + np.random.default_rng(0).uniform(0, 0.2, 100)
-    cube = dr.zeros(mi.Float, 100 * film.entries_per_pixel())
+    cube = storage(film, 100 * film.entries_per_pixel())
     base = dr.arange(mi.UInt32, 100) * film.entries_per_pixel()
-    film.put(cube, base, mi.Float64(lengths), [mi.Float(1)], mi.Bool(True))
+    film.put(0, base, mi.Float64(lengths), [mi.Float(1)], mi.Bool(True))
     pairs = np.array(cube, dtype=np.float64).reshape(100, -1, 2)
     assert error_in_cycles(pairs[..., 0] + 1j * pairs[..., 1], lengths[:, None] * film.frequencies).max() < 1e-6
     single = (np.float32(lengths)[:, None] * np.float32(film.frequencies)).astype(np.float64)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradient_cases import Case, Problem, film, move, room, rotate, set_color, transform
+
+from support.gradient_cases.problem import Case, Problem
+from support.gradient_cases.scenes import film, room, transform
+from support.gradient_cases.unknowns import move, rotate, set_color
 
 VARIANT = "llvm_ad_mono_polarized"
 

@@ -6,7 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from gradient_cases import CASES, Problem, room, set_color
+
+from support.gradient_cases.cases_materials import CASES
+from support.gradient_cases.problem import Problem
+from support.gradient_cases.scenes import room
+from support.gradient_cases.unknowns import set_color
 
 BASE = next(case for case in CASES if case.name == "diffuse_albedo")
 SIDE, WALL = "side.bsdf.reflectance.value", "wall.bsdf.reflectance.value"

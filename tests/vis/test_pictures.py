@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from cubes import AXIS, read_png, sweep
 
 import torchtransient as tt
+from support.cubes import AXIS, read_png, sweep
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.vis import colour_maps
 

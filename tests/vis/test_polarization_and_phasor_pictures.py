@@ -6,9 +6,9 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from cubes import read_gif
 
 import torchtransient as tt
+from support.cubes import read_gif
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.polarization import angle_image

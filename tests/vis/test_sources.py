@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cubes import AXIS, sweep
 
 import torchtransient as tt
+from support.cubes import AXIS, sweep
 from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.vis.sources import phasor_of, steady_of, stokes_of, transient_of

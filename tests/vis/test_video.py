@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 import torch
-from cubes import AXIS, read_gif, read_mp4, sweep
 
 import torchtransient as tt
+from support.cubes import AXIS, read_gif, read_mp4, sweep
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.vis.stamps import moment, with_strip
 

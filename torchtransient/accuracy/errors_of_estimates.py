@@ -40,7 +40,6 @@ class ErrorTally:
     reference: Reference | None = None
     squared: list[Array] = field(default_factory=list)
     power: list[Array] = field(default_factory=list)
-    entries_per_bin: int = 0
     _waiting: NDArray[np.float32] | None = None
     _reference_sums: tuple[Array, Array, NDArray[np.float32]] | None = None
 

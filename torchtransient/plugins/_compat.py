@@ -1,8 +1,6 @@
 """What the plugins ask about the active Mitsuba variant.
 
-A variant's name says how it computes (`scalar`, `llvm`, `cuda`, `metal`), whether it carries derivatives (`ad`), how it
-represents colour (`mono`, `rgb`, `spectral`) and whether it carries Stokes vectors (`polarized`). Nothing here is bound
-to one variant: every function looks at the variant that is active when it is called.
+Nothing here is bound to one variant: every function looks at the variant that is active when it is called.
 """
 
 from __future__ import annotations
@@ -23,26 +21,6 @@ def active_variant() -> str | None:
 def is_jit(variant: str | None) -> bool:
     """Whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
     return variant is not None and variant.startswith(_JIT_PREFIXES)
-
-
-def is_ad(variant: str | None) -> bool:
-    """Whether a variant tracks derivatives."""
-    return variant is not None and "_ad_" in variant
-
-
-def is_polarized(variant: str | None) -> bool:
-    """Whether a variant carries Stokes vectors and Mueller matrices."""
-    return variant is not None and variant.endswith("_polarized")
-
-
-def color_mode(variant: str) -> str:
-    """`"mono"`, `"rgb"` or `"spectral"`."""
-    for mode in ("mono", "rgb", "spectral"):
-        if mode in variant.split("_"):
-            return mode
-    raise VariantError(
-        f"color_mode: expected a Mitsuba variant such as 'llvm_ad_rgb', got {variant!r}. Choose one of mi.variants()."
-    )
 
 
 def require_jit_variant(what: str) -> str:

@@ -40,6 +40,7 @@ import mitsuba as mi
 
 from torchtransient._llvm import ensure_llvm
 from torchtransient.errors import PluginRegistrationError, TorchTransientError
+from torchtransient.interfaces import missing_members
 from torchtransient.plugins._compat import active_variant, is_jit, require_jit_variant
 
 KINDS = (
@@ -102,12 +103,18 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
     """Register a plugin for the active variant. Called at the end of a plugin module.
 
     `kind` is one of `KINDS`, `name` the plugin's name in scene files, `constructor` the class (or a function) that
-    takes `mi.Properties`. Raises PluginRegistrationError for an unknown kind, or when another module of the library's
-    list already registered the name.
+    takes `mi.Properties`. Raises PluginRegistrationError for an unknown kind, for a class that lacks a member of an
+    interface that it signed up for, or when another module of the library's list already registered the name.
     """
     if kind not in KINDS:
         raise PluginRegistrationError(
             f"register: expected a plugin kind out of {', '.join(KINDS)}; got {kind!r} for plugin '{name}'."
+        )
+    missing = missing_members(constructor) if isinstance(constructor, type) else []
+    if missing:
+        raise PluginRegistrationError(
+            f"register: {kind} plugin '{name}' ({constructor.__name__}) was expected to have {', '.join(missing)} and "
+            "does not. What is asked of it is written in torchtransient/interfaces.py."
         )
     key = (kind, name)
     module = _state.loading or getattr(constructor, "__module__", "?")

@@ -156,13 +156,15 @@ def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[st
     return list(dict.fromkeys(name for name, effect in named if effect.moves_length))
 
 
-def no_slope(moving: Sequence[str], response: str, remedy: str) -> GradientError:
-    """The error for a derivative through the time of flight that the film's response over time does not have.
+def check_slope(moving: Sequence[str], has_slope: bool, response: str, remedy: str) -> None:
+    """Raise ``GradientError`` where a derivative through the time of flight has no slope to go through.
 
-    ``moving``: names of the parameters that can change a path length. ``response``: what the film calls its response,
-    its temporal filter or kind of gate. ``remedy``: what to do.
+    ``moving``: names of the parameters with a derivative that can change a path length. ``has_slope``: of the film.
+    ``response``: what the film calls its response over time, its temporal filter or kind of gate. ``remedy``: what to
+    do.
     """
-    return GradientError(
-        f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's {response!r} has no "
-        f"slope: the derivative through the time of flight would be lost. {remedy}"
-    )
+    if moving and not has_slope:
+        raise GradientError(
+            f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's {response!r} has no "
+            f"slope: the derivative through the time of flight would be lost. {remedy}"
+        )

@@ -20,8 +20,10 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
-from torchtransient.plugins.parameters import no_slope
+from torchtransient.interfaces import is_time_resolved
+from torchtransient.plugins.parameters import check_slope
 from torchtransient.render.build import BuildOptions
+from torchtransient.render.filter_override import temporal_filter
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
 from torchtransient.render.variant import active_variant
@@ -96,15 +98,6 @@ class _Session:
             raise SceneError(f"values of {', '.join(self.job.keys)}: Mitsuba refuses them: {error}") from error
         return leaves
 
-    def set_filter(self, name: str) -> list[tuple[Any, str]]:
-        """Use a temporal filter on all films; returns what they had."""
-        before = []
-        for target in [self.integrator, *(sensor.film() for sensor in self.sensors)]:
-            if hasattr(target, "temporal_filter"):
-                before.append((target, target.temporal_filter))
-                target.temporal_filter = name
-        return before
-
 
 def _own_array(tensor: torch.Tensor) -> Any:
     """A flat Dr.Jit copy: the scene must not alias memory that belongs to the caller."""
@@ -142,12 +135,11 @@ def _session(job: RenderJob) -> Iterator[_Session]:
     with active_variant(job.scene.variant), no_collection():
         slots = job.scene.slots(job.keys, job.options)
         session = _Session(job, slots)
-        filters = session.set_filter(job.temporal_filter) if job.temporal_filter else []
+        films = [sensor.film() for sensor in session.sensors]
         try:
-            yield session
+            with temporal_filter(job.temporal_filter, session.integrator, films):
+                yield session
         finally:
-            for target, name in filters:
-                target.temporal_filter = name
             try:
                 slots.restore()
             except BaseException:
@@ -250,7 +242,7 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
     for item in items:
         if not 0 <= item.sensor < len(sensors):
             raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
-        if not hasattr(sensors[item.sensor].film(), "cube_shape"):
+        if not is_time_resolved(sensors[item.sensor].film()):
             raise SceneError(
                 "the sensor's film has no time axis; use transient_hdr_film or phasor_hdr_film, or give "
                 "time_axis=tt.TimeAxis(...) or frequencies=tt.FrequencyAxis(...)."
@@ -350,13 +342,13 @@ def jvp(
 
 
 def _check_slope(session: _Session) -> None:
-    """A path length that changes needs a film whose response over time has a slope."""
+    """A path length that changes needs films whose response over time has a slope."""
     job = session.job
     wanted = [key for key, need in zip(job.keys, job.needs, strict=True) if need]
     moving = needing_slope(job.scene.parameters(), wanted)
-    film = session.film(job.items[0])
-    if moving and not film.has_slope:
-        raise no_slope(moving, film.temporal_filter, film.slope_remedy)
+    for item in job.items if moving else ():
+        film = session.film(item)
+        check_slope(moving, film.has_slope, film.response_name, film.slope_remedy)
 
 
 def _steady_adjoint(g: torch.Tensor) -> Any:

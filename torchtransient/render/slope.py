@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchtransient.plugins.parameters import no_slope
+from torchtransient.plugins.parameters import check_slope
 
 
 def has_slope(temporal_filter: str, pulsed: bool) -> bool:
@@ -25,5 +25,5 @@ def filter_for(moving: Sequence[str], own: str, pulsed: bool) -> str:
 
 def check_filter(moving: Sequence[str], temporal_filter: str, pulsed: bool) -> None:
     """Raise ``GradientError`` for a filter without the slope that ``moving`` parameters need."""
-    if moving and not has_slope(temporal_filter, pulsed):
-        raise no_slope(moving, temporal_filter, "Use temporal_filter='auto', 'tent' or 'gaussian'.")
+    remedy = "Use temporal_filter='auto', 'tent' or 'gaussian'."
+    check_slope(moving, has_slope(temporal_filter, pulsed), temporal_filter, remedy)

@@ -7,9 +7,6 @@ from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rat
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
-from torchtransient.sensing.compose import adjoint as adjoint
-from torchtransient.sensing.compose import deepinv_physics as deepinv_physics
-from torchtransient.sensing.compose import linearity_error as linearity_error
 from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
 from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
@@ -71,10 +68,13 @@ from torchtransient.sensing.itof_depth import tap_phasor as tap_phasor
 from torchtransient.sensing.itof_depth import unambiguous_range_m as unambiguous_range_m
 from torchtransient.sensing.itof_depth import unwrap_depth as unwrap_depth
 from torchtransient.sensing.itof_depth import wrapped_difference as wrapped_difference
+from torchtransient.sensing.linear_part import adjoint as adjoint
+from torchtransient.sensing.linear_part import linearity_error as linearity_error
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
+from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
 from torchtransient.sensing.polarization import Analysers as Analysers
 from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
 from torchtransient.sensing.polarization import circular_analysers as circular_analysers

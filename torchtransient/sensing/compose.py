@@ -1,4 +1,4 @@
-"""Sensors in a row, after a renderer or inside a data set; and the adjoint of linear ones."""
+"""Sensors in a row, after a renderer or inside a data set."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
@@ -116,68 +116,3 @@ class Compose(Sensor):
                     f"Compose: expected the axis of stage '{name}' ({type(module).__name__}: {own}), got {axis}. Make "
                     "the sensor with the renderer's axis."
                 )
-
-
-def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
-    """``A^T y``: the transpose of a sensor's mean, exactly, for inputs of ``input_shape``; dtype and device of ``y``.
-
-    ``A`` is the linear part of `expected`, ``x -> expected(x) - expected(0)``; a sensor that is not linear gives the
-    transpose of its derivative at zero: see `linearity_error`. Differentiable in ``y`` and in the sensor's parameters,
-    so that an unrolled reconstruction can be trained through it. Raises ShapeError when ``y`` is no output for that
-    shape.
-    """
-    learnt = any(p.requires_grad for p in sensor.parameters())
-    onwards = torch.is_grad_enabled() and (y.requires_grad or learnt)
-    with torch.inference_mode(False), torch.enable_grad():
-        y = y.clone() if y.is_inference() else y
-        x = torch.zeros(tuple(input_shape), dtype=y.dtype, device=y.device, requires_grad=True)
-        out = sensor.expected(x)
-        if out.shape != y.shape:
-            raise ShapeError(
-                f"adjoint: expected y {tuple(out.shape)} for inputs {tuple(input_shape)}, got {tuple(y.shape)}."
-            )
-        if not out.requires_grad:
-            raise GradientError(f"adjoint: expected a sensor with gradients, but {type(sensor).__name__} has none.")
-        (gradient,) = torch.autograd.grad(out, x, y, create_graph=onwards)
-    return gradient
-
-
-def linearity_error(sensor: Sensor, x: Tensor) -> float:
-    """``|A(2 x) - 2 A(x)| / |A(2 x)|`` of the mean without its offset: rounding for a linear sensor."""
-    with torch.no_grad():
-        offset = sensor.expected(torch.zeros_like(x))
-        once, twice = sensor.expected(x) - offset, sensor.expected(2 * x) - offset
-        return float((twice - 2 * once).abs().max() / twice.abs().max().clamp_min(torch.finfo(x.dtype).tiny))
-
-
-def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, check: bool = True) -> Any:
-    """The sensor as a DeepInverse physics, ``y = physics(x)`` with x (B, C, T, H, W).
-
-    With ``img_size`` (C, T, H, W): a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from
-    them (``check`` tries the linearity on random light first: UnitError when it fails by more than 1e-4). Without: a
-    `Physics` of any sensor, with ``A`` and ``A_vjp``. Raises StorageError when ``deepinv`` is not installed (``pip
-    install 'torchtransient[deepinv]'``).
-    """
-    try:
-        from torchtransient.sensing import deepinverse
-    except ImportError as error:
-        raise StorageError(
-            f"deepinv_physics: expected the package deepinv to be installed ({error}); pip install "
-            "'torchtransient[deepinv]'."
-        ) from error
-    if img_size is None:
-        return deepinverse.SensorPhysics(sensor)
-    size = tuple(int(n) for n in img_size)
-    if check:
-        _check_linear(sensor, size)
-    return deepinverse.LinearSensorPhysics(sensor, size)
-
-
-def _check_linear(sensor: Sensor, size: tuple[int, ...]) -> None:
-    light = torch.rand((1, *size), generator=torch.Generator().manual_seed(0))
-    error = linearity_error(sensor, light)
-    if error > 1e-4:
-        raise UnitError(
-            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {error:.1e} at double "
-            "the light. Leave img_size out for a physics that is not linear."
-        )

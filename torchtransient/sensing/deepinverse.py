@@ -13,7 +13,7 @@ from deepinv.physics import LinearPhysics, Physics
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.sensing.compose import adjoint
+from torchtransient.sensing.linear_part import adjoint
 from torchtransient.sensing.sensor import Sensor
 
 

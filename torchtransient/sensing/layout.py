@@ -109,8 +109,3 @@ def check_seconds(value: float, name: str, where: str, *, open_low: bool = False
     if number >= 1.0:
         raise UnitError(f"{where}: expected {name} in seconds, got {number!r} s. Picoseconds or bins? 50 ps is 50e-12.")
     return number
-
-
-def accumulator(x: Tensor) -> Tensor:
-    """`x` in float64, in which running sums over many bins keep their digits."""
-    return x.to(torch.float64)

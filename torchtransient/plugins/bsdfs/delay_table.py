@@ -100,38 +100,50 @@ def _distribution(curve, name):
     return mi.ContinuousDistribution(mi.ScalarVector2f(low, high), mi.Float(values.astype(np.float32)))
 
 
-class DelayTable:
-    """Lifetimes, yields and parts of the delayed BSDFs of a scene; attached where their parameters are.
-
-    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
-    """
+class DelayedBSDFs:
+    """The delayed BSDFs of a scene: what of them does not change with their parameters."""
 
     def __init__(self, bsdfs):
-        self._rows = PointerTable(bsdfs, range(1, len(bsdfs) + 1))
-        self._late = mi.UInt32([registry_number(bsdf.nested) for bsdf in bsdfs])
-        self._at_once = mi.UInt32([registry_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
-        probabilities, decays = [], []
+        self.bsdfs = bsdfs
+        self.rows = PointerTable(bsdfs, range(1, len(bsdfs) + 1))
+        self.late = mi.UInt32([registry_number(bsdf.nested) for bsdf in bsdfs])
+        self.at_once = mi.UInt32([registry_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
+        self.only_late = mi.UInt32([int(bsdf.at_once is None) for bsdf in bsdfs])
+        decays = []
         for bsdf in bsdfs:
-            elastic, late = (float(dr.slice(dr.detach(weight), 0)) for weight in bsdf.weights())
-            p = late / (elastic + late) if elastic + late > 0 else 0.5
-            p = min(max(p, LEAST_PROBABILITY), 1 - LEAST_PROBABILITY)
-            probabilities.append(1.0 if bsdf.at_once is None else p)
             decays.append(0 if bsdf.decay is None else 1 + sum(d > 0 for d in decays) * DECAY_NODES)
-        self._probability = mi.Float(probabilities)
         tables = [bsdf.decay for bsdf in bsdfs if bsdf.decay is not None]
-        self._decay_start = mi.UInt32(decays) if tables else None
-        self._decay = mi.Float(np.concatenate(tables).astype(np.float32)) if tables else None
-        self._shifts = [(row, bsdf.shift) for row, bsdf in enumerate(bsdfs) if bsdf.shift is not None]
-        with dr.resume_grad():
-            self.lifetimes = _gathered([bsdf.lifetime for bsdf in bsdfs])
-            self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in bsdfs])
-            self.late_weights = _gathered([bsdf.weights()[1] for bsdf in bsdfs])
-        dr.make_opaque(self._late, self._at_once, self._probability, self._decay_start, self._decay)
+        self.decay_start = mi.UInt32(decays) if tables else None
+        self.decay = mi.Float(np.concatenate(tables).astype(np.float32)) if tables else None
+        self.spectral_shifts = [(row, bsdf.shift) for row, bsdf in enumerate(bsdfs) if bsdf.shift is not None]
+        dr.make_opaque(self.late, self.at_once, self.only_late, self.decay_start, self.decay)
 
     @property
     def shifts(self) -> bool:
         """Whether wavelengths change along a path."""
-        return bool(self._shifts)
+        return bool(self.spectral_shifts)
+
+    def read(self) -> DelayTable:
+        """Their parameters as they are now; to be called outside of loops, once a job."""
+        return DelayTable(self)
+
+
+class DelayTable:
+    """Lifetimes, yields and parts of delayed BSDFs; attached where their parameters are.
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """
+
+    def __init__(self, delayed: DelayedBSDFs):
+        self._of = delayed
+        with dr.resume_grad():
+            self.lifetimes = _gathered([bsdf.lifetime for bsdf in delayed.bsdfs])
+            self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in delayed.bsdfs])
+            self.late_weights = _gathered([bsdf.weights()[1] for bsdf in delayed.bsdfs])
+        elastic, late = dr.detach(self.elastic_weights), dr.detach(self.late_weights)
+        p = dr.select(elastic + late > 0, late / (elastic + late), 0.5)
+        p = dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+        self._probability = dr.select(delayed.only_late == 1, 1, p)
 
     def attached(self) -> list:
         """The tables that carry derivatives."""
@@ -139,22 +151,22 @@ class DelayTable:
 
     def answer(self, bsdf, u, wavelengths) -> Answer:
         """How surfaces with BSDFs ``bsdf`` answer, for two uniform numbers ``u``."""
-        row = self._rows.look_up(bsdf)
+        row = self._of.rows.look_up(bsdf)
         there = row > 0
         row = dr.select(there, row - 1, 0)
         p = dr.gather(mi.Float, self._probability, row, there)
         late = there & (u.x < p)
-        pointer = dr.select(late, dr.gather(mi.UInt32, self._late, row, late), dr.reinterpret_array(mi.UInt32, bsdf))
-        pointer = dr.select(there & ~late, dr.gather(mi.UInt32, self._at_once, row, there), pointer)
+        pointer = dr.select(late, dr.gather(mi.UInt32, self._of.late, row, late), dr.reinterpret_array(mi.UInt32, bsdf))
+        pointer = dr.select(there & ~late, dr.gather(mi.UInt32, self._of.at_once, row, there), pointer)
         late_weight = dr.gather(mi.Float, self.late_weights, row, late) * dr.rcp(dr.select(late, p, 1))
         once_weight = dr.gather(mi.Float, self.elastic_weights, row, there) * dr.rcp(dr.select(late | ~there, 1, 1 - p))
         weight = dr.select(late, late_weight, dr.select(there, once_weight, 1))
         lifetime = dr.gather(mi.Float, self.lifetimes, row, late)
         delay = dr.select(late, lifetime * self._delay(u.x / dr.select(late, p, 1), row, late), 0)
         beyond = None
-        if self._shifts:
+        if self._of.shifts:
             weight, beyond = mi.UnpolarizedSpectrum(weight), mi.UnpolarizedSpectrum(wavelengths)
-            for number, shift in self._shifts:
+            for number, shift in self._of.spectral_shifts:
                 chosen = late & (row == number)
                 absorbed, factor = shift.draw(u.y, wavelengths)
                 weight = dr.select(chosen, weight * factor, weight)
@@ -165,14 +177,14 @@ class DelayTable:
         """Delay in units of the lifetime for uniform numbers in [0, 1)."""
         v = dr.minimum(v, dr.one_minus_epsilon(mi.Float))
         unit = -dr.log(1 - v)
-        if self._decay is None:
+        if self._of.decay is None:
             return unit
-        start = dr.gather(mi.UInt32, self._decay_start, row, active)
+        start = dr.gather(mi.UInt32, self._of.decay_start, row, active)
         measured = active & (start > 0)
         x = v * (DECAY_NODES - 1)
         i = dr.minimum(mi.UInt32(x), DECAY_NODES - 2)
         at = dr.select(measured, start - 1, 0) + i
-        a, b = dr.gather(mi.Float, self._decay, at, measured), dr.gather(mi.Float, self._decay, at + 1, measured)
+        a, b = dr.gather(mi.Float, self._of.decay, at, measured), dr.gather(mi.Float, self._of.decay, at + 1, measured)
         return dr.select(measured, dr.lerp(a, b, x - mi.Float(i)), unit)
 
 
@@ -185,8 +197,8 @@ def _gathered(values):
 
 
 def delays_of(bsdfs):
-    """(BSDFs that paths can meet, table of delays): delayed BSDFs are replaced by their parts; the table is None where
-    there are none. Raises SceneError for one inside another BSDF.
+    """(BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is None
+    where there are none. Raises SceneError for one inside another BSDF.
     """
     if _created == 0:
         return bsdfs, None
@@ -203,4 +215,4 @@ def delays_of(bsdfs):
                 f"BSDF '{bsdf.id()}' has a delayed BSDF inside; expected it outermost: put {bsdf.class_name()} into "
                 "the delayed one."
             )
-    return met, DelayTable(delayed) if delayed else None
+    return met, DelayedBSDFs(delayed) if delayed else None

@@ -19,25 +19,22 @@ from torchtransient.plugins.node_walk import bsdfs_of_scene as bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 
 
-class RefractionTable:
-    """Relative indices of the BSDFs of one scene, read anew by ``refresh`` when parameters may have changed.
+class RefractiveBSDFs:
+    """The BSDFs of one scene that refract without being a delta function, each with what holds its index.
 
     Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``,
     ``principled`` with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``,
     ``blendbsdf``, ``normalmap``, ``bumpmap`` and in shape groups. Attached where the plugin's ``eta`` (``specular``
     for ``principled``) is. Delta lobes are left out: nothing connects through them, and ``sample`` returns their
     index.
-
-    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
     def __init__(self, entries: list[tuple[Any, Any]]) -> None:
         self._entries = entries
-        self.refresh()
 
     @staticmethod
-    def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractionTable | None:
-        """The table of ``scene``, or None when nothing in it refracts through a lobe that can be connected to.
+    def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
+        """Those of ``scene``, or None when nothing in it refracts through a lobe that can be connected to.
 
         ``bsdfs``: those of the scene where they are known already.
         Raises SceneError for a blend of two refractive BSDFs with different indices, where a connection has no single
@@ -46,13 +43,23 @@ class RefractionTable:
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
         leaves = ((bsdf, _refractive_leaf(bsdf)) for bsdf in found)
         entries = [(bsdf, leaf) for bsdf, leaf in leaves if leaf is not None]
-        return RefractionTable(entries) if entries else None
+        return RefractiveBSDFs(entries) if entries else None
 
-    def refresh(self) -> None:
-        """Read the indices again; to be called outside of loops, once per render."""
+    def read(self) -> RefractionTable:
+        """The indices as they are now; to be called outside of loops, once a job."""
         with dr.resume_grad():
             indices = [_index_of(leaf) for _, leaf in self._entries]
-            self._indices = PointerTable([bsdf for bsdf, _ in self._entries], indices, default=1)
+            return RefractionTable(PointerTable([bsdf for bsdf, _ in self._entries], indices, default=1))
+
+
+class RefractionTable:
+    """Relative indices of BSDFs.
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """
+
+    def __init__(self, indices: PointerTable) -> None:
+        self._indices = indices
 
     @property
     def table(self) -> Any:

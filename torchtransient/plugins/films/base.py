@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.plugins.films.lane import AdjointLane, Lane
+from torchtransient.interfaces import FilmInterface
+from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 
@@ -19,24 +20,24 @@ MAX_ARRAY_ENTRIES = 2**32 - 1
 MAX_SINGLE_PRECISION_SAMPLES = 2**16
 
 
+@FilmInterface.register
 class TimeResolvedFilm(mi.Film):
     """Abstract base of films that keep an array behind every pixel beside the steady image.
 
-    A subclass has ``plugin`` (its name in messages), ``measures`` (what its array is: ``transient`` or ``phasor``), the
-    shape of that array (``cube_shape``, ``entries_per_pixel``), and says by ``lane`` and ``adjoint_lane`` how an
-    integrator writes to it and reads an adjoint from it. ``start_opl`` is where its clock starts: path lengths are
-    handed over as ``opl - start_opl`` in double precision.
+    What it has to offer is declared in :class:`torchtransient.interfaces.FilmInterface`. A subclass adds ``plugin``
+    (its name in messages) and ``measures`` (``transient``, ``phasor``, ``gated``, ...: what its array is), the shape of
+    that array (``cube_shape``, ``entries_per_pixel``), and how an arrival meets it: ``put``, its derivative
+    ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused where it is registered.
 
     Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
     """
 
-    plugin = "time-resolved film"
-    measures = "transient"
     exhaustive_scan = False
-    # Whether there is a steady image beside the array, of light at any time; otherwise it is the sum over the array.
     keeps_steady = True
-    # Whether the film has a window that light can miss, which is then counted in `outside`.
     has_window = True
+    slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
+    has_slope = True
+    pulses = ()
 
     def __init__(self, props):
         super().__init__(props)
@@ -61,44 +62,32 @@ class TimeResolvedFilm(mi.Film):
     # ------------------------------------------------------------------------------------- for integrators
 
     @property
-    def has_slope(self) -> bool:
-        """Whether what is stored changes smoothly with the path length."""
-        return True
+    def temporal_filter(self) -> str:
+        """A film without a filter answers so."""
+        return ""
 
     @property
-    def slope_remedy(self) -> str:
-        """What to do where there is no slope: the end of an error message."""
-        return "Set temporal_filter to 'tent' or 'gaussian'."
+    def response_name(self) -> str:
+        return self.temporal_filter
 
     def take_filter(self, name: str, stddev: float | None):
-        """Take over an integrator's settings of the temporal filter; empty name and None leave the film's own."""
+        pass
 
     def arrivals(self):
-        """Which arrivals count (:class:`.window.ArrivalWindow`), None for all: for a film without a steady image."""
-
-    def lanes_at_most(self, depth: int) -> int | None:
-        """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
         return None
 
-    def lane(self, job, base, match, depth: int, tangents: bool = False) -> Lane:
-        """How the samples of one pass write. ``base``: index of each sample's first entry in the band of ``job``;
-        ``depth``: longest path in segments; ``tangents``: events are derivatives (``put_slope``) instead of
-        contributions (``put``).
-        """
-        return Lane(self, self.bands[job.band][2], base, match)
+    def lanes_at_most(self, depth: int) -> int | None:
+        return None
 
-    def adjoint_lane(self, response, base, steady, match) -> AdjointLane:
-        """How the samples of one pass read the adjoint: ``response`` is None or (array, bin stride, channel stride),
-        ``base`` the index of each sample's first entry in it, ``steady`` the adjoint of the steady image by channel.
-        """
-        return AdjointLane(self, response, base, steady, match)
+    def create_block(self, job, base, match, depth: int, tangents: bool = False) -> FilmBlock:
+        return FilmBlock(self, job.band, base, match)
+
+    def create_adjoint_block(self, response, base, steady, match) -> AdjointBlock:
+        return AdjointBlock(self, response, base, steady, match)
 
     # ---------------------------------------------------------------------------------------- storage
 
     def channel_count(self) -> int:
-        """The number of :meth:`channel_names`, in polarized variants four times that: first all of S0, then S1, S2,
-        S3.
-        """
         return len(self.channel_names()) * (4 if mi.is_polarized else 1)
 
     def channel_names(self) -> tuple[str, ...]:
@@ -122,12 +111,10 @@ class TimeResolvedFilm(mi.Film):
         return min(rows, int(self.crop_size()[1]))
 
     def band_layout(self) -> list[tuple[int, int]]:
-        """The storage bands as (first row, rows); one, unless the cube exceeds 32-bit indices."""
         height, rows = self.cube_shape()[0], self.band_rows()
         return [(first, min(rows, height - first)) for first in range(0, height, rows)]
 
     def prepare(self, aovs=(), samples: int = 0):
-        """Allocate zeroed storage for one render of ``samples`` per pixel. Returns the number of channels."""
         if len(aovs):
             raise SceneError(f"{self.plugin}: arbitrary output variables are not supported, got {list(aovs)}.")
         height, width = self.cube_shape()[:2]
@@ -139,10 +126,20 @@ class TimeResolvedFilm(mi.Film):
         self.outside = dr.zeros(real, height * width * 2) if self.has_window else None
         return self.channel_count()
 
-    def settle(self):
-        """End of a render: sums kept in double precision become single precision, and a film without a steady image
-        sums one up.
-        """
+    def add_steady(self, pixel, channels):
+        """Add to the steady image of pixels, unless the film sums it up of its array."""
+        if self.keeps_steady:
+            for c, value in enumerate(channels):
+                index = pixel * self.channel_count() + c
+                dr.scatter_reduce(dr.ReduceOp.Add, self.steady, type(self.steady)(value), index)
+
+    def add_outside(self, pixel, before, after):
+        """Count the light of pixels that a window missed; nothing to do for a film without one."""
+        if self.outside is not None:
+            for side, value in enumerate((before, after)):
+                dr.scatter_reduce(dr.ReduceOp.Add, self.outside, type(self.outside)(value), pixel * 2 + side)
+
+    def finish_render(self):
         if dr.type_v(self.steady) != dr.type_v(mi.Float):
             self.bands = [(first, rows, mi.Float(flat)) for first, rows, flat in self.bands]
             self.steady = mi.Float(self.steady)
@@ -160,15 +157,16 @@ class TimeResolvedFilm(mi.Film):
             dr.scatter(self.steady, total.array, index)
 
     def clear(self):
-        """Drop the storage; tensors developed before keep their memory."""
         self.bands, self.steady, self.outside = [], None, None
 
     def transient_bands(self):
-        """The storage as (first row, rows, flat array) for each band."""
         return self.bands
 
+    def band_array(self, band: int):
+        """The flat array of a band, which :meth:`put` adds to."""
+        return self.bands[band][2]
+
     def check_one_band(self):
-        """Raise ``StorageError`` when the cube does not fit into one tensor."""
         if self.band_rows() < int(self.crop_size()[1]):
             raise StorageError(
                 f"{self.plugin}: the cube {self.cube_shape()} exceeds the 2^32 values of one tensor; render with "
@@ -189,12 +187,10 @@ class TimeResolvedFilm(mi.Film):
 
     @property
     def energy_before(self) -> float:
-        """Light that arrived before ``start_opl``: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(0)
 
     @property
     def energy_after(self) -> float:
-        """Light that arrived after the end of the window: sum over pixels, mean over channels (of S0)."""
         return self._energy_outside(1)
 
     def _energy_outside(self, side: int) -> float:
@@ -203,7 +199,6 @@ class TimeResolvedFilm(mi.Film):
     # ----------------------------------------------------------------------------------- pixel sampling
 
     def sample_offset(self, sample):
-        """Offset from the pixel's centre drawn from the spatial filter, and the sample's weight."""
         rfilter = self.rfilter()
         if rfilter.is_box_filter():
             return sample - 0.5, None

@@ -65,11 +65,6 @@ class ChannelMatch:
         return result
 
 
-def zero_channels(count: int) -> list:
-    """``count`` zeros."""
-    return [mi.Float(0) for _ in range(count)]
-
-
 def mean_of(channels: list):
     """Mean over the channels, those of the power in polarized variants."""
     if mi.is_polarized:

@@ -65,47 +65,47 @@ class GateTable:
 
 
 @dr.syntax
-def put_gates(spot, table, opl, value, slope_value, active):
+def put_gates(layout, table, opl, value, slope_value, active):
     """Add to every gate that light arriving at ``opl`` meets."""
     g, end = table.candidates(opl, active)
     going = mi.Bool(active) & (g < end)
     while dr.hint(going, label="gates put"):
         weight, slope = table.value(g, opl, going)
-        _scatter(spot, g, weight, slope, value, slope_value, going & ((weight != 0) | (slope != 0)))
+        _scatter(layout, g, weight, slope, value, slope_value, going & ((weight != 0) | (slope != 0)))
         g += 1
         going = going & (g < end)
 
 
-def _scatter(spot, gate, weight, slope, value, slope_value, active):
-    for c in range(spot.channels):
+def _scatter(layout, gate, weight, slope, value, slope_value, active):
+    for c in range(layout.channels):
         v = value[c] * weight
         if slope_value is not None:
             v += slope_value[c] * slope
-        index = dr.fma(gate, spot.bin_stride, spot.base) + c * spot.channel_stride
-        dr.scatter_reduce(dr.ReduceOp.Add, spot.flat, type(spot.flat)(v), index, active)
+        index = dr.fma(gate, layout.bin_stride, layout.base) + c * layout.channel_stride
+        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index, active)
 
 
 @dr.syntax
-def read_gates(spot, table, opl, steady, active):
+def read_gates(layout, table, opl, steady, active):
     """Adjoint and its slope summed over the gates that light arriving at ``opl`` meets."""
-    A, slope = [mi.Float(0) for _ in range(spot.channels)], [mi.Float(0) for _ in range(spot.channels)]
+    A, slope = [mi.Float(0) for _ in range(layout.channels)], [mi.Float(0) for _ in range(layout.channels)]
     g, end = table.candidates(opl, active)
     going = mi.Bool(active) & (g < end)
     while dr.hint(going, label="gates read"):
         weight, dweight = table.value(g, opl, going)
-        A, slope = _gathered(spot, g, weight, dweight, steady, A, slope, going)
+        A, slope = _gathered(layout, g, weight, dweight, steady, A, slope, going)
         g += 1
         going = going & (g < end)
     return A, slope
 
 
-def _gathered(spot, gate, weight, dweight, steady, A, slope, active):
-    index = dr.fma(gate, spot.bin_stride, spot.base)
+def _gathered(layout, gate, weight, dweight, steady, A, slope, active):
+    index = dr.fma(gate, layout.bin_stride, layout.base)
     total_A, total_slope = [], []
-    for c in range(spot.channels):
+    for c in range(layout.channels):
         a = mi.Float(0) if steady is None else steady[c]
-        if spot.flat is not None:
-            a = a + dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, active)
+        if layout.flat is not None:
+            a = a + dr.gather(mi.Float, layout.flat, index + c * layout.channel_stride, active)
         total_A.append(dr.fma(a, weight, A[c]))
         total_slope.append(dr.fma(a, dweight, slope[c]))
     return total_A, total_slope

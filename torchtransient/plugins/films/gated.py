@@ -9,7 +9,7 @@ from torchtransient.gates import gates_from_text
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.gate_table import GateTable, put_gates, read_gates
-from torchtransient.plugins.films.long_kernel import Spot
+from torchtransient.plugins.films.long_kernel import BinLayout
 from torchtransient.plugins.films.pulsed_filter import pulse_of
 from torchtransient.plugins.films.window import GappedWindow
 
@@ -70,8 +70,7 @@ class GatedHDRFilm(TimeResolvedFilm):
         return self._has_slope
 
     @property
-    def temporal_filter(self) -> str:
-        """What errors call the film's response over time."""
+    def response_name(self) -> str:
         return "rectangular gate"
 
     @property
@@ -99,29 +98,22 @@ class GatedHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def put(self, cube, base, opl_from_start, value, active):
-        """Add ``value`` (a list of channel values) arriving at ``opl - start_opl`` to the gates from ``base`` on."""
-        put_gates(self._spot(cube, base), self.table, opl_from_start, value, None, active)
+    def put(self, band, base, opl_from_start, value, active):
+        put_gates(self._layout(band, base), self.table, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
-    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active):
-        """Forward mode: add ``gate df + f gate' dtau``; arguments as for :meth:`put`."""
-        put_gates(self._spot(cube, base), self.table, opl_from_start, d_value, value_d_opl, active)
+    def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
+        put_gates(self._layout(band, base), self.table, opl_from_start, d_value, value_d_opl, active)
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):
-        """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
-
-        ``adjoint`` is ``(flat array, gate stride, channel stride)`` or None, ``base`` the index of the pixel's first
-        value in it, ``steady`` the adjoint of the sum over the gates.
-        """
         channels = self.channel_count()
         flat, gate_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
-        spot = Spot(flat, base, gate_stride, channel_stride, self.gate_count(), channels)
-        return read_gates(spot, self.table, mi.Float64(opl_from_start), steady, active)
+        layout = BinLayout(flat, base, gate_stride, channel_stride, self.gate_count(), channels)
+        return read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
 
-    def _spot(self, cube, base):
+    def _layout(self, band, base):
         channels = self.channel_count()
-        return Spot(cube, base, channels, 1, self.gate_count(), channels)
+        return BinLayout(self.band_array(band), base, channels, 1, self.gate_count(), channels)
 
     def to_string(self):
         return (

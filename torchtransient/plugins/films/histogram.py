@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.long_kernel import Spot
+from torchtransient.plugins.films.long_kernel import BinLayout
 from torchtransient.plugins.films.long_kernel import put as put_long
 from torchtransient.plugins.films.long_kernel import read as read_long
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
@@ -17,6 +17,8 @@ from torchtransient.plugins.films.window import ArrivalWindow
 
 # Kernels of more bins are looped over instead of written out.
 MAX_UNROLLED = 9
+# Temporal filters of other settings that a film keeps.
+MAX_FILTERS = 8
 
 
 class TransientHDRFilm(TimeResolvedFilm):
@@ -64,6 +66,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "transient_hdr_film"
+    measures = "transient"
 
     def __init__(self, props):
         super().__init__(props)
@@ -77,7 +80,9 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.keeps_steady = self.has_window = bool(props.get("steady", True))
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
-        self._make_filter()
+        # Temporal filters by what they were made for, since a renderer changes the film's and puts it back.
+        self._filters = {}
+        self.take_filter("", None)
 
     # ------------------------------------------------------------------------------------- parameters
 
@@ -108,9 +113,7 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     @temporal_filter.setter
     def temporal_filter(self, name: str):
-        check_name(name)
-        self._filter_name = name
-        self._make_filter()
+        self.take_filter(name, None)
 
     @property
     def gaussian_stddev(self) -> float:
@@ -119,21 +122,29 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     @gaussian_stddev.setter
     def gaussian_stddev(self, stddev: float):
-        check_stddev(stddev)
-        self._gaussian_stddev = float(stddev)
-        self._make_filter()
-
-    def _make_filter(self):
-        self.filter = make_temporal_filter(self._filter_name, self._gaussian_stddev)
-        if self.pulses:
-            self.filter = PulsedFilter(self.filter, self.pulses, self.bin_width_opl)
-        self._long = getattr(self.filter, "count", 0) > MAX_UNROLLED
+        self.take_filter("", stddev)
 
     def take_filter(self, name: str, stddev: float | None):
-        if stddev is not None:
-            self.gaussian_stddev = stddev
-        if name:
-            self.temporal_filter = name
+        name, stddev = name or self._filter_name, self._gaussian_stddev if stddev is None else float(stddev)
+        check_name(name)
+        check_stddev(stddev)
+        # Nothing is changed by a setting that cannot be used.
+        self.filter = self._filter_for(name, stddev)
+        self._filter_name, self._gaussian_stddev = name, stddev
+        self._long = getattr(self.filter, "count", 0) > MAX_UNROLLED
+
+    def _filter_for(self, name: str, stddev: float):
+        """A pulse makes a table of the filter: it is made once for every setting that is used, and kept."""
+        made_for = name, stddev if name == "gaussian" else None, self.bin_width_opl, tuple(self.pulses)
+        found = self._filters.pop(made_for, None)
+        if found is None:
+            found = make_temporal_filter(name, stddev)
+            if self.pulses:
+                found = PulsedFilter(found, self.pulses, self.bin_width_opl)
+        self._filters[made_for] = found
+        while len(self._filters) > MAX_FILTERS:
+            del self._filters[next(iter(self._filters))]
+        return found
 
     @property
     def has_slope(self) -> bool:
@@ -181,18 +192,16 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Index of the histogram of one laser position, where ``base`` is that of a pixel's first one."""
         return base if laser is None else base + laser * (self.temporal_bins * self.channel_count())
 
-    def put(self, cube, base, opl_from_start, value, active, laser=None):
-        """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the histogram that begins at ``base``.
-
-        ``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
-        otherwise. Returns the fractions of ``value`` that belong to bins before the window and to bins after it; they
-        are not stored.
+    def put(self, band, base, opl_from_start, value, active, laser=None):
+        """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
+        otherwise.
         """
+        cube = self.band_array(band)
         x = self.bin_position(opl_from_start)
         bins, channels = self.temporal_bins, self.channel_count()
         base = self.pixel_base(base, laser)
         if self._long:
-            return put_long(Spot(cube, base, channels, 1, bins, channels), self.filter, x, value, None, active)
+            return put_long(BinLayout(cube, base, channels, 1, bins, channels), self.filter, x, value, None, active)
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
         # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a
@@ -209,17 +218,12 @@ class TransientHDRFilm(TimeResolvedFilm):
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):
-        """``A`` and its slope ``dA / d opl`` for an arrival: lists over channels.
-
-        ``adjoint`` is ``(flat array, bin stride, channel stride)`` or None, and ``base`` the index of the histogram's
-        first value in it; ``steady`` is the adjoint of the sum over the bins.
-        """
         flat, bin_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
         if self._long:
-            spot = Spot(flat, base, bin_stride, channel_stride, self.temporal_bins, channels)
-            A, slope = read_long(spot, self.filter, x, active, steady)
+            layout = BinLayout(flat, base, bin_stride, channel_stride, self.temporal_bins, channels)
+            A, slope = read_long(layout, self.filter, x, active, steady)
             return A, [s * (1 / self.bin_width_opl) for s in slope]
         A, slope = [mi.Float(0)] * channels, [mi.Float(0)] * channels
         first, taps = self.filter.weights(x)
@@ -236,15 +240,15 @@ class TransientHDRFilm(TimeResolvedFilm):
                     slope[c] = dr.fma(a, dweight * (1 / self.bin_width_opl), slope[c])
         return A, slope
 
-    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active, laser=None):
-        """Forward mode: add ``k df + f k' dtau`` to the derivative cube; arguments as for :meth:`put`."""
+    def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active, laser=None):
+        cube = self.band_array(band)
         x = self.bin_position(opl_from_start)
         channels = self.channel_count()
         base = self.pixel_base(base, laser)
         if self._long:
             slopes = [v * (1 / self.bin_width_opl) for v in value_d_opl]
-            spot = Spot(cube, base, channels, 1, self.temporal_bins, channels)
-            put_long(spot, self.filter, x, d_value, slopes, active)
+            layout = BinLayout(cube, base, channels, 1, self.temporal_bins, channels)
+            put_long(layout, self.filter, x, d_value, slopes, active)
             return
         first, taps = self.filter.weights(x)
         for offset, weight, dweight in taps:

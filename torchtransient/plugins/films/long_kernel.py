@@ -1,6 +1,6 @@
 """Loops over the bins of a long temporal kernel: what unrolled code does for a short one.
 
-``spot`` is a plain object with the arrays that are scattered to or gathered from: Dr.Jit loops leave it alone, where
+``layout`` is a plain object with the arrays that are scattered to or gathered from: Dr.Jit loops leave it alone, where
 they would take local variables for loop state.
 """
 
@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 
-class Spot:
+class BinLayout:
     """Where one event meets the film: arrays, index of the histogram's first value, strides, bins and channels."""
 
     def __init__(self, flat, base, bin_stride, channel_stride, bins, channels):
@@ -20,7 +20,7 @@ class Spot:
 
 
 @dr.syntax
-def put(spot, kernel, x, value, slope_value, active):
+def put(layout, kernel, x, value, slope_value, active):
     """Add ``value`` times the weight and ``slope_value`` times its slope per bin; returns the shares of the weight
     before and after the window. Either list may be None.
     """
@@ -34,54 +34,54 @@ def put(spot, kernel, x, value, slope_value, active):
         high, high_pdf = kernel.edge(node, share)
         weight, dweight = high - low, low_pdf - high_pdf
         before += dr.select(k < 0, weight, 0)
-        after += dr.select(k >= spot.bins, weight, 0)
-        inside = going & (k >= 0) & (k < spot.bins)
-        scatter(spot, inside, k, weight, dweight, value, slope_value)
+        after += dr.select(k >= layout.bins, weight, 0)
+        inside = going & (k >= 0) & (k < layout.bins)
+        scatter(layout, inside, k, weight, dweight, value, slope_value)
         low, low_pdf = mi.Float(high), mi.Float(high_pdf)
         k += 1
         going = going & (k < end)
     return before, after
 
 
-def scatter(spot, inside, k, weight, dweight, value, slope_value):
+def scatter(layout, inside, k, weight, dweight, value, slope_value):
     """Add to one bin."""
-    index = dr.fma(mi.UInt32(k), spot.bin_stride, spot.base)
-    for c in range(spot.channels):
+    index = dr.fma(mi.UInt32(k), layout.bin_stride, layout.base)
+    for c in range(layout.channels):
         v = 0 if value is None else value[c] * weight
         if slope_value is not None:
             v += slope_value[c] * dweight
-        dr.scatter_reduce(dr.ReduceOp.Add, spot.flat, type(spot.flat)(v), index + c * spot.channel_stride, inside)
+        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index + c * layout.channel_stride, inside)
 
 
 @dr.syntax
-def read(spot, kernel, x, active, steady=None):
+def read(layout, kernel, x, active, steady=None):
     """Weighted sum of a cube's entries and its slope per bin: two lists over channels. ``steady``: list that is added
     to every entry.
     """
     k, node, share = kernel.begin(x)
     end = k + kernel.count
     low, low_pdf = kernel.edge(node, share)
-    A, slope = [mi.Float(0) for _ in range(spot.channels)], [mi.Float(0) for _ in range(spot.channels)]
+    A, slope = [mi.Float(0) for _ in range(layout.channels)], [mi.Float(0) for _ in range(layout.channels)]
     going = mi.Bool(active)
     while dr.hint(going, label="long temporal kernel, adjoint"):
         node += kernel.nodes_per_bin
         high, high_pdf = kernel.edge(node, share)
-        A, slope = gathered(spot, going, k, high - low, low_pdf - high_pdf, steady, A, slope)
+        A, slope = gathered(layout, going, k, high - low, low_pdf - high_pdf, steady, A, slope)
         low, low_pdf = mi.Float(high), mi.Float(high_pdf)
         k += 1
         going = going & (k < end)
     return A, slope
 
 
-def gathered(spot, going, k, weight, dweight, steady, A, slope):
+def gathered(layout, going, k, weight, dweight, steady, A, slope):
     """The sums with one more bin."""
-    inside = going & (k >= 0) & (k < spot.bins)
-    index = dr.fma(mi.UInt32(k), spot.bin_stride, spot.base)
+    inside = going & (k >= 0) & (k < layout.bins)
+    index = dr.fma(mi.UInt32(k), layout.bin_stride, layout.base)
     values = []
-    for c in range(spot.channels):
+    for c in range(layout.channels):
         a = mi.Float(0) if steady is None else dr.select(inside, steady[c], 0)
-        if spot.flat is not None:
-            a += dr.gather(mi.Float, spot.flat, index + c * spot.channel_stride, inside)
+        if layout.flat is not None:
+            a += dr.gather(mi.Float, layout.flat, index + c * layout.channel_stride, inside)
         values.append(a)
     return (
         [dr.fma(a, weight, s) for a, s in zip(values, A, strict=True)],

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventLane, events_at_most, rotation
+from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, events_at_most, rotation
 from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 
 # The events of one kernel launch wait in memory until the next kernel sums them up; larger jobs take several launches.
@@ -147,29 +147,25 @@ class PhasorHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def lane(self, job, base, match, depth, tangents=False):
-        return EventLane(self, self.bands[job.band], base, match, job, depth, tangents)
+    def create_block(self, job, base, match, depth, tangents=False):
+        return EventBlock(self, job, base, match, depth, tangents)
 
     def _table(self, flat):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count())
 
-    def put(self, cube, base, opl_from_start, value, active):
-        """Add ``value`` (a list of channel values) at ``opl - start_opl`` to the phasors that begin at ``base``.
-
-        One event, frequency by frequency: the plain form of what :class:`EventLane` does for many events at once.
-        """
-        add_event(self._table(cube), base, opl_from_start, value, None, active)
+    def put(self, band, base, opl_from_start, value, active):
+        """One event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
+        add_event(self._table(self.band_array(band)), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
-    def put_slope(self, cube, base, opl_from_start, d_value, value_d_opl, active):
-        """Forward mode: add ``k df + f k' dtau`` to the derivative of the phasors; arguments as for :meth:`put`."""
-        add_event(self._table(cube), base, opl_from_start, d_value, value_d_opl, active)
+    def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
+        add_event(self._table(self.band_array(band)), base, opl_from_start, d_value, value_d_opl, active)
 
-    def read(self, adjoint, base, opl_from_start, active):
+    def read(self, adjoint, base, opl_from_start, active, steady=None):
         """``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival: lists over channels.
 
-        ``adjoint`` is ``(flat array, frequency stride, entry stride)`` and ``base`` the index of the pixel's first
-        value in it.
+        ``adjoint`` is ``(flat array, frequency stride, entry stride)``; ``steady`` is always None, since the film keeps
+        a steady image.
         """
         flat, stride, entry = adjoint
         return read_event(self._table(flat), base, stride, entry, opl_from_start, active)

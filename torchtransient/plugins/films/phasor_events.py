@@ -14,7 +14,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.films.lane import Lane
+from torchtransient.plugins.films.block import FilmBlock
 
 # Events of a path that are kept; what exceeds them is added one by one, which is slower.
 MAX_EVENTS = 16
@@ -39,12 +39,12 @@ def rotation(turns):
     return cos, sin
 
 
-class EventLane(Lane):
+class EventBlock(FilmBlock):
     """Keeps the events of each path of one pass and sums them up in ``finish``."""
 
-    def __init__(self, film, band, base, match, job, depth, tangents):
-        self.first_row, _, cube = band
-        super().__init__(film, cube, base, match)
+    def __init__(self, film, job, base, match, depth, tangents):
+        super().__init__(film, job.band, base, match)
+        self.first_row, _, self.cube = film.bands[job.band]
         self.job, self.tangents = job, tangents
         self.slots = events_at_most(depth, tangents)
         self.overflows = (3 if tangents else 2) * depth > self.slots
@@ -62,14 +62,14 @@ class EventLane(Lane):
         channels = self.match.to_channels(value)
         more = self._store(events, opl, channels, active)
         if self.overflows:
-            self.film.put(self.cube, self.base, opl, channels, more)
+            self.film.put(self.band, self.base, opl, channels, more)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
         d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
         more = self._store(events, opl, d + slope, active)
         if self.overflows:
-            self.film.put_slope(self.cube, self.base, opl, d, slope, more)
+            self.film.put_slope(self.band, self.base, opl, d, slope, more)
 
     def _store(self, events, opl, values, active):
         """Append an event to its path; returns where there was no room left."""
@@ -164,22 +164,22 @@ class FrequencyBlock:
 
 
 @dr.syntax
-def sum_events(lane, block, first, last):
+def sum_events(events, frequencies, first, last):
     """Sums of ``value * exp(-2 pi i nu opl)`` over the events of the paths from ``first`` to ``last``.
 
     Returns real and imaginary parts, each a list over the frequencies of the block of lists over the event's values.
     """
-    numbers = len(lane.values)
-    re = [[mi.Float(0) for _ in range(numbers)] for _ in range(block.size)]
-    im = [[mi.Float(0) for _ in range(numbers)] for _ in range(block.size)]
+    numbers = len(events.values)
+    re = [[mi.Float(0) for _ in range(numbers)] for _ in range(frequencies.size)]
+    im = [[mi.Float(0) for _ in range(numbers)] for _ in range(frequencies.size)]
     path, n = mi.UInt32(first), mi.UInt32(0)
-    count = dr.gather(mi.UInt32, lane.count, path)
+    count = dr.gather(mi.UInt32, events.count, path)
     while dr.hint(path < last, label="phasor sums"):
         live = n < count
-        index = dr.fma(n, lane.paths, path)
-        opl = dr.gather(mi.Float64, lane.opl, index, live)
-        values = [dr.gather(mi.Float, array, index, live) for array in lane.values]
-        for j, (cos, sin) in enumerate(block.rotations(opl)):
+        index = dr.fma(n, events.paths, path)
+        opl = dr.gather(mi.Float64, events.opl, index, live)
+        values = [dr.gather(mi.Float, array, index, live) for array in events.values]
+        for j, (cos, sin) in enumerate(frequencies.rotations(opl)):
             for c in range(numbers):
                 re[j][c] = dr.fma(values[c], cos, re[j][c])
                 im[j][c] = dr.fma(-values[c], sin, im[j][c])
@@ -187,5 +187,5 @@ def sum_events(lane, block, first, last):
         over = n >= count
         path += dr.select(over, mi.UInt32(1), 0)
         n = dr.select(over, 0, n)
-        count = dr.select(over, dr.gather(mi.UInt32, lane.count, path, over & (path < last)), count)
+        count = dr.select(over, dr.gather(mi.UInt32, events.count, path, over & (path < last)), count)
     return re, im

@@ -1,16 +1,18 @@
 """Temporal filters: how one arrival spreads over the bins of the time axis.
 
-A filter is a function ``k(x)`` of the distance from a bin's centre in units of bins. All filters here are
-the bin's box convolved with a smooth kernel, so they sum to one over the bins at every arrival time and the
-sum of a transient over its bins stays the steady image:
+A filter gives the weight ``k(x)`` of a bin by the distance ``x`` between arrival and the bin's centre, in bins. All
+filters here are the bin's box convolved with a kernel of mass one, so they sum to one over the bins at every arrival
+time and the sum of a transient over its bins stays the steady image:
 
-====== =============================================================== ============ ==========
-name   kernel                                                          slope        bins hit
-====== =============================================================== ============ ==========
-box    none: the exact histogram, half-open bins ``[k, k + 1)``        none         1
-tent   box of one bin: linear splat between the two nearest centres    piecewise    2
-gauss  Gaussian of ``stddev`` bins, cut at ``4 stddev`` and rescaled   smooth       2 ceil(4 s) + 1
-====== =============================================================== ============ ==========
+======== ============================================================= =================== ===================
+name     kernel                                                        slope               bins written
+======== ============================================================= =================== ===================
+box      none: the exact histogram, half-open bins ``[k, k + 1)``      none                1
+tent     box of one bin: linear splat between the two nearest centres  piecewise constant  2
+gaussian Gaussian of ``stddev`` bins s, cut at 4 s and rescaled        continuous but for  2 ceil(4 s) + 1
+                                                                       3e-4 of its height
+                                                                       at the cut
+======== ============================================================= =================== ===================
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ class BoxFilter:
     def weights(self, x):
         """Weights of one arrival.
 
-        ``x`` is the arrival in bins (0 is the start of bin 0), ``Float64``. Returns a list of
-        ``(offset from floor(x), weight, d weight / dx)``.
+        ``x`` is the arrival in bins (0 is the start of bin 0), ``Float64``. Returns a bin (``Float64``, which may lie
+        outside of the axis) and a list of ``(offset from that bin, weight, d weight / dx)``.
         """
         return dr.floor(x), [(0, mi.Float(1), mi.Float(0))]
 

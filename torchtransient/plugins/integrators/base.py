@@ -1,8 +1,6 @@
-"""What every transient integrator shares: parameters, passes, primary rays and the three entry points."""
+"""What every transient integrator shares: parameters, primary rays, launches and the three entry points."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -11,50 +9,34 @@ from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
-from torchtransient.plugins.integrators.media.media_facts import media_facts
-from torchtransient.plugins.integrators.push import settle_tangents, tangents
-from torchtransient.plugins.integrators.scene_facts import SceneFacts, scene_facts
+from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
+from torchtransient.plugins.parameters import check_slope, moving_names
+from torchtransient.plugins.polarized import turning_throughput
 from torchtransient.plugins.sampling.distant import distant_reference
-from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_turn
+from torchtransient.plugins.transport.carry import Carry
+from torchtransient.plugins.transport.contents import SceneContents
+from torchtransient.plugins.transport.derivative.forward import forward, tangents_of
+from torchtransient.plugins.transport.derivative.reverse import reverse
+from torchtransient.plugins.transport.derivative.wanted import Wanted
+from torchtransient.plugins.transport.sinks.film import FilmSink
+from torchtransient.plugins.transport.sinks.record import RecordSink
+from torchtransient.plugins.transport.walk import walk
+from torchtransient.plugins.transport.world import PathSettings, World
 
-# Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
-# bits.
-MAX_LANES = 2**26
-
-
-@dataclass
-class Pass:
-    """One kernel launch: ``spp`` of ``total`` samples per pixel for rows of one storage band."""
-
-    band: int
-    first_row: int
-    rows: int
-    spp: int
-    total: int
-    seed: int
+UNLIMITED = 0xFFFFFFFF
 
 
-def _launch_counts(sampler, spp: int, most: int) -> list[int]:
-    """Samples per pixel of the launches that make up ``spp``, at most ``most`` each, in numbers that the sampler takes.
-
-    Samplers such as multijitter or ldsampler round a number up; what they really draw is what a pixel is divided by.
+class PrimaryRays:
+    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``row`` and ``column``
+    of the pixel, the :class:`~..sensors.origin.View` of every sensor (``seen``), and ``match`` (ChannelMatch). A plain
+    object, which Dr.Jit loops leave alone.
     """
 
-    def drawn(count):
-        sampler.set_sample_count(count)
-        return sampler.sample_count()
-
-    if spp <= most:
-        return [drawn(spp)]
-    while most > 1 and drawn(most) > most:
-        # Rounding up would exceed the launch; the sampler takes some smaller number.
-        most -= max(1, most // 16)
-    counts = []
-    while (left := spp - sum(counts)) > 0:
-        counts.append(drawn(min(most, left)))
-    return counts
+    def __init__(self, sampler, ray, weight, scale, row, column, seen):
+        self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
+        self.row, self.column, self.seen = row, column, seen
 
 
 class TransientIntegrator(mi.CppADIntegrator):
@@ -65,7 +47,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     that reaches the sensor without a bounce),
     ``temporal_filter`` (the film's) and ``gaussian_stddev`` (the film's, in bins).
 
-    Subclasses provide ``trace`` (primal), ``sweep`` (reverse mode) and ``push`` (forward mode).
+    Subclasses say with :meth:`strategies` what the walk of light is made of, see :mod:`..transport.strategy`;
+    derivatives in both modes follow from that.
     """
 
     def __init__(self, props):
@@ -73,7 +56,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         max_depth = int(props.get("max_depth", 6))
         if max_depth < -1:
             raise SceneError(f"max_depth: expected -1 (no limit) or a number >= 0, got {max_depth}.")
-        self.max_depth = max_depth if max_depth != -1 else 0xFFFFFFFF
+        self.max_depth = max_depth if max_depth != -1 else UNLIMITED
         self.rr_depth = int(props.get("rr_depth", 5))
         if self.rr_depth <= 0:
             raise SceneError(f"rr_depth: expected a number >= 1, got {self.rr_depth}.")
@@ -86,7 +69,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if "gaussian_stddev" in props:
             self.gaussian_stddev = float(props["gaussian_stddev"])
             check_stddev(self.gaussian_stddev)
-        self._distant = None
+        self._reference = self._contents = None
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
@@ -116,7 +99,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
             )
-        if not self.walks_through_media and media_facts(scene, sensor) is not None:
+        if not self.walks_through_media and self.contents(scene, sensor).media is not None:
             raise SceneError(
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
@@ -125,57 +108,45 @@ class TransientIntegrator(mi.CppADIntegrator):
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
 
-    def facts(self, scene, sensor=None) -> SceneFacts:
-        """What the loops may leave out for this scene, seen by this sensor.
+    def strategies(self, contents):
+        """(segment, scattering, list of connections) for a scene with these contents: new objects for every job."""
+        raise NotImplementedError
 
-        The reference sphere of distant lights is fixed when a scene is first seen: moving a shape must not shift the
-        clock. The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes
-        is, so that no later scene can be taken for this one because it got the same addresses.
+    def contents(self, scene, sensor) -> SceneContents:
+        """What the scene contains, looked up when it is first seen by this sensor.
+
+        The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes is, so
+        that no later scene can be taken for this one because it got the same addresses.
         """
-        facts = scene_facts(scene, self.reference(scene))
-        if sensor is not None:
-            facts.window = sensor.film().arrivals()
-            facts.light_box = LightBox.of(scene, facts.bsdfs) if facts.window is not None else None
-        if self.walks_through_media:
-            facts.media = media_facts(scene, sensor)
-        if facts.media is not None:
-            facts.media.hide_emitters = bool(self.hide_emitters)
-        return facts
+        shapes = scene.shapes()
+        key = (scene.ptr, sensor.ptr, *(shape.ptr for shape in shapes))
+        if self._contents is None or self._contents[0] != key:
+            self._contents = (key, SceneContents(scene, sensor, self.reference(scene)), shapes[:1])
+        return self._contents[1]
+
+    def world(self, scene, sensor, contents, wanted=None, window=None) -> World:
+        """What the walks of one job are told."""
+        settings = PathSettings(
+            self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
+        )
+        return World(scene, contents, settings, self.strategies(contents), wanted, window)
 
     def reference(self, scene):
-        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
+        """The sphere around the scene as it was first seen, which light from and to infinity is timed by: moving a
+        shape must not shift the clock.
+        """
         shapes = scene.shapes()
         key = (scene.ptr, *(shape.ptr for shape in shapes))
-        if self._distant is None or self._distant[0] != key:
-            self._distant = (key, distant_reference(scene), shapes[:1])
-        return self._distant[1]
+        if self._reference is None or self._reference[0] != key:
+            self._reference = (key, distant_reference(scene), shapes[:1])
+        return self._reference[1]
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
-        """The launches of a job, and the largest number of samples per pixel.
+        """The launches of a job, and the largest number of samples per pixel."""
+        return passes_of(sensor.sampler().clone(), film, seed_array(seed), spp, self.max_depth)
 
-        Some samplers round the number of samples of a launch, so that storage bands of different heights may get
-        different totals.
-        """
-        sampler = sensor.sampler().clone()
-        if spp:
-            sampler.set_sample_count(spp)
-        spp = sampler.sample_count()
-        width = int(film.crop_size()[0])
-        most = min(MAX_LANES, film.lanes_at_most(self.max_depth) or MAX_LANES)
-        result = []
-        for band, (first_row, rows) in enumerate(film.band_layout()):
-            counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))
-            rows_per_pass = rows if width * rows * max(counts) <= most else max(1, most // width)
-            for row in range(first_row, first_row + rows, rows_per_pass):
-                some = min(rows_per_pass, first_row + rows - row)
-                result += [Pass(band, row, some, count, sum(counts), 0) for count in counts]
-        for i, p in enumerate(result):
-            # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
-            p.seed = seed if len(result) == 1 else int(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0][0])
-        return result, max(p.total for p in result)
-
-    def start(self, scene, sensor, film, job: Pass):
-        """Seeded sampler, primary rays (attached to the sensor), ray weight, pixel indices and sensors of one pass."""
+    def start(self, scene, sensor, film, job: Pass) -> PrimaryRays:
+        """The primary rays of one pass."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
@@ -201,21 +172,31 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
-        scale = mi.Float(1 / job.total) if weight is None else weight / job.total
-        return sampler, ray, ray_weight, scale, row, column, seen
+        scale = dr.opaque(mi.Float, 1 / job.total)
+        if weight is not None:
+            scale *= weight
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen)
 
-    def channel_match(self, seen, film, ray, ray_weight, scale):
+    def channel_match(self, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
-        turn = sensor_turn(seen, dr.detach(ray)) if mi.is_polarized else None
-        return ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale, film.curves, turn)
+        ray = dr.detach(rays.ray)
+        turn = sensor_turn(rays.seen, ray) if mi.is_polarized else None
+        return ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves, turn)
 
-    def lane_bases(self, film, job, row, column):
-        """Index of a pixel's first bin in its band, and of the pixel in the film."""
+    def pixel_indices(self, film, job, rays):
+        """Index of a pixel's first entry in its band, and of the pixel in the film."""
         width = int(film.crop_size()[0])
         first = film.band_layout()[job.band][0]
-        pixel = dr.fma(row, width, column)
+        pixel = dr.fma(rays.row, width, rays.column)
         in_band = pixel - dr.opaque(mi.UInt32, first * width)
         return in_band * film.entries_per_pixel(), pixel
+
+    def first_opl(self, film, rays):
+        """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
+        length = mi.Float(0)
+        if not self.camera_unwarp:
+            length = dr.detach(length_to_sensor_origin(rays.seen, rays.ray))
+        return mi.Float64(length) - film.start_opl
 
     # ----------------------------------------------------------------------------------- entry points
 
@@ -230,31 +211,30 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             if develop:
                 film.check_one_band()
-            jobs, samples = self.passes(sensor, film, int(seed), int(spp))
+            world = self.world(scene, sensor, self.contents(scene, sensor), window=film.arrivals())
+            jobs, samples = self.passes(sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for i, job in enumerate(jobs):
-                self._render_pass(scene, sensor, film, job)
+                self._render_pass(world, sensor, film, job)
                 if evaluate or len(jobs) > 1:
                     dr.eval(film.bands[job.band][2], film.steady, film.outside)
                 if progress_callback:
                     dr.sync_thread()
                     progress_callback((i + 1) / len(jobs))
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
-    def _render_pass(self, scene, sensor, film, job):
-        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
-        match = self.channel_match(seen, film, ray, ray_weight, scale)
-        base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, self.max_depth)
-        first = self._first_opl(seen, film, ray)
-        facts = self.facts(scene, sensor)
-        L, before, after = self.trace(scene, sampler, dr.detach(ray), first, lane, facts)
-        self._add_steady(film, match.to_channels(L), pixel)
+    def _render_pass(self, world, sensor, film, job):
+        rays = self.start(world.scene, sensor, film, job)
+        match = self.channel_match(film, rays)
+        base, pixel = self.pixel_indices(film, job, rays)
+        block = film.create_block(job, base, match, self.max_depth)
+        _, kept = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), FilmSink(block))
+        self._add_steady(film, match.to_channels(kept["L"]), pixel)
         if film.outside is not None:
-            for side, value in enumerate((before, after)):
-                dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(value), pixel * 2 + side)
-        lane.finish()
+            for side, name in enumerate(("before", "after")):
+                dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(kept[name]), pixel * 2 + side)
+        block.finish()
 
     @staticmethod
     def _add_steady(film, channels, pixel):
@@ -263,11 +243,6 @@ class TransientIntegrator(mi.CppADIntegrator):
             for c, value in enumerate(channels):
                 index = pixel * film.channel_count() + c
                 dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index)
-
-    def _first_opl(self, seen, film, ray):
-        """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
-        length = mi.Float(0) if self.camera_unwarp else dr.detach(length_to_sensor_origin(seen, ray))
-        return mi.Float64(length) - film.start_opl
 
     @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -282,43 +257,61 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
-            with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
-            self._check_differentiable(film, facts)
+            contents, wanted = self._wanted(scene, sensor, film)
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:
                 return
-            jobs, _ = self.passes(sensor, film, int(seed), int(spp))
+            world = self.world(scene, sensor, contents, wanted, film.arrivals())
+            jobs, _ = self.passes(sensor, film, seed, int(spp))
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad():
                 for job in jobs:
-                    self._backward_pass(scene, sensor, film, job, g_steady, g_transient, facts)
+                    self._backward_pass(world, sensor, film, job, g_steady, g_transient)
                     dr.eval()
 
-    def _backward_pass(self, scene, sensor, film, job, g_steady, g_transient, facts):
-        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
-        match = self.channel_match(seen, film, ray, ray_weight, scale)
+    def _wanted(self, scene, sensor, film):
+        """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
+        contents = self.contents(scene, sensor)
+        with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
+            effects = contents.parameters(scene).attached()
+        check_slope(moving_names(effects), film.has_slope, film.temporal_filter, film.slope_remedy)
+        if self.max_depth == UNLIMITED:
+            raise GradientError(
+                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
+                "finite number, for instance to where the remaining throughput no longer matters."
+            )
+        return contents, Wanted(effects, sensor, contents)
+
+    def _record(self, world, film, rays):
+        """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
+        sink = RecordSink()
+        count, store = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), sink)
+        return sink.layout, store, count
+
+    def _backward_pass(self, world, sensor, film, job, g_steady, g_transient):
+        rays = self.start(world.scene, sensor, film, job)
+        match = self.channel_match(film, rays)
         channels = film.channel_count()
-        _, pixel = self.lane_bases(film, job, row, column)
+        _, pixel = self.pixel_indices(film, job, rays)
         steady = [mi.Float(0)] * channels
         if g_steady is not None:
             steady = [dr.gather(mi.Float, g_steady.array, pixel * channels + c) for c in range(channels)]
         transient, base = None, mi.UInt32(0)
         if g_transient is not None:
             flat, offset, strides = self._adjoint_layout(film, g_transient)
-            base = row * strides[0] + column * strides[1] + offset
+            base = rays.row * strides[0] + rays.column * strides[1] + offset
             transient = (flat, strides[2], strides[3])
-        lane = film.adjoint_lane(transient, base, steady, match)
-        first = self._first_opl(seen, film, ray)
-        a_o, a_d, a_first, a_turn = self.sweep(scene, sampler, dr.detach(ray), first, lane, facts)
-        if facts.sensor_moves:
+        block = film.create_adjoint_block(transient, base, steady, match)
+        adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
+        if world.wanted.sensor:
             with dr.resume_grad():
-                objective = dr.dot(a_o, ray.o) + dr.dot(a_d, ray.d)
+                objective = dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
                 if not self.camera_unwarp:
-                    objective += a_first * length_to_sensor_origin(seen, ray)
+                    objective += adjoint.slope * length_to_sensor_origin(rays.seen, rays.ray)
                 if mi.is_polarized:
-                    objective += a_turn * sensor_turn(seen, ray).angle()
+                    turning = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
+                    objective += turning * sensor_turn(rays.seen, rays.ray).angle()
                 dr.backward_from(objective)
 
     @no_collection()
@@ -330,38 +323,44 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
+            contents, wanted = self._wanted(scene, sensor, film)
+            world = self.world(scene, sensor, contents, wanted, film.arrivals())
             with dr.resume_grad():
-                facts = self.facts(scene, sensor).with_gradients(scene, sensor)
-                settle_tangents(scene, facts)
-            self._check_differentiable(film, facts)
-            jobs, samples = self.passes(sensor, film, int(seed), int(spp))
+                settle_tangents(world)
+            jobs, samples = self.passes(sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for job in jobs:
-                self._forward_pass(scene, sensor, film, job, facts)
+                self._forward_pass(world, sensor, film, job)
                 dr.eval(film.bands[job.band][2], film.steady)
-            film.settle()
+            film.finish_render()
             return film.develop() if develop else None
 
-    def _forward_pass(self, scene, sensor, film, job, facts):
-        sampler, ray, ray_weight, scale, row, column, seen = self.start(scene, sensor, film, job)
-        match = self.channel_match(seen, film, ray, ray_weight, scale)
-        base, pixel = self.lane_bases(film, job, row, column)
-        lane = film.lane(job, base, match, self.max_depth, tangents=True)
-        first = self._first_opl(seen, film, ray)
-        t_ray, d_first, t_turn = (mi.Vector3f(0), mi.Vector3f(0)), mi.Float(0), None
-        if facts.sensor_moves:
-            with dr.resume_grad():
-                length = length_to_sensor_origin(seen, ray)
-                attached = [ray.o, ray.d, length]
-                if mi.is_polarized:
-                    attached.append(sensor_turn(seen, ray).angle())
-                t_o, t_d, t_first, *t_angle = tangents(attached)
-                t_turn = t_angle[0] if mi.is_polarized else None
-                t_ray = (mi.Vector3f(t_o), mi.Vector3f(t_d))
-                d_first = mi.Float(0) if self.camera_unwarp else t_first
-        dL = self.push(scene, sampler, dr.detach(ray), first, lane, facts, t_ray, d_first, t_turn)
+    def _forward_pass(self, world, sensor, film, job):
+        rays = self.start(world.scene, sensor, film, job)
+        match = self.channel_match(film, rays)
+        base, pixel = self.pixel_indices(film, job, rays)
+        block = film.create_block(job, base, match, self.max_depth, tangents=True)
+        tangent = self._tangent_of(world, rays)
+        dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
         self._add_steady(film, match.to_channels(dL), pixel)
-        lane.finish()
+        block.finish()
+
+    def _tangent_of(self, world, rays) -> Carry:
+        """The tangent of the Carry of the primary rays."""
+        tangent = Carry.zeros()
+        if not world.wanted.sensor:
+            return tangent
+        with dr.resume_grad():
+            attached = [rays.ray.o, rays.ray.d, length_to_sensor_origin(rays.seen, rays.ray)]
+            if mi.is_polarized:
+                attached.append(sensor_turn(rays.seen, rays.ray).angle())
+            o, d, length, *turn = tangents_of(attached)
+        tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
+        tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
+        tangent.slope = mi.Float(0) if self.camera_unwarp else mi.Float(length)
+        if mi.is_polarized:
+            tangent.β = turning_throughput(turn[0])
+        return tangent
 
     @staticmethod
     def _adjoint_layout(film, g_transient):
@@ -375,20 +374,21 @@ class TransientIntegrator(mi.CppADIntegrator):
         _, w, t, c = expected
         return g_transient.array, 0, (w * t * c, t * c, c, 1)
 
-    def _check_differentiable(self, film, facts):
-        if facts.geometry and not film.has_slope:
-            raise GradientError(
-                "A parameter that changes optical path lengths (geometry, light or sensor pose, index of refraction) "
-                f"needs a response over time with a slope; the film has {film.temporal_filter!r}. {film.slope_remedy}"
-            )
-        if self.max_depth == 0xFFFFFFFF:
-            raise GradientError(
-                "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
-                "finite number, for instance to where the remaining throughput no longer matters."
-            )
-
     def to_string(self):
         return (
             f"{type(self).__name__}[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
             f"  camera_unwarp = {self.camera_unwarp},\n  discard_direct_light = {self.discard_direct_light}\n]"
         )
+
+
+def settle_tangents(world):
+    """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
+    attached = world.contents.parameters(world.scene).attached_values()
+    attached += [table for table in world.tables() if dr.grad_enabled(table)]
+    if not attached:
+        return
+    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
+    # On to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so already.
+    for value in attached:
+        dr.enqueue(dr.ADMode.Forward, value)
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)

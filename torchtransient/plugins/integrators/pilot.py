@@ -14,7 +14,9 @@ import numpy as np
 
 from torchtransient._collection import no_collection
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
-from torchtransient.plugins.integrators.base import Pass
+from torchtransient.plugins.integrators.launch import Pass, seed_array
+from torchtransient.plugins.transport.sinks.event_list import EventListSink
+from torchtransient.plugins.transport.walk import walk
 
 # Depth of a pilot's paths. Russian roulette ends most of them long before.
 PILOT_DEPTH = 512
@@ -58,48 +60,6 @@ class _PilotFilm:
         return sample - 0.5, None
 
 
-class _PilotLane:
-    """Lists events, each path in slots of its own. The loops put twice per vertex, emission found and then emission
-    sampled, which gives the depth."""
-
-    def __init__(self, match, curves: bool, lanes: int, slots: int, spp: int):
-        self.match, self.curves, self.slots, self.spp = match, curves, slots, spp
-        self.lane = dr.arange(mi.UInt32, lanes)
-        size = slots * lanes
-        self.opl = dr.zeros(mi.Float64, size)
-        self.energy = dr.zeros(mi.Float, size)
-        self.depth = dr.zeros(mi.UInt32, size)
-        self.used = None
-
-    def begin(self):
-        return {"puts": mi.UInt32(0), "used": mi.UInt32(0)}
-
-    def put(self, events, opl, value, active):
-        puts, used = events["puts"], events["used"]
-        energy = self._energy(value)
-        active = active & (energy != 0)
-        slot, fits = dr.fma(self.lane, self.slots, used), active & (used < self.slots)
-        dr.scatter(self.opl, opl, slot, fits)
-        dr.scatter(self.energy, energy, slot, fits)
-        # Emission found at vertex d needs d + 1 segments, sampled there d + 2.
-        dr.scatter(self.depth, (puts >> 1) + (puts & 1) + 1, slot, fits)
-        events["puts"] = puts + 1
-        events["used"] = used + dr.select(active, mi.UInt32(1), 0)
-        return mi.Float(0), mi.Float(0)
-
-    def _energy(self, value):
-        """Never negative: wavelengths are averaged, since single ones have colours outside of sRGB."""
-        if self.curves:
-            return mean_of(self.match.to_channels(value))
-        return dr.mean(value * self.match.weight)
-
-    def end(self, events):
-        self.used = events["used"]
-
-    def finish(self):
-        pass
-
-
 def pilot_size(film, pixels: int) -> tuple[int, int]:
     """Width and height of a film of about ``pixels`` pixels in the proportions of ``film``, no more than it has."""
     width, height = (int(n) for n in film.crop_size())
@@ -122,44 +82,49 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
         slots = _EVENTS_PER_PATH
         while True:
             spp = max(1, min(paths, _MAX_EVENTS // slots) // (size[0] * size[1]))
-            lane, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots)
+            events, spp, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots)
             if most <= slots:
                 break
             slots = most + most // 8
     finally:
         integrator.max_depth, integrator.rr_depth = before
-    depth = np.array(lane.depth, dtype=np.int64)
+    depth = np.array(events.depth, dtype=np.int64)
     filled = np.flatnonzero(depth)
     path = filled // slots
     return PilotEvents(
-        opl=np.array(lane.opl, dtype=np.float64)[filled],
-        energy=np.array(lane.energy, dtype=np.float64)[filled],
+        opl=np.array(events.opl, dtype=np.float64)[filled],
+        energy=np.array(events.energy, dtype=np.float64)[filled],
         depth=depth[filled],
         path=path,
-        pixel=path // lane.spp,
-        paths=size[0] * size[1] * lane.spp,
+        pixel=path // spp,
+        paths=size[0] * size[1] * spp,
         size=size,
     )
 
 
 @no_collection()
-def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[_PilotLane, int]:
-    """The filled lane, and the largest number of events of a path, which may be more than it had slots for."""
+def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[EventListSink, int, int]:
+    """The events, the samples per pixel, and the largest number of events of a path, which may be more than it had
+    slots for.
+    """
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
     spp = sampler.sample_count()
     with dr.suspend_grad():
-        job = Pass(band=0, first_row=0, rows=size[1], spp=spp, total=spp, seed=seed)
-        sampler, ray, ray_weight, scale, _, _, seen = integrator.start(scene, sensor, film, job)
-        ray = dr.detach(ray)
-        match = ChannelMatch(ray.wavelengths, dr.detach(ray_weight) * scale / (size[0] * size[1]), film.curves)
-        lane = _PilotLane(match, film.curves is not None, size[0] * size[1] * spp, slots, spp)
-        first = integrator._first_opl(seen, film, ray)
-        facts = integrator.facts(scene, sensor)
-        # What the sensor's film would not count is asked for too: the answers are about all arrivals.
-        facts.window = None
-        integrator.trace(scene, sampler, ray, first, lane, facts)
-        most = dr.max(lane.used)
-        dr.eval(most, lane.opl, lane.energy, lane.depth)
+        job = Pass(band=0, first_row=0, rows=size[1], spp=spp, total=spp * size[0] * size[1], seed=seed_array(seed))
+        rays = integrator.start(scene, sensor, film, job)
+        ray = dr.detach(rays.ray)
+        match = ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves)
+        sink = EventListSink(size[0] * size[1] * spp, slots, lambda value: _energy(match, value, film.curves))
+        # Without a window: what the sensor's film would not count is asked for, too.
+        world = integrator.world(scene, sensor, integrator.contents(scene, sensor))
+        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink)
+        most = dr.max(sink.used)
+        dr.eval(most, sink.opl, sink.energy, sink.depth)
         dr.sync_thread()
-    return lane, int(most[0])
+    return sink, spp, int(most[0])
+
+
+def _energy(match, value, curves):
+    """Never negative: wavelengths are averaged, since single ones have colours outside of sRGB."""
+    return dr.mean(value * match.weight) if curves is None else mean_of(match.to_channels(value))

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators import path
+from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
+from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
+from torchtransient.plugins.transport.segment.media import Media
 
 
 class TransientVolpath(path.TransientPath):
     r"""Time-resolved volumetric path tracer (:monosp:`transient_prbvolpath`, :monosp:`transient_volpath`).
 
     The path tracer ``transient_path`` with walks through homogeneous and heterogeneous media between its vertices, see
-    ``media/free_flight.py``: any phase function, colours of extinction, open (``null``) and refractive boundaries,
+    ``transport/segment/free_flight.py``: any phase function, colours of extinction, open (``null``) and refractive
+    boundaries,
     sensors inside a medium. Parameters as in :class:`TransientIntegrator`; ``max_depth`` counts scattering at surfaces
     and in media, not the passage of an open boundary. A ``mask`` or ``thindielectric`` counts, as in
     ``transient_path``. In a scene without media it is ``transient_path``, down to the compiled kernel.
@@ -26,6 +31,11 @@ class TransientVolpath(path.TransientPath):
     """
 
     walks_through_media = True
+
+    def strategies(self, contents):
+        if contents.media is None:
+            return super().strategies(contents)
+        return Media(), SurfaceOrMedium(), [EmitterFound(), EmitterSampled()]
 
 
 register("integrator", "transient_prbvolpath", TransientVolpath)

@@ -1,0 +1,101 @@
+"""Measure every gradient of the test matrix and print the support table; ``--write README.md`` puts it between the
+markers.
+
+The cases are those of ``tests/support/gradient_cases``: what the table says is what the tests check.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
+NOT_SUPPORTED = (
+    (
+        "`eta`, `specular` of `principled` with `spec_trans`",
+        "biased, see docs/gradients.md; use `diff_rough_dielectric`",
+    ),
+    (
+        "eta of Mitsuba's own `dielectric`, `roughdielectric`",
+        "taken over by `diff_dielectric`, `diff_rough_dielectric` when the key is asked for",
+    ),
+    (
+        "derivatives of Mitsuba's own `conductor`, `polarizer`, `retarder`, `circular` in polarized variants",
+        "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place, see docs/polarization.md",
+    ),
+    (
+        "vertices of light-emitting meshes without texture coordinates",
+        "rigid motion only: the area element is not differentiated",
+    ),
+    ("any path length through an explicit box filter", "not supported: `GradientError`"),
+    ("second derivatives; unlimited depth (`max_depth=-1`)", "not supported: `GradientError`"),
+)
+
+
+def measure(case):
+    """One case: (reverse mode, its error, finite difference, its error, forward over reverse mode)."""
+    from support.gradient_cases.problem import Problem
+
+    problem = Problem(case)
+    reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
+    forward = problem.forward(100)
+    h = case.step
+    fd = np.array(
+        [(problem.loss(case.value + h, s) - problem.loss(case.value - h, s)) / (2 * h) for s in range(case.seeds)]
+    )
+    root = np.sqrt(case.seeds)
+    return reverse.mean(), reverse.std(ddof=1) / root, fd.mean(), fd.std(ddof=1) / root, forward / reverse[0]
+
+
+def table(rows) -> str:
+    lines = [
+        "| parameter | status | case: reverse mode, finite differences, difference in standard errors "
+        "| forward / reverse |",
+        "|---|---|---|---|",
+    ]
+    for row, entries in rows.items():
+        status = "; ".join(dict.fromkeys(case.support for case, _ in entries))
+        cells, ratios = [], []
+        for case, (r, se_r, d, se_d, ratio) in entries:
+            z = (r - d) / np.hypot(se_r, se_d)
+            cells.append(f"{case.name}: {r:.5g} ± {se_r:.1g}, {d:.5g} ± {se_d:.1g}, {z:+.1f}")
+            ratios.append(f"{ratio:.5f}")
+        lines.append(f"| {row} | {status} | {'<br>'.join(cells)} | {'<br>'.join(ratios)} |")
+    lines += [f"| {what} | {status} | | |" for what, status in NOT_SUPPORTED]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", type=Path, help="file with the markers to write the table to")
+    parser.add_argument("--only", nargs="*", default=[], help="names of cases")
+    arguments = parser.parse_args()
+
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+    from tqdm import tqdm
+
+    import torchtransient  # noqa: F401  finds an LLVM before Dr.Jit does
+    from support.gradient_cases.all_cases import ALL_CASES  # isort: skip
+
+    rows = defaultdict(list)
+    for case in tqdm(
+        [c for c in ALL_CASES if not arguments.only or c.name in arguments.only], desc="gradients", unit="case"
+    ):
+        rows[case.row].append((case, measure(case)))
+    text = table(rows)
+    print(text)
+    if arguments.write:
+        content = arguments.write.read_text(encoding="utf-8")
+        if BEGIN not in content or END not in content:
+            parser.error(f"{arguments.write} lacks the markers {BEGIN} and {END}")
+        head, rest = content.split(BEGIN)
+        arguments.write.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What tests share: scenes, cases, contracts and oracles. Imported as ``support.NAME``; nothing here is collected."""

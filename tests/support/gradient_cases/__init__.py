@@ -1,0 +1,1 @@
+"""One scalar unknown a case: scenes, how the unknown enters them, its gradient, and the matrix of all cases."""

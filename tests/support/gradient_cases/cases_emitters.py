@@ -1,0 +1,150 @@
+"""Gradient cases of emitters: what they emit, where they are."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, camera, room, transform
+from support.gradient_cases.unknowns import move, move_point, move_vertices, scale_texture, set_color, stretch
+
+
+def picture_sky():
+    """An environment map with a gradient in it."""
+    data = np.linspace(0.5, 1.5, 8 * 16, dtype=np.float32).reshape(8, 16, 1)
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.repeat(data, 3, axis=2))}
+
+
+def projector():
+    """A projector beside the camera, aimed at the wall."""
+    pose = transform().look_at([0.5, 0, 4], [0, 0, 0], [0, 1, 0])
+    return {"type": "projector", "irradiance": 2.0, "fov": 40.0, "to_world": pose, "scale": 1.0}
+
+
+def angular_light():
+    """An area light that emits into a cone with a soft rim."""
+    lamp = area_light()
+    lamp["emitter"] = {"type": "angulararea", "radiance": 9.0, "cutoff_angle": 60.0, "beam_width": 5.0}
+    return lamp
+
+
+CASES = [
+    Case("point_intensity", "emitter radiance or intensity", room, set_color("light.intensity.value"), 10.0, 0.5),
+    Case(
+        "area_radiance",
+        "emitter radiance or intensity",
+        lambda: room(light=area_light()),
+        set_color("light.emitter.radiance.value"),
+        9.0,
+        0.5,
+    ),
+    Case("point_position", "point and spot light position", room, move_point("light.position", (0, 0.3, 1)), 0.0, 4e-3),
+    Case(
+        "spot_position",
+        "point and spot light position",
+        lambda: room(
+            light={
+                "type": "spot",
+                "intensity": 10.0,
+                "cutoff_angle": 30.0,
+                "beam_width": 5.0,
+                "to_world": transform().look_at([0.5, 0, 4], [0.2, 0, 0], [0, 1, 0]),
+            }
+        ),
+        move("light.to_world", (0.3, 0, 1)),
+        0.0,
+        4e-3,
+    ),
+    Case(
+        "area_light_moves",
+        "area light shape",
+        lambda: room(light=area_light(), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+    ),
+    Case(
+        "area_light_scales",
+        "area light shape",
+        lambda: room(light=area_light(), side_reflectance=0.2),
+        stretch("light.to_world"),
+        1.0,
+        0.01,
+        spp=4096,
+    ),
+    Case(
+        "sphere_light_moves",
+        "area light shape",
+        lambda: room(light=area_light("sphere", 0.15), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+    ),
+    Case(
+        "sky_radiance",
+        "environment radiance",
+        lambda: room(light={"type": "constant", "radiance": 1.0}, sensor=camera(start=2.0)),
+        set_color("light.radiance.value"),
+        1.0,
+        0.05,
+        spp=4096,
+    ),
+    Case(
+        "sky_texture",
+        "environment radiance",
+        lambda: room(light=picture_sky(), sensor=camera(start=2.0)),
+        scale_texture("light.data"),
+        0.0,
+        0.05,
+        spp=4096,
+    ),
+    Case(
+        "projector_scale",
+        "emitter radiance or intensity",
+        lambda: room(light=projector()),
+        set_color("light.scale"),
+        1.0,
+        0.05,
+        spp=2048,
+    ),
+    Case(
+        "cube_light_moves",
+        "area light shape",
+        lambda: room(light=area_light("cube", 0.12), side_reflectance=0.2),
+        move_vertices("light.vertex_positions", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+        fd_spp=8192,
+    ),
+    Case(
+        "angular_light_radiance",
+        "emitter radiance or intensity",
+        lambda: room(light=angular_light()),
+        set_color("light.emitter.radiance.value"),
+        9.0,
+        0.5,
+        spp=2048,
+    ),
+    Case(
+        "angular_light_moves",
+        "area light shape",
+        lambda: room(light=angular_light(), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+    ),
+    Case(
+        "disk_light_moves",
+        "area light shape",
+        lambda: room(light=area_light("disk", 0.3), side_reflectance=0.2),
+        move("light.to_world", (0.2, 0.1, 1)),
+        0.0,
+        5e-3,
+        spp=4096,
+    ),
+]

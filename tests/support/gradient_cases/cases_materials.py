@@ -1,0 +1,152 @@
+"""Gradient cases of surfaces: albedos, roughness, indices of refraction, weights."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import area_light, glass_slab, instances, mirror_room, room, transform
+from support.gradient_cases.unknowns import scale_texture, set_color
+
+
+def texture():
+    rng = np.random.default_rng(3)
+    data = mi.TensorXf(rng.uniform(0.2, 0.7, (4, 4, 1)).astype(np.float32))
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear"}}
+
+
+def blend():
+    """Diffuse and rough metal, mixed."""
+    parts = {"a": {"type": "diffuse", "reflectance": 0.5}, "b": {"type": "roughconductor", "alpha": 0.3}}
+    return {"type": "blendbsdf", "weight": 0.4, **parts}
+
+
+CASES = [
+    Case("diffuse_albedo", "diffuse albedo", room, set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
+    Case(
+        "zero_albedo",
+        "diffuse albedo",
+        lambda: room(side_reflectance=0.0),
+        set_color("side.bsdf.reflectance.value"),
+        0.0,
+        0.02,
+    ),
+    Case(
+        "texture",
+        "textured albedo",
+        lambda: room(bsdf=texture()),
+        scale_texture("wall.bsdf.reflectance.data"),
+        0.0,
+        0.05,
+    ),
+    Case(
+        "roughness",
+        "roughness (rough conductor)",
+        lambda: room(bsdf={"type": "roughconductor", "alpha": 0.3, "distribution": "ggx"}, light=area_light()),
+        set_color("wall.bsdf.alpha.value"),
+        0.3,
+        0.01,
+        spp=4096,
+    ),
+    Case(
+        "smooth_glass_index",
+        "dielectric index, smooth",
+        lambda: glass_slab({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
+        set_color("slab.bsdf.eta"),
+        1.5,
+        4e-3,
+        spp=8192,
+    ),
+    Case(
+        "rough_glass_index",
+        "dielectric index, rough",
+        lambda: glass_slab({"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.2}),
+        set_color("slab.bsdf.eta"),
+        1.5,
+        4e-3,
+        spp=16384,
+    ),
+    Case(
+        "mirror_reflectance",
+        "specular reflectance (delta lobe)",
+        lambda: mirror_room(),
+        set_color("wall.bsdf.specular_reflectance.value"),
+        0.9,
+        0.05,
+        spp=2048,
+    ),
+    Case(
+        "plastic_alpha",
+        "roughness (rough plastic)",
+        lambda: room(bsdf={"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": 0.3}, light=area_light()),
+        set_color("wall.bsdf.alpha"),
+        0.3,
+        0.01,
+        spp=4096,
+        support="biased: Mitsuba's transmittance table is not differentiated",
+    ),
+    Case(
+        "principled_roughness",
+        "roughness (principled)",
+        lambda: room(
+            bsdf={"type": "principled", "roughness": 0.5, "base_color": {"type": "rgb", "value": 0.5}, "specular": 0.7},
+            light=area_light(),
+        ),
+        set_color("wall.bsdf.roughness.value"),
+        0.5,
+        0.02,
+        spp=4096,
+    ),
+    Case(
+        "mask_opacity",
+        "mask opacity",
+        lambda: room(
+            screen={
+                "type": "rectangle",
+                "to_world": transform().translate([0, 0, 0.5]).scale(2),
+                "bsdf": {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse", "reflectance": 0.5}},
+            }
+        ),
+        set_color("screen.bsdf.opacity.value"),
+        0.4,
+        0.02,
+        spp=4096,
+    ),
+    Case(
+        "blend_weight",
+        "blend weight",
+        lambda: room(bsdf=blend()),
+        set_color("wall.bsdf.weight.value"),
+        0.4,
+        0.02,
+        spp=2048,
+    ),
+    Case(
+        "conductor_eta",
+        "complex index of a conductor",
+        lambda: mirror_room({"type": "conductor", "eta": 0.5, "k": 2.0}),
+        set_color("wall.bsdf.eta.value"),
+        0.5,
+        0.02,
+        spp=2048,
+    ),
+    Case(
+        "glass_in_a_group",
+        "dielectric index, smooth",
+        lambda: instances({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
+        set_color("group.plate.bsdf.eta"),
+        1.5,
+        4e-3,
+        spp=8192,
+    ),
+    Case(
+        "albedo_spectral",
+        "diffuse albedo",
+        room,
+        set_color("side.bsdf.reflectance.value"),
+        0.8,
+        0.02,
+        "llvm_ad_spectral",
+    ),
+]

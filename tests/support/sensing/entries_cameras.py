@@ -1,0 +1,98 @@
+"""Contract entries of cameras: iToF, streak, gated, polarization, devices."""
+
+from __future__ import annotations
+
+import torch
+
+from support.sensing.contract import Entry
+from torchtransient import sensing
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing import electronics, itof, itof_codes
+
+AXIS = TimeAxis(0.5, 0.2, 12)
+
+
+def itof_correlation():
+    return itof.ItofCorrelation(itof_codes.square_code(4), (20e6, 60e6), AXIS, contrast=0.8)
+
+
+def pixel_electronics(grad="expected"):
+    return electronics.PixelElectronics(
+        full_well_e=1e4, read_noise_e=3.0, ktc_noise_e=2.0, excess_noise=1.2, gain_e_per_dn=0.5, bits=14,
+        black_level_dn=100.0, offset_map_e=torch.tensor(0.25), gain_map=torch.tensor(1.1), grad=grad,
+    )  # fmt: skip
+
+
+def chain(grad=None):
+    return sensing.Compose(
+        [
+            sensing.ImpulseResponse(sensing.GaussianResponse(900e-12), AXIS, boundary="periodic"),
+            itof_correlation(),
+            electronics.PixelElectronics(read_noise_e=0.5),
+        ],
+        grad=grad,
+    )
+
+
+def streak(grad="expected"):
+    return sensing.StreakCamera(
+        AXIS, time_fwhm_s=900e-12, jitter_fwhm_s=700e-12, spatial_fwhm_px=0.5, read_noise_e=0.3, grad=grad
+    )
+
+
+def stokes_like(shape, seed):
+    """Physical Stokes vectors (..., 4, C, T, H, W), polarized by up to a half."""
+    g = torch.Generator().manual_seed(seed)
+    x = torch.rand(shape, generator=g, dtype=torch.float64) - 0.5
+    x.select(-5, 0).add_(1.5)
+    return x
+
+
+ENTRIES: list[Entry] = [
+    Entry(
+        "ItofCorrelation",
+        itof_correlation,
+        conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
+        errors=(
+            (lambda: itof_correlation()(torch.ones(1, 7, 1, 1)), ShapeError),
+            (lambda: itof_correlation()(torch.ones(3)), ShapeError),
+            (lambda: itof.ItofCorrelation(itof_codes.sine_code(4), 20.0, AXIS), UnitError),
+        ),
+    ),
+    Entry(
+        "PixelElectronics",
+        pixel_electronics,
+        random=True,
+        errors=((lambda: electronics.PixelElectronics(read_noise_e=-1.0), UnitError),),
+    ),
+    Entry("Compose", chain, random=True),
+    Entry("StreakCamera", streak, random=True),
+    Entry(
+        "SweepJitter",
+        lambda grad="expected": sensing.SweepJitter(700e-12, AXIS, grad=grad),
+        random=True,
+        # Every policy but `expected` is pathwise: the draw is linear in the input, and no score is left to collect.
+        policies=("expected", "gaussian", "straight_through"),
+    ),
+    Entry(
+        "GatedIntegration",
+        lambda: sensing.GatedIntegration([4e-9, 6e-9], 3e-9, AXIS, rise_s=0.8e-9, leakage=0.01, learnable=True),
+        errors=((lambda: sensing.GatedIntegration([], 1e-9, AXIS), ShapeError),),
+    ),
+    Entry(
+        "PolarizationMosaic",
+        lambda: sensing.PolarizationMosaic.polarsens(200.0),
+        shape=(2, 4, 1, 3, 4, 5),
+        input=stokes_like,
+        errors=((lambda: sensing.PolarizationMosaic(torch.ones(4)), ShapeError),),
+    ),
+    Entry(
+        "Analysers",
+        lambda: sensing.Analysers(sensing.linear_analysers([0, 60, 120], 50.0)),
+        shape=(2, 4, 1, 3, 2, 2),
+        input=stokes_like,
+        # Half of the light passes an analyser: two thirds of three pictures of it are S0.
+        conserves=lambda y: y.select(-5, 0).sum() if y.shape[-5] == 4 else y.sum() * 2 / 3 / (1 + 1 / 50.0),
+    ),
+]

@@ -1,0 +1,137 @@
+"""Contract entries of impulse responses, photon budget and photon counting."""
+
+from __future__ import annotations
+
+import torch
+
+from support.sensing.contract import Entry
+from torchtransient import sensing
+from torchtransient.errors import GradientError, ShapeError, UnitError
+
+PS = 1e-12
+ALL = (torch.bfloat16, torch.float32, torch.float64)
+
+
+def impulse(response, **keywords):
+    return lambda: sensing.ImpulseResponse(response(), bin_width_s=20 * PS, **keywords)
+
+
+def tails():
+    return sensing.TailedResponse(50 * PS, [30 * PS, 80 * PS], [0.3, 0.1], learnable=True)
+
+
+def measured():
+    counts = torch.tensor([3.0, 2, 3, 40, 90, 50, 30, 12, 3, 2, 3, 3, 2, 3, 2, 3, 3])
+    return sensing.MeasuredResponse(counts, 13 * PS, learnable=True)
+
+
+def composed():
+    return sensing.ComposedResponse(
+        [sensing.GaussianResponse(30 * PS, learnable=True), sensing.emg_response(20 * PS, 40 * PS)]
+    )
+
+
+ENTRIES = [
+    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True)), dtypes=ALL),
+    Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
+    Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
+    Entry(
+        "ImpulseResponse-composed",
+        impulse(composed, boundary="periodic", method="fft"),
+        conserves=lambda y: y.sum(-3),
+        errors=(
+            (lambda: sensing.ImpulseResponse(tails(), bin_width_s=20.0), UnitError),
+            (lambda: sensing.TailedResponse(50 * PS, [30 * PS], [1.2]), UnitError),
+            (lambda: sensing.MeasuredResponse(torch.ones(4), 1 * PS), UnitError),
+            (lambda: sensing.ComposedResponse([]), ShapeError),
+        ),
+    ),
+    Entry(
+        "LensBlur",
+        lambda: sensing.LensBlur(0.8, "circular", size=3, learnable=True),
+        shape=(2, 1, 3, 4, 5),
+        conserves=lambda y: y.sum((-1, -2)),
+        dtypes=ALL,
+    ),
+    Entry(
+        "SpatialPSF", lambda: sensing.SpatialPSF(torch.arange(9.0).view(3, 3), learnable=True), shape=(2, 1, 3, 4, 5)
+    ),
+    Entry(
+        "PhotonBudget",
+        lambda: sensing.PhotonBudget(
+            sensing.Optics(f_number=2.0),
+            pulse_energy_j=1e-9,
+            wavelength_m=532e-9,
+            repetition_rate_hz=1e7,
+            cycles=1000,
+            ambient_rate_hz=1e6,
+            bin_width_s=20 * PS,
+        ),
+        dtypes=ALL,
+    ),
+    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), dtypes=ALL, random=True),
+    Entry(
+        "SynchronousSPAD-gate",
+        lambda **k: sensing.SynchronousSPAD(500, gate=torch.linspace(0, 1, 12), **k),
+        random=True,
+    ),
+    Entry(
+        "SynchronousSPAD-dead-time",
+        lambda **k: sensing.SynchronousSPAD(500, dead_time_s=70 * PS, bin_width_s=20 * PS, **k),
+        random=True,
+    ),
+    Entry(
+        "FreeRunningSPAD",
+        lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, learnable=True, **k),
+        random=True,
+    ),
+    Entry(
+        "FreeRunningSPAD-paralyzable",
+        lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="paralyzable", learnable=True, **k),
+        random=True,
+        errors=(
+            (lambda: sensing.FreeRunningSPAD(500, 75.0, bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.FreeRunningSPAD(500, 75 * PS), UnitError),
+            (lambda: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="strange"), ShapeError),
+            (lambda: sensing.SynchronousSPAD(2.5), UnitError),
+            (lambda: sensing.SynchronousSPAD(5, dead_time_s=75.0, bin_width_s=20 * PS), UnitError),
+        ),
+    ),
+    Entry(
+        "Afterpulsing",
+        lambda **k: sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, bin_width_s=20 * PS, learnable=True, **k),
+        random=True,
+        errors=(
+            (lambda: sensing.Afterpulsing(5.0, 90 * PS, 50 * PS, bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.Afterpulsing(0.05, 90.0, 50 * PS, bin_width_s=20 * PS), UnitError),
+        ),
+    ),
+    Entry(
+        "Crosstalk",
+        lambda **k: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True, **k),
+        random=True,
+        errors=((lambda: sensing.Crosstalk(0.5), UnitError),),
+    ),
+    Entry(
+        "TDC",
+        lambda: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0))),
+        conserves=lambda y: y.sum(-3),
+        dtypes=ALL,
+    ),
+    Entry("TDC-dither", lambda: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3)),
+    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True, dtypes=ALL),
+    Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
+    Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
+    Entry(
+        "ShotNoise",
+        sensing.ShotNoise,
+        random=True,
+        conserves=lambda y: y.sum(),
+        errors=(
+            (lambda: sensing.ShotNoise(grad="magic"), GradientError),
+            (lambda: sensing.ShotNoise()(torch.ones(3)), ShapeError),
+            (lambda: sensing.ShotNoise()(torch.ones(1, 4, 1, 1, dtype=torch.int64)), UnitError),
+            (lambda: sensing.poisson(torch.tensor([-1.0])), UnitError),
+        ),
+    ),
+]

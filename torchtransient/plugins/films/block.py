@@ -1,0 +1,63 @@
+"""The film's side of the samples in flight, as the integrators' loops see it.
+
+Plain objects, which Dr.Jit loops leave alone: the arrays in them are targets of scatters, not loop state. What a film
+has to carry along a path is in ``events``, which belongs to the loop.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+
+from torchtransient.plugins.films.colour import mean_of
+from torchtransient.plugins.polarized import light_type
+
+
+class FilmBlock:
+    """The samples of one pass: which band of the film they write to, from which entry on, with which weight.
+
+    A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
+    one; whoever launched the loop calls ``finish`` when all of it is recorded. A histogram writes every event at once.
+    """
+
+    def __init__(self, film, band: int, base, match):
+        self.film, self.band, self.base, self.match = film, band, base, match
+
+    def begin(self):
+        """What the film carries along a path: loop state, handed back at every event."""
+        return {}
+
+    def put(self, events, opl, value, active):
+        """Write a contribution; returns what fell before and after the window (mean over channels)."""
+        channels = self.match.to_channels(value)
+        before, after = self.film.put(self.band, self.base, opl, channels, active)
+        energy = dr.select(active, mean_of(channels), 0)
+        return energy * before, energy * after
+
+    def put_slope(self, events, opl, d_value, value_d_opl, active):
+        """Forward mode: write ``k df + f k' dtau``."""
+        d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
+        self.film.put_slope(self.band, self.base, opl, d, slope, active)
+
+    def end(self, events):
+        """The paths are over."""
+
+    def finish(self):
+        """Bring what was written to the film. Called outside of the loop, may launch a kernel."""
+
+
+class AdjointBlock:
+    """Reads ``A(tau)`` and ``A'(tau)`` of the incoming adjoint for the samples in flight."""
+
+    def __init__(self, film, response, base, steady, match):
+        self.film, self.response, self.base, self.steady, self.match = film, response, base, steady, match
+
+    def read(self, opl, active):
+        """Adjoint and its slope in opl, as spectra that weigh a contribution of one primary ray."""
+        if not self.film.keeps_steady:
+            A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
+            return self.match.to_spectrum(A), self.match.to_spectrum(slope)
+        if self.response is None:
+            return self.match.to_spectrum(self.steady), light_type()(0)
+        A, slope = self.film.read(self.response, self.base, opl, active)
+        A = [a + s for a, s in zip(A, self.steady, strict=True)]
+        return self.match.to_spectrum(A), self.match.to_spectrum(slope)

@@ -1,0 +1,78 @@
+"""The kernel launches that a job is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
+# bits.
+MAX_LANES = 2**26
+
+
+@dataclass
+class Pass:
+    """One kernel launch: ``spp`` of ``total`` samples per pixel for ``rows`` rows of one storage band. ``seed`` is a
+    UInt32 in memory: as a number it would be a literal of the kernel.
+    """
+
+    band: int
+    first_row: int
+    rows: int
+    spp: int
+    total: int
+    seed: Any
+
+
+def passes_of(sampler: Any, film: Any, seed: Any, spp: int, depth: int) -> tuple[list[Pass], int]:
+    """The launches of a job of ``spp`` samples per pixel (0: the sampler's own number), and the largest number of
+    samples of a pixel. ``sampler`` is changed.
+
+    Some samplers round the number of samples of a launch, so that storage bands of different heights may get different
+    totals.
+    """
+    if spp:
+        sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    width = int(film.crop_size()[0])
+    most = min(MAX_LANES, film.lanes_at_most(depth) or MAX_LANES)
+    result = []
+    for band, (first_row, rows) in enumerate(film.band_layout()):
+        counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))
+        rows_per_pass = rows if width * rows * max(counts) <= most else max(1, most // width)
+        for row in range(first_row, first_row + rows, rows_per_pass):
+            some = min(rows_per_pass, first_row + rows - row)
+            result += [Pass(band, row, some, count, sum(counts), None) for count in counts]
+    for i, p in enumerate(result):
+        # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
+        p.seed = seed if len(result) == 1 else mi.sample_tea_32(seed, mi.UInt32(i))[0]
+    return result, max(p.total for p in result)
+
+
+def seed_array(seed: Any) -> Any:
+    """A seed, a number or an array of one, as an array in memory."""
+    return mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed))
+
+
+def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
+    """Samples per pixel of the launches that make up ``spp``, at most ``most`` each, in numbers that the sampler takes.
+
+    Samplers such as multijitter or ldsampler round a number up; what they really draw is what a pixel is divided by.
+    """
+
+    def drawn(count):
+        sampler.set_sample_count(count)
+        return sampler.sample_count()
+
+    if spp <= most:
+        return [drawn(spp)]
+    while most > 1 and drawn(most) > most:
+        # Rounding up would exceed the launch; the sampler takes some smaller number.
+        most -= max(1, most // 16)
+    counts = []
+    while (left := spp - sum(counts)) > 0:
+        counts.append(drawn(min(most, left)))
+    return counts

@@ -1,0 +1,82 @@
+"""Everything differentiable that goes from one vertex of a path to the next.
+
+A vertex is a function ``Carry -> (EventTerms, Carry)``. Reverse mode carries the adjoint of a Carry backwards, forward
+mode its tangent forwards; neither knows what is in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Carry:
+    """A dataclass on purpose: the adjoint and the tangent are loop state. Copied, never changed."""
+
+    β: Any      # Spectrum    throughput; its adjoint is the light beyond, weighed by the film's adjoint
+    slope: Any  # Float       zero with the derivative of the optical path length so far
+    η: Any      # Float       index of refraction along the ray
+    o: Any      # Point3f     ray origin, attached behind delta lobes and sensors
+    d: Any      # Vector3f    ray direction, likewise
+    x: Any      # Point3f     start of the segment, where its transmittance matters
+    w: Any      # Vector3f    direction at the far end of the segment, for ``si.wi`` there
+
+    @staticmethod
+    def zeros() -> Carry:
+        """No adjoint or tangent."""
+        vectors = (mi.Vector3f(0) for _ in range(4))
+        return Carry(mi.Spectrum(0), mi.Float(0), mi.Float(0), *vectors)
+
+
+def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) -> Carry:
+    """The carry with fresh leaves for the fields ``names``, with ``tangents`` in forward mode."""
+    leaves = {}
+    for name in names:
+        leaf = type(getattr(carry, name))(getattr(carry, name))
+        dr.enable_grad(leaf)
+        if tangents is not None:
+            dr.set_grad(leaf, getattr(tangents, name))
+        leaves[name] = leaf
+    return replace(carry, **leaves)
+
+
+def adjoint_of(carry: Carry, names: Sequence[str]) -> Carry:
+    """What a traversal left at the leaves ``names``."""
+    return with_fields(Carry.zeros(), names, [dr.grad(getattr(carry, name)) for name in names])
+
+
+def with_fields(carry: Carry, names: Sequence[str], values: Sequence[Any]) -> Carry:
+    """The carry with some fields replaced by values of their types."""
+    return replace(carry, **{n: type(getattr(carry, n))(v) for n, v in zip(names, values, strict=True)})
+
+
+def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
+    """``<adjoint, carry>`` over the fields ``names``."""
+    total = mi.Float(0)
+    for name in names:
+        total += total_of(getattr(adjoint, name), getattr(carry, name))
+    return total
+
+
+def total_of(a: Any, b: Any) -> Any:
+    """Sum over all entries of ``a b``: of numbers, vectors, spectra, Stokes vectors of spectra, Mueller matrices."""
+    if mi.is_polarized and isinstance(b, mi.Spectrum):
+        return dr.sum(sum(a[i, j] * b[i, j] for i in range(4) for j in range(4)))
+    if mi.is_polarized and isinstance(b, mi.SpectrumEntry):
+        return dr.sum(sum(a[i] * b[i] for i in range(4)))
+    return a * b if dr.depth_v(b) == 1 else dr.sum(a * b)
+
+
+def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
+    """``a`` where ``mask``, else ``b``, in the fields ``names``; the others are those of ``b``."""
+    return replace(b, **{name: dr.select(mask, getattr(a, name), getattr(b, name)) for name in names})
+
+
+def slope_only(x: Any) -> Any:
+    """Zero with the derivative of ``x``."""
+    return dr.replace_grad(mi.Float(0), x)

@@ -1,0 +1,103 @@
+"""Emission of what a path runs into.
+
+The point of a found light belongs to the vertex that scattered towards it. Where the light's shape moves it is attached
+there (``_ahead``) as a material point, as it is for connections: both strategies must move their samples alike, or the
+weights between them would no longer sum to one under the motion. Where the sensor or a delta lobe led to it, no other
+strategy could have: the ray decides, and it is attached at the light's own vertex (``_here``).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import column, product, scattered
+from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.scattering.geometry_terms import (
+    direction_to,
+    distance,
+    material_point,
+    solid_angle_over_area,
+)
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
+
+
+class EmitterFound(Connection):
+    """Emission where a path arrives, weighed against the strategies that could have connected to it."""
+
+    name = "emitter_found"
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def connect(self, world, path, vertex, proposal, answer, zeros):
+        seen = path.active & vertex.surface
+        if world.hide_emitters:
+            seen &= (path.depth > 0) | vertex.valid
+        if world.discard_direct_light:
+            seen &= path.depth > 0
+        emitter = vertex.si.emitter(world.scene)
+        hit = (emitter != None) & seen  # noqa: E711 (a Dr.Jit comparison)
+        prev = dr.zeros(mi.Interaction3f)
+        prev.p, prev.n = path.prev_p, path.prev_n
+        prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
+        ds = mi.DirectionSample3f(world.scene, si=vertex.si, ref=prev)
+        connected = hit & ~path.prev_unconnected
+        others = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
+        mis = dr.select(hit, mis_weight(path.prev_pdf, sum(others)), 0)
+        value = column(path.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
+        return Event(value=value, opl=path.τ, active=hit, depth=path.depth + 1, mis=mis)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        return {"mis": mi.Float}
+
+    def record(self, sample):
+        return {"mis": sample.event.mis}
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def attached(self, world, vertex, step, wanted):
+        terms = [self._here(world, vertex, wanted)]
+        return [*terms, self._ahead(world, vertex, step, wanted)] if wanted.emitter_shape else terms
+
+    def _here(self, world, vertex, wanted):
+        v, si = vertex.v, vertex.si
+        mis = v.of(self.name)["mis"]
+        hit = v.active & (mis > 0)
+        emitter = vertex.sid.emitter(world.scene)
+        if wanted.emitter_shape:
+            hit &= v.before(world.scattering.name, "delta", at_sensor=True)
+        elif (claimed := self._claimed(world, emitter, wanted)) is not None:
+            hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~claimed
+        Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
+        return EventTerm(value=column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
+
+    def _claimed(self, world, emitter, wanted):
+        """Mask of the emitters that derivatives reach by another strategy alone; None for none."""
+        claims = [c.claims(world, emitter, wanted) for c in world.connections if c is not self]
+        claims = [c for c in claims if c is not None]
+        return None if not claims else claims[0] if len(claims) == 1 else dr.any(claims)
+
+    def _ahead(self, world, vertex, step, wanted):
+        si, following = vertex.scattered_si, vertex.v.after()
+        mis = following.of(self.name)["mis"]
+        lit = step.ahead & (mis > 0)
+        if wanted.sphere_lights:
+            with dr.suspend_grad():
+                hit = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
+                lit &= ~self._claimed(world, hit.emitter(world.scene), wanted)
+        light, area = material_point(following.pi, following.ray, lit)
+        out = direction_to(si.p, light.p, lit, mi.Vector3f(following.ray.d))
+        light.wi = dr.select(lit, light.to_local(-out), dr.detach(light.wi))
+        J = dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, lit))
+        J *= dr.relative_grad(dr.select(lit, area, 1))
+        towards = world.scattering.evaluate(world, vertex, out, lit)
+        Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))
+        value = scattered(towards.value, vertex.turn) * (step.inv_pdf * J * mis) * Le
+        end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
+        T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
+        value = product(vertex.carry.β, dr.select(lit, value * T, 0))
+        length = step.carry.η * distance(si.p, light.p, lit)
+        slope = vertex.scattered_slope + slope_only(length)
+        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit)

@@ -1,0 +1,162 @@
+"""A point sampled on a light (next-event estimation)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import intensity, product, scattered, transported
+from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.scattering.geometry_terms import (
+    direction_to,
+    distance,
+    material_point,
+    solid_angle_over_area,
+)
+from torchtransient.plugins.transport.segment.vacuum import length_to
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal, mis_weight
+
+
+class EmitterSampled(Connection):
+    """``share``: part of the light that this strategy brings, where several sample lights with the same density."""
+
+    name = "emitter_sampled"
+
+    def __init__(self, share: float = 1.0):
+        self.share = share
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def propose(self, world, path, vertex, sampler):
+        active = vertex.goes_on & vertex.connectable
+        u = sampler.next_2d()
+        ds, weight = world.scene.sample_emitter_direction(vertex.at, u, False, active)
+        active &= ds.pdf != 0
+        return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
+
+    def density(self, world, ref, ds, active):
+        pdf = world.scene.pdf_emitter_direction(ref, ds, active)
+        return pdf if self.share == 1 else pdf * self.share
+
+    def mis(self, ds, pdf, alone):
+        """Weight of a sample towards which scattering has the density ``pdf``; ``alone``: nothing else finds it."""
+        mis = dr.select(alone, 1, mis_weight(ds.pdf, pdf))
+        return mis if self.share == 1 else mis * self.share
+
+    def connect(self, world, path, vertex, proposal, answer, zeros):
+        ds, active = proposal.ds, proposal.active
+        value = transported(path.β, self.mis(ds, answer.pdf, ds.delta), answer.value)
+        value *= mi.unpolarized_spectrum(proposal.weight)
+        if not zeros:  # shadow rays only where they can matter; the derivative of a zero may matter
+            active = active & (dr.max(dr.abs(intensity(value))) > 0)
+        length = self._length(world, vertex.at.p, ds) * (path.η * answer.eta)
+        opl = vertex.delay.after(path.τ) + mi.Float64(length)
+        active = world.counted(active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        value *= T
+        if not zeros:
+            value = dr.select(active, value, 0)
+        return Event(value=value, opl=opl, active=active, depth=path.depth + 2, T=T)
+
+    @staticmethod
+    def _length(world, p, ds):
+        """Length of the connection from ``p`` to a sampled point or direction of a light."""
+        if world.contents.distant is None:
+            return ds.dist
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        return dr.select(far, world.contents.distant.length(p, ds.d), ds.dist)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        fields = {"u": mi.Point2f, "lit": mi.Bool}
+        return fields if world.contents.media is None else fields | {"T": mi.UnpolarizedSpectrum}
+
+    def record(self, sample):
+        return {"u": sample.proposal.u, "lit": sample.event.active, "T": sample.event.T}
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def claims(self, world, emitter, wanted):
+        # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
+        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone.
+        if not wanted.sphere_lights:
+            return None
+        on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+        return on_surface & (emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere))
+
+    def attached(self, world, vertex, step, wanted):
+        v, si = vertex.v, vertex.scattered_si
+        r = v.of(self.name)
+        lit = r["lit"]
+        light = self._light(world, si, r["u"], lit, wanted)
+        d = mi.Vector3f(light.ds.d)
+        if wanted.geometry:
+            d = direction_to(si.p, light.p, light.near, d)
+        Le = self._emission(world, si, light, d, lit, wanted)
+        towards = world.scattering.evaluate(world, vertex, d, lit)
+        mis = self.mis(light.ds, dr.detach(towards.pdf), light.ds.delta | light.cone)
+        value = scattered(towards.value, vertex.turn) * Le * mis
+        if "T" in r:
+            value *= r["T"]
+        end = Local(p=light.p, d=mi.Vector3f(light.ds.d), far=light.far, ahead=False)
+        value *= world.segment.attached_transmittance(world, vertex, end, lit)
+        # Selected before the product: what an idle lane holds must not reach the adjoint of the throughput.
+        value = product(vertex.carry.β, dr.select(lit, value, 0))
+        length = length_to(world.contents, si.p, light.p, light.near, d) * towards.eta
+        opl = vertex.scattered_opl + mi.Float64(dr.detach(length) * v.η)
+        slope = vertex.scattered_slope
+        if wanted.geometry:
+            slope = slope + slope_only(vertex.carry.η * length)
+        return [EventTerm(value=value, slope=slope, opl=opl, active=lit)]
+
+    def _light(self, world, si, u, lit, wanted):
+        """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
+        scene = world.scene
+        with dr.suspend_grad():
+            ds, weight = scene.sample_emitter_direction(dr.detach(si), u, False, lit)
+            flags = ds.emitter.flags()
+            far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
+            surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
+        light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
+        light.p, light.n, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Float(1)
+        light.cone, light.cone_weight = mi.Bool(False), None
+        if wanted.light:
+            at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+            moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
+            light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, dr.detach(moving.p)))
+        if wanted.sphere_lights:
+            light.cone = surface & self.claims(world, ds.emitter, wanted)
+            light.surface = surface & ~light.cone
+            moving, light.cone_weight = scene.sample_emitter_direction(si, u, False, light.cone)
+            light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))
+        if wanted.emitter_shape:
+            self._follow_shape(world, si, light)
+        return light
+
+    @staticmethod
+    def _follow_shape(world, si, light):
+        """Make the point a material one of the light's shape."""
+        ray = dr.detach(si).spawn_ray(light.ds.d)
+        with dr.suspend_grad():
+            pi = world.segment.next_surface(world, ray, light.surface)
+        found, area = material_point(pi, ray, light.surface & pi.is_valid())
+        there = light.surface & pi.is_valid() & (dr.detach(found).emitter(world.scene) == light.ds.emitter)
+        light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
+        light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
+        light.area = dr.relative_grad(dr.select(there, area, 1))
+
+    @staticmethod
+    def _emission(world, si, light, d, lit, wanted):
+        """Emission over density, with the derivative of the emission and of the solid angle."""
+        ds = dr.copy(light.ds)
+        if wanted.geometry:
+            ds.p, ds.n, ds.d = light.p, light.n, d
+            ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))
+        inv_pdf = dr.select(light.ds.pdf > 0, dr.rcp(light.ds.pdf), 0)
+        value = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
+        if wanted.geometry:
+            value *= dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, light.surface)) * light.area
+        if wanted.sphere_lights:
+            value = dr.select(light.cone, mi.unpolarized_spectrum(light.cone_weight), value)
+        return dr.replace_grad(light.weight, value)

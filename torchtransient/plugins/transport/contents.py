@@ -1,0 +1,65 @@
+"""What a scene contains, looked up once a scene, so that the loops hold only what the scene calls for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from torchtransient.plugins.bsdfs.delay_table import delays_of
+from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
+from torchtransient.plugins.parameters import ParameterTracker
+from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.transport.media_contents import media_of
+
+
+class SceneContents:
+    """The static choices of the kernels. Does not change once built.
+
+    ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
+    groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
+    which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
+    variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Each is
+    None where the scene has no such thing.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
+        shapes = scene.shapes()
+        self.bsdfs, self.delays = delays_of(bsdfs_of_scene(scene))
+        self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
+        self.instances = any(is_instance(shape) for shape in shapes)
+        infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
+        self.distant = reference if infinite else None
+        self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
+        self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
+        self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
+        self.media = media_of(scene, sensor)
+        self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
+        self._built = True
+
+    def parameters(self, scene: Any) -> ParameterTracker:
+        """The parameters of ``scene``, whose contents these are, to be asked which of them carry gradients.
+
+        Walked over when first asked for: a render has no use for it.
+        """
+        if "_tracker" not in vars(self):
+            vars(self)["_tracker"] = ParameterTracker(scene)
+        return vars(self)["_tracker"]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if getattr(self, "_built", False):
+            raise AttributeError(f"SceneContents does not change once built; tried to set {name!r}.")
+        super().__setattr__(name, value)
+
+
+def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
+    found = [bsdf for bsdf in bsdfs if is_two_sided(bsdf)]
+    # A path may be handed a part of a BSDF by the part's own pointer.
+    found += [part for bsdf in found for part in bsdfs_below(bsdf) if is_two_sided(part)]
+    return PointerTable.marking(found)

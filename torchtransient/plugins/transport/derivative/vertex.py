@@ -1,0 +1,61 @@
+"""One recorded vertex as a function ``Carry -> (EventTerms, Carry)``, put together from what the strategies say.
+
+The sampled path is held fixed in this sense: a vertex slides along the ray that found it when its surface moves, and
+against the next vertex it moves as if that one were nailed down, with the change of solid angle counted. Points on
+light sources whose shape moves are material points: they follow the shape. Where a delta lobe determines the next ray,
+that ray itself is attached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.carry import Carry, attach
+from torchtransient.plugins.transport.strategy import Local
+
+
+@dataclass
+class VertexEnd:
+    """Where a vertex lies, without derivatives: what the one before sees of it. Loop state of the reverse mode."""
+
+    p: Any      # Point3f
+    n: Any      # Normal3f   zero for points in a volume
+    d: Any      # Vector3f   direction of the ray that found it
+    valid: Any  # Bool       something was hit
+
+    @staticmethod
+    def nowhere() -> VertexEnd:
+        """Behind the last vertex of a path."""
+        return VertexEnd(mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(False))
+
+
+class AttachedVertex(Local):
+    """A recorded vertex with derivatives.
+
+    ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``carry`` (with the throughput at the vertex),
+    ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``, ``delay``,
+    ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind
+    its delay) and ``turn``.
+    """
+
+
+def attached_carry(v, wanted, tangents=None):
+    """The recorded Carry that arrives at a vertex, with leaves for what is wanted."""
+    # A leaf has the width of the lanes, or its gradient would be summed up over them.
+    zero = dr.zeros(mi.Float, dr.width(v.ray.d))
+    o, d = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d)
+    carry = Carry(β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d))
+    return attach(carry, wanted.carried, tangents)
+
+
+def vertex_terms(world, v, carry, wanted):
+    """(events with derivatives, the Carry to the next vertex, the attached vertex)."""
+    vertex = world.segment.attached(world, v, carry, wanted)
+    world.scattering.attach(world, vertex, wanted)
+    step = world.scattering.attached(world, vertex, wanted)
+    terms = [term for c in world.connections for term in c.attached(world, vertex, step, wanted)]
+    return terms, step.carry, vertex

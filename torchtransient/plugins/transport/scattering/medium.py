@@ -1,0 +1,80 @@
+"""Scattering by BSDFs on surfaces and by phase functions in media. Everything else is that of surfaces."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.scattering.surface import Surface
+
+# Stands for the density of a phase function so narrow that single precision has none; its square is still a number.
+DELTA_LIKE = 1e15
+
+
+def finite(value, otherwise=0):
+    """``otherwise`` where a phase function is so narrow that single precision has no value for it."""
+    return dr.select(dr.isfinite(value), value, otherwise)
+
+
+def unpolarizing(value):
+    """Scattering by ``value`` that leaves nothing of the polarization: what a scalar phase function says."""
+    if not mi.is_polarized:
+        return value
+    matrix = dr.zeros(mi.Spectrum)
+    matrix[0, 0] = value
+    return matrix
+
+
+def phase_and_scattering(mei, active):
+    """(phase function, scattering coefficient) of the medium at ``mei``."""
+    phase = dr.select(active, mei.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
+    return phase, mei.medium.get_scattering_coefficients(mei, active)[0]
+
+
+class SurfaceOrMedium(Surface):
+    """In a medium the vertex scatters by the phase function times the scattering coefficient."""
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def connectable(self, world, vertex):
+        smooth = super().connectable(world, vertex)
+        allowed = True if world.contents.media.emitter_sampling else vertex.medium.use_emitter_sampling()
+        return dr.select(vertex.scatter, allowed, smooth)
+
+    def elsewhere(self, world, vertex, proposals, answers, step):
+        ctx, mei, scatter = mi.PhaseFunctionContext(None), vertex.mei, vertex.scatter
+        active = vertex.goes_on & scatter
+        phase, σ_s = phase_and_scattering(mei, active)
+        for p, answer in zip(proposals, answers, strict=True):
+            if p is not None:
+                f, pdf = phase.eval_pdf(ctx, mei, p.d, p.active & scatter)
+                f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
+                answer.value = dr.select(scatter, f, answer.value)
+                answer.pdf = dr.select(scatter, finite(pdf), answer.pdf)
+        out, w, pdf = phase.sample(ctx, mei, step.u_lobe, step.u_dir, active)
+        pdf = finite(pdf, DELTA_LIKE)
+        w = dr.select(pdf > 0, finite(mi.unpolarized_spectrum(w)) * σ_s, 0)
+        step.weight = dr.select(scatter, unpolarizing(w), step.weight)
+        step.out, step.pdf = dr.select(scatter, out, step.out), dr.select(scatter, pdf, step.pdf)
+        step.eta, step.delta = dr.select(scatter, 1, step.eta), step.delta & ~scatter
+        step.unconnected = step.delta
+        if not world.contents.media.emitter_sampling:
+            step.unconnected = step.delta | (scatter & ~vertex.medium.use_emitter_sampling())
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def attach(self, world, vertex, wanted):
+        super().attach(world, vertex, wanted)
+        vertex.phase, vertex.σ_s = phase_and_scattering(vertex.mei, vertex.v.active & vertex.scatter)
+
+    def eval_pdf(self, vertex, wo, out, active, sampled):
+        """A phase function too narrow for single precision has no light towards a given point, and its own samples
+        (``sampled``) have the ratio of value and density that they were drawn with.
+        """
+        surface_value, surface_pdf = super().eval_pdf(vertex, wo, out, active, sampled)
+        ctx, scatter = mi.PhaseFunctionContext(None), vertex.scatter
+        value, pdf = vertex.phase.eval_pdf(ctx, vertex.mei, out, active & scatter)
+        usable = dr.isfinite(dr.detach(pdf)) & (dr.detach(pdf) > 0)
+        other = 1 if sampled else 0
+        value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value), other) * vertex.σ_s)
+        return dr.select(scatter, value, surface_value), dr.select(scatter, dr.select(usable, pdf, other), surface_pdf)

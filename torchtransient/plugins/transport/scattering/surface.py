@@ -1,0 +1,208 @@
+"""Scattering by the BSDFs of surfaces."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.bsdfs.delay_table import Answer as DelaySample
+from torchtransient.plugins.polarized import from_mirrored, product, scattered, scattering, turn_in, turn_out
+from torchtransient.plugins.transport.carry import Carry, slope_only
+from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, solid_angle_over_area
+from torchtransient.plugins.transport.segment.vacuum import length_to
+from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
+
+
+class Surface(Scattering):
+    """What all vertices do in vacuum; those in media are told apart in :class:`.medium.SurfaceOrMedium`.
+
+    ``guides`` draw some of the next vertices in the BSDF's place: each has a ``share`` of the samples,
+    ``prepare(world)``, ``draw(vertex, sampler) -> (point, whether it is chosen)`` and ``density(vertex, ray, leg,
+    active)``, the density per solid angle with which it draws what ``ray`` has found.
+    """
+
+    def __init__(self, guides=()):
+        self.guides = list(guides)
+
+    def prepare(self, world):
+        contents = world.contents
+        self.refraction = None if contents.refraction is None else contents.refraction.read()
+        self.delays = None if contents.delays is None else contents.delays.read()
+        for guide in self.guides:
+            guide.prepare(world)
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def arrive(self, world, path, vertex, sampler):
+        vertex.u_delay = None if self.delays is None else sampler.next_2d()
+        vertex.delay = self.delay(vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
+        vertex.bsdf = vertex.delay.bsdf
+        vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
+        vertex.connectable = self.connectable(world, vertex)
+
+    def delay(self, bsdf, u, wavelengths):
+        """Whether a surface scatters late: which BSDF takes its place, when, and with which weight."""
+        return DelaySample(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
+
+    @staticmethod
+    def behind(delay, *interactions):
+        """The interactions with the wavelengths beyond the surface."""
+        if delay.wavelengths is None:
+            return interactions
+        copies = {id(i): dr.copy(i) for i in interactions}
+        delay.move(*copies.values())
+        return tuple(copies[id(i)] for i in interactions)
+
+    def connectable(self, world, vertex):
+        """Whether light can be found at the vertex by connecting to it."""
+        return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+
+    def scatter(self, world, path, vertex, proposals, sampler):
+        ctx, si, bsdf = mi.BSDFContext(), vertex.scattered_si, vertex.bsdf
+        u_lobe, u_dir = sampler.next_1d(), sampler.next_2d()
+        answers, sample = [], None
+        for p in proposals:
+            if p is None:
+                answers.append(None)
+                continue
+            wo = si.to_local(p.d)
+            if sample is None:
+                value, pdf, *sample = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, vertex.goes_on)
+            else:
+                value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
+            value = self.upright(world, bsdf, si, wo, vertex.delay.scaled(value))
+            answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo)))
+        bs, weight = sample or bsdf.sample(ctx, si, u_lobe, u_dir, vertex.goes_on)
+        weight = self.upright(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
+        step = Step(
+            out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
+            u_delay=vertex.u_delay,
+            delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
+        )  # fmt: skip
+        step.unconnected = step.delta
+        self.elsewhere(world, vertex, proposals, answers, step)
+        turn = turn_out(si, path.ray.d)
+        for answer in answers:
+            if answer is not None:
+                answer.value = scattered(answer.value, turn)
+        step.weight = scattering(step.weight, turn, turn_in(si, step.wo, step.out))
+        for guide in self.guides:
+            point, chosen = guide.draw(vertex, sampler)
+            step.out = dr.select(chosen & ~step.delta, dr.normalize(point - vertex.at.p), step.out)
+        return answers, step
+
+    def elsewhere(self, world, vertex, proposals, answers, step):
+        """Change answers and step where the vertex is not on a surface."""
+
+    def weigh(self, world, path, vertex, step, ray, leg):
+        """With guides: weight and density of the mixture, once it is known what the next segment has found."""
+        si, smooth = vertex.scattered_si, vertex.goes_on & ~step.delta
+        own = 1 - sum(guide.share for guide in self.guides)
+        wo = si.to_local(step.out)
+        value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
+        pdf = own * pdf + sum(guide.share * guide.density(vertex, ray, leg, smooth) for guide in self.guides)
+        value = self.upright(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        value = scattering(value, turn_out(si, path.ray.d), turn_in(si, wo, step.out))
+        step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
+        step.pdf = dr.select(smooth, pdf, step.pdf)
+        step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, si, wo), step.eta)
+
+    def tables(self):
+        delays = [] if self.delays is None else self.delays.attached()
+        return delays if self.refraction is None else [self.refraction.table, *delays]
+
+    # ---------------------------------------------------------------------------------------- scene contents
+
+    @staticmethod
+    def upright(world, bsdf, si, wo, value):
+        """``value`` of a BSDF towards ``wo``, put right where Mitsuba's two-sided BSDFs mirror it."""
+        two_sided = world.contents.two_sided
+        if two_sided is None:
+            return value
+        return from_mirrored(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
+
+    def relative_index(self, bsdf, si, wo):
+        """Index on the side of ``wo`` over that on the side of ``si.wi``."""
+        return mi.Float(1) if self.refraction is None else self.refraction.relative_index(bsdf, si, wo)
+
+    @staticmethod
+    def probability(world, bsdf, bs):
+        """One, with the derivative of a delta lobe's probability where the BSDF's weight hides it."""
+        hidden = world.contents.hidden_probability
+        return 1 if hidden is None else dr.select(hidden.lists(bsdf), dr.relative_grad(bs.pdf), 1)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        fields = {"delta": mi.Bool}
+        if world.contents.delta:
+            fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
+        if self.delays is not None:
+            fields["u_delay"] = mi.Point2f
+        if self.guides:
+            fields["pdf"] = mi.Float
+        return fields
+
+    def record(self, step):
+        return vars(step)
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def attach(self, world, vertex, wanted):
+        """Look up how the attached vertex scatters."""
+        v, si = vertex.v, vertex.si
+        vertex.turn = turn_out(si, vertex.carry.w)
+        u = v.of(self.name).get("u_delay")
+        vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
+        vertex.bsdf = vertex.delay.bsdf
+        (vertex.scattered_si,) = self.behind(vertex.delay, si)
+        vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
+        if wanted.geometry and vertex.delay.delay is not None:
+            vertex.scattered_slope = vertex.slope + slope_only(vertex.delay.delay)
+
+    def evaluate(self, world, vertex, out, active, sampled=False):
+        si = vertex.scattered_si
+        wo = si.to_local(out)
+        value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
+        value = self.upright(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
+
+    def eval_pdf(self, vertex, wo, out, active, sampled):
+        """Value and density towards the local direction ``wo``, in the world ``out``."""
+        return vertex.bsdf.eval_pdf(mi.BSDFContext(), vertex.scattered_si, wo, active)
+
+    def attached(self, world, vertex, wanted):
+        v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.of(self.name), vertex.v.next
+        smooth, mirrored = v.goes_on & ~r["delta"], v.goes_on & r["delta"]
+        ahead = smooth & following.valid
+        out, J = mi.Vector3f(following.d), mi.Float(1)
+        if wanted.geometry:
+            out = direction_to(si.p, following.p, ahead, out)
+            volume = world.segment.has_no_normal(following)
+            J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
+        towards = self.evaluate(world, vertex, out, smooth, sampled=True)
+        pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
+        inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
+        weight = scattering(towards.value, vertex.turn, turn_in(si, towards.wo, out, following.d))
+        weight = dr.select(smooth, weight * (inv_pdf * J), 0)
+        eta = dr.select(smooth, towards.eta, 1)
+        o, d, w = mi.Point3f(0), mi.Vector3f(0), dr.select(ahead, out, 0)
+        if world.contents.delta:
+            bs, delta_weight = vertex.bsdf.sample(mi.BSDFContext(), si, r["u_lobe"], r["u_dir"], mirrored)
+            delta_weight = self.upright(world, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
+            d_out = si.to_world(bs.wo)
+            delta_weight = scattering(delta_weight, vertex.turn, turn_in(si, bs.wo, d_out, following.d))
+            delta_weight *= self.probability(world, vertex.bsdf, bs) * v.rr
+            weight = dr.select(mirrored, delta_weight, weight)
+            eta = dr.select(mirrored, bs.eta, eta)
+            o, d, w = dr.select(mirrored, si.p, 0), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)
+        η = dr.select(v.goes_on, vertex.carry.η * eta, 0)
+        slope = vertex.scattered_slope
+        if wanted.geometry:
+            # The other end is nailed down here; what it adds when it moves is counted where it is attached.
+            length = dr.select(smooth, length_to(world.contents, si.p, following.p, following.valid, following.d), 0)
+            slope = slope + slope_only(dr.detach(η) * length)
+        carry = Carry(
+            β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
+        )
+        return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)

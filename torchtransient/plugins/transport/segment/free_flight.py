@@ -1,0 +1,264 @@
+"""From a vertex along a straight line to the next event: a collision in a medium, a surface, or nothing.
+
+Homogeneous media are sampled analytically, heterogeneous ones by delta tracking (Woodcock et al. 1965): collisions at
+the rate of a majorant, each real with some probability and null otherwise. A line passes null collisions and open
+boundaries without bending, so its optical length is the distance between its ends times one index, whatever it passed.
+
+Colours share one sample. The channel that chooses a distance is drawn in proportion to the light it carries, and the
+weight divides by the mean of the densities under the same probabilities: the sum over the channels is kept exactly
+where nothing is absorbed, and no channel's weight can grow beyond that sum.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.media_contents import is_open
+
+# Streams of random numbers that start from the same number must differ.
+WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B
+
+
+class Walk:
+    """Where a walk ended; a plain object that only lives within one iteration.
+
+    ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
+    that is not valid. ``pi`` is the next surface in both cases, counted from the ray's origin. ``medium`` is the one
+    that the walk ended in. ``weight``: transmittance over the probability density of what was sampled, without the
+    scattering coefficient. ``entry``: the last boundary that was passed, if ``media.keeps_entry``.
+    """
+
+    def __init__(self, pi, scatter, t, medium, weight, entry):
+        self.pi, self.scatter, self.t, self.medium, self.weight, self.entry = pi, scatter, t, medium, weight, entry
+
+
+def generator(numbers, lanes, stream):
+    """Random numbers of one straight line, a function of the sampler's ``numbers`` and of the lane."""
+    bits = mi.UInt32(stream)
+    for number in numbers:
+        bits ^= dr.reinterpret_array(mi.UInt32, number)
+        bits *= 0x2C1B3C6D
+        bits ^= bits >> 15
+    low, high = mi.sample_tea_32(bits, lanes)
+    rng = mi.PCG32()
+    # Any state is a good one; the increment has to be odd.
+    rng.state = mi.UInt64(low) | (mi.UInt64(high) << 32)
+    rng.inc = (mi.UInt64(lanes) << 1) | 1
+    rng.next_uint32()
+    return rng
+
+
+def medium_interaction(ray, medium, t):
+    """The point at distance ``t`` on ``ray`` inside ``medium``."""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.t = t
+    mei.p = ray(t)
+    mei.wi = -ray.d
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    mei.time = ray.time
+    mei.wavelengths = ray.wavelengths
+    mei.medium = medium
+    return mei
+
+
+def channel_probabilities(carried):
+    """Probability of each channel, in proportion to the light it carries."""
+    total = dr.sum(carried)
+    return dr.select(total > 0, carried / total, 1 / len(carried))
+
+
+def pick(spectrum, probabilities, u):
+    """The entry of a channel drawn by ``u``."""
+    value, below = spectrum[0], probabilities[0]
+    for c in range(1, len(spectrum)):
+        value = dr.select(u >= below, spectrum[c], value)
+        below = below + probabilities[c]
+    return value
+
+
+def attenuation(rate, stretch):
+    """``exp(-rate stretch)`` per channel, 1 where the rate is zero, however long the stretch is."""
+    return dr.exp(-dr.select(rate > 0, rate * stretch, 0))
+
+
+def stretch_inside(media, medium, ray, t, t_end, inside):
+    """(begin, end) of the part of ``[t, t_end]`` where the medium can have density."""
+    if not media.heterogeneous:
+        return t, t_end
+    hits, near, far = medium.intersect_aabb(ray)
+    begin = dr.maximum(t, dr.select(inside & hits, near, t))
+    end = dr.minimum(t_end, dr.select(hits, far, begin))
+    return begin, dr.maximum(begin, end)
+
+
+def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
+    """One tentative flight from distance ``t`` on ``ray`` towards ``t_end``.
+
+    Returns (collides, is the collision real, distance of the collision, factor on the weight).
+    """
+    rate = medium.get_majorant(medium_interaction(ray, medium, t), inside)
+    if media.rate_floor is not None:
+        rate = dr.maximum(rate, media.rate_floor)
+    many = len(rate) > 1
+    p = channel_probabilities(carried)
+    one = pick(rate, p, rng.next_float32()) if many else rate[0]
+    begin, end = stretch_inside(media, medium, ray, t, t_end, inside)
+    flight = dr.select(one > 0, -dr.log(1 - u) / one, dr.inf)
+    t_new = begin + flight
+    collides = inside & (t_new < end)
+    stretch = dr.select(collides, flight, end - begin)
+    factor, real = mi.UnpolarizedSpectrum(1), mi.Bool(True)
+    mei = medium_interaction(ray, medium, dr.select(collides, t_new, t))
+    analytic = mi.Bool(True)
+    if media.heterogeneous:
+        analytic = medium.is_homogeneous()
+    if media.homogeneous:
+        σ_t = rate
+        if media.rate_floor is not None:
+            σ_t = medium.get_majorant(mei, inside & analytic)
+        density = attenuation(rate, stretch)
+        density = dr.sum(p * dr.select(collides, rate * density, density))
+        factor = dr.select(density > 0, attenuation(σ_t, stretch) / density, 0)
+    if media.heterogeneous:
+        σ_t = medium.get_scattering_coefficients(mei, collides & ~analytic)[2]
+        # Forced collisions where there is little density, about one in four walks through the scene in total.
+        chance = dr.sum(p * σ_t) / one
+        if media.rate_floor is not None:
+            chance = dr.maximum(chance, 0.25 * media.rate_floor / one)
+        chance = dr.minimum(chance, 1)
+        delta_real = rng.next_float32() < chance
+        accept, refuse = dr.rcp(one * chance), dr.rcp(one * (1 - chance))
+        tracked = dr.select(delta_real, accept, dr.maximum(rate - σ_t, 0) * refuse)
+        tracked = dr.select(collides, tracked, 1)
+        factor = dr.select(analytic, factor, tracked)
+        real = analytic | delta_real
+    return collides, real, t_new, mi.UnpolarizedSpectrum(dr.select(inside, factor, 1))
+
+
+def across(scene, ray, pi, medium, passes):
+    """Behind the open boundary at ``pi``: (next surface counted from ``ray.o``, medium)."""
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, passes)
+    changes = passes & si.is_medium_transition()
+    medium = dr.select(changes, si.target_medium(ray.d), medium)
+    # The search goes on along the line itself: an origin lifted off along the normal would land beside it.
+    start = pi.t + (1 + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
+    onward = mi.Ray3f(ray)
+    onward.o = ray(start)
+    onward.maxt = ray.maxt - start
+    found = scene.ray_intersect_preliminary(onward, active=passes)
+    found.t += start
+    return dr.select(passes, found, pi), medium
+
+
+@dr.syntax
+def closed_surface(scene, media, ray, active):
+    """The next surface along ``ray`` that is not an open boundary."""
+    pi = scene.ray_intersect_preliminary(ray, active=active)
+    if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
+        passes = active & passable(pi, False)
+        while dr.hint(passes, label="open boundaries"):
+            pi, _ = across(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
+            passes &= passable(pi, False)
+    return pi
+
+
+def passable(pi, hide):
+    """Whether the surface at ``pi`` is an open boundary; with ``hide`` emitting surfaces count as such."""
+    opens = pi.is_valid() & is_open(pi.shape)
+    if hide:
+        opens |= pi.is_valid() & pi.shape.is_emitter()
+    return opens
+
+
+@dr.syntax
+def walk(scene, media, ray, medium, carried, u, lanes, active, first=False):
+    """Walk from ``ray.o`` in ``medium`` to the next event; returns a :class:`Walk`.
+
+    ``carried``: light per channel at the start, which only steers the choice of channels. ``u``: a number of the
+    sampler, which chooses the first flight and starts the generator of the others; the same arguments give the same
+    walk. ``first``: the ray comes from the sensor. ``hide`` in ``media`` makes it pass light sources then.
+    """
+    rng = generator([u], lanes, WALK)
+    u = mi.Float(u)
+    t = mi.Float(0)
+    medium = mi.MediumPtr(medium)
+    weight = mi.UnpolarizedSpectrum(1)
+    scatter = mi.Bool(False)
+    hide = first and media.hide_emitters
+    entry = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lanes))
+    entry.t = dr.full(mi.Float, dr.inf, dr.width(lanes))
+    pi = scene.ray_intersect_preliminary(ray, coherent=first, active=active)
+    if dr.hint(media.one_stretch and not hide, mode="scalar"):
+        inside = active & (medium != None)  # noqa: E711 (a Dr.Jit comparison)
+        scatter, _, t, weight = fly(media, medium, ray, t, pi.t, carried, u, rng, inside)
+    else:
+        going = mi.Bool(active)
+        while dr.hint(going, label="walk through media"):
+            inside = going & (medium != None)  # noqa: E711
+            collides, real, t_new, factor = fly(media, medium, ray, t, pi.t, carried * weight, u, rng, inside)
+            weight *= factor
+            scatter = collides & real
+            passes = going & ~collides & passable(pi, hide)
+            t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
+            if dr.hint(media.keeps_entry, mode="scalar"):
+                entry = dr.select(passes, pi, entry)
+            pi, medium = across(scene, ray, pi, medium, passes)
+            going = (collides & ~real) | passes
+            u = rng.next_float32()
+    return Walk(pi, scatter, t, medium, weight, entry)
+
+
+@dr.syntax
+def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
+    """Transmittance over ``length`` along ``ray``, which starts in ``medium`` and ends before ``ray.maxt``.
+
+    Returns (per channel, whether nothing is in the way). Analytic in homogeneous media; ratio tracking (Novak et al.
+    2014) in others, with random numbers that follow from ``numbers`` of the sampler and the lane.
+    """
+    if dr.hint(media.one_stretch, mode="scalar"):
+        visible = active & ~scene.ray_test(ray, active)
+        inside = visible & (medium != None)  # noqa: E711
+        σ_t = medium.get_majorant(medium_interaction(ray, medium, mi.Float(0)), inside)
+        T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
+    else:
+        rng = generator(numbers, lanes, SHADOW)
+        t = mi.Float(0)
+        medium = mi.MediumPtr(medium)
+        T = mi.UnpolarizedSpectrum(1)
+        visible = mi.Bool(active)
+        pi = scene.ray_intersect_preliminary(ray, active=active)
+        going = mi.Bool(active)
+        while dr.hint(going, label="transmittance through media"):
+            inside = going & (medium != None)  # noqa: E711
+            t_end = dr.minimum(pi.t, length)
+            collides, t_new, factor = thin_out(media, medium, ray, t, t_end, rng, inside)
+            T *= factor
+            blocked = pi.is_valid() & ~passable(pi, False)
+            passes = going & ~collides & pi.is_valid() & ~blocked
+            visible &= ~(going & ~collides & blocked)
+            t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
+            pi, medium = across(scene, ray, pi, medium, passes)
+            going = (collides | passes) & (dr.max(T) > 0)
+    return T, visible
+
+
+def thin_out(media, medium, ray, t, t_end, rng, inside):
+    """One step of ratio tracking, or the whole stretch where the medium is homogeneous.
+
+    Returns (a collision came before the end, its distance, factor on the transmittance).
+    """
+    majorant = medium.get_majorant(medium_interaction(ray, medium, t), inside)
+    collides, t_new, factor = mi.Bool(False), t, mi.UnpolarizedSpectrum(1)
+    analytic = mi.Bool(True)
+    if media.heterogeneous:
+        analytic = medium.is_homogeneous()
+        begin, end = stretch_inside(media, medium, ray, t, t_end, inside)
+        rate = majorant[0]
+        t_new = begin + dr.select(rate > 0, -dr.log(1 - rng.next_float32()) / rate, dr.inf)
+        collides = inside & ~analytic & (t_new < end)
+        σ_t = medium.get_scattering_coefficients(medium_interaction(ray, medium, t_new), collides)[2]
+        factor = dr.select(collides, dr.maximum(1 - σ_t / rate, 0), 1)
+    if media.homogeneous:
+        factor = dr.select(inside & analytic, attenuation(majorant, t_end - t), factor)
+    return collides, t_new, mi.UnpolarizedSpectrum(factor)

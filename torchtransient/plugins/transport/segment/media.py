@@ -1,0 +1,204 @@
+"""Segments through participating media.
+
+A vertex in a medium slides along the ray that found it, as one on a surface does: it divides the stretch between the
+surfaces before and behind it in a fixed ratio, so that it never leaves the medium when one of them moves, and the
+stretch's length enters as the measure of what was integrated. Where nothing that moves bounds the stretch it is a fixed
+point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import faded
+from torchtransient.plugins.transport.derivative.vertex import VertexEnd
+from torchtransient.plugins.transport.media_contents import FlightSettings
+from torchtransient.plugins.transport.segment.free_flight import closed_surface, medium_interaction, transmittance, walk
+from torchtransient.plugins.transport.segment.optical_depth import (
+    ARRIVING,
+    CONNECTING,
+    EMITTING,
+    Leg,
+    with_log_slope,
+)
+from torchtransient.plugins.transport.segment.vacuum import (
+    Vacuum,
+    intersection,
+    intersection_fields,
+    intersection_numbers,
+)
+from torchtransient.plugins.transport.strategy import Local, Vertex
+
+
+class Media(Vacuum):
+    """Straight lines that can end in a medium, and pass open boundaries.
+
+    A leg is a dictionary: ``pi`` (the next surface), ``scatter`` (the leg ends in a medium, at distance ``t`` from the
+    ray's origin), ``medium`` (at its end), ``weight`` (transmittance over density); for derivatives also ``begin`` (the
+    medium at its start) and ``entry`` (the boundary passed last).
+    """
+
+    def prepare(self, world):
+        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters)
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def first(self, world, ray, sampler):
+        medium = dr.zeros(mi.MediumPtr, dr.width(ray.d))
+        if self.settings.at_sensor is not None:
+            medium = mi.MediumPtr(self.settings.at_sensor)
+        return self._leg(world, ray, medium, mi.UnpolarizedSpectrum(1), sampler, mi.Bool(True), first=True)
+
+    def depart(self, world, ray, vertex, β, sampler, active):
+        medium = medium_behind(vertex.si, ray.d, vertex.medium, vertex.surface)
+        return self._leg(world, ray, medium, mi.unpolarized_spectrum(β), sampler, active)
+
+    def _leg(self, world, ray, medium, carried, sampler, active, first=False):
+        u, lanes = sampler.next_1d(), lane_numbers(sampler)
+        end = walk(world.scene, self.settings, ray, medium, carried, u, lanes, active, first=first)
+        leg = {"pi": end.pi, "scatter": end.scatter, "t": end.t, "medium": end.medium, "weight": end.weight}
+        if self.settings.recorded:
+            leg["begin"] = medium
+        if self.settings.keeps_entry:
+            leg["entry"] = end.entry
+        return leg
+
+    def arrive(self, world, path):
+        leg, scatter = path.leg, path.leg["scatter"]
+        mei = medium_interaction(path.ray, leg["medium"], leg["t"])
+        si = leg["pi"].compute_surface_interaction(path.ray, mi.RayFlags.All, ~scatter)
+        at, valid = reference(si, mei, scatter), si.is_valid() | scatter
+        return Vertex(
+            si=si, at=at, valid=valid, surface=~scatter, β=faded(path.β, leg["weight"]), ray=path.ray, leg=leg,
+            scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(world, path, at.p, valid),
+        )  # fmt: skip
+
+    def transmittance(self, world, vertex, ds, u, sampler, active):
+        ray = vertex.at.spawn_ray_to(ds.p)
+        medium = medium_behind(vertex.si, ds.d, vertex.medium, vertex.surface)
+        lanes = lane_numbers(sampler)
+        T, seen = transmittance(world.scene, self.settings, ray, ds.dist, medium, [u.x, u.y], lanes, active)
+        return seen, T
+
+    def next_surface(self, world, ray, active):
+        return closed_surface(world.scene, self.settings, ray, active)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        fields = super().fields(world) | {
+            "scatter": mi.Bool, "t_end": mi.Float, "begin": mi.UInt32, "end": mi.UInt32,
+            "weight": mi.UnpolarizedSpectrum,
+        }  # fmt: skip
+        return fields | (intersection_fields(world, "entry_") if self.settings.keeps_entry else {})
+
+    def record(self, vertex):
+        leg, of_ray = vertex.leg, Local(ray=vertex.ray, leg=vertex.leg["pi"])
+        begin, end = (dr.reinterpret_array(mi.UInt32, leg[key]) for key in ("begin", "medium"))
+        values = super().record(of_ray) | {"begin": begin, "end": end}
+        values |= {"scatter": leg["scatter"], "t_end": leg["t"], "weight": leg["weight"]}
+        return values | (intersection_numbers(leg["entry"], "entry_") if "entry" in leg else {})
+
+    def restore(self, v, ray):
+        r = v.of(self.name)
+        v.scatter, v.t, v.weight = r["scatter"], r["t_end"], r["weight"]
+        v.begin, v.end = (dr.reinterpret_array(mi.MediumPtr, r[name]) for name in ("begin", "end"))
+        v.entry = intersection(r, v.active, "entry_") if self.settings.keeps_entry else None
+        return super().restore(v, ray)
+
+    def weight(self, v):
+        return v.weight
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def end(self, world, v):
+        si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active & ~v.scatter)
+        p = dr.select(v.scatter, v.ray(v.t), si.p)
+        n = dr.select(v.scatter, mi.Normal3f(0), si.n)
+        return VertexEnd(p, n, v.ray.d, v.active & (si.is_valid() | v.scatter))
+
+    def has_no_normal(self, end):
+        return dr.all(end.n == 0)
+
+    def attached(self, world, v, carry, wanted):
+        ray = mi.Ray3f(v.ray)
+        ray.o, ray.d = carry.o, carry.d
+        si, mei, stretch = self._surface_or_medium(v, ray, carry.w, wanted)
+        vertex = self.arrived(world, v, carry, ray, si, wanted)
+        vertex.scatter, vertex.mei = v.scatter, mei
+        far = ~vertex.sid.is_valid()
+        leg = Leg(v, v.ray.o, vertex.sid.p, v.ray.d, far, v.begin, ARRIVING)
+        T = v.weight * with_log_slope(world.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
+        if wanted.geometry:
+            T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
+        vertex.carry = replace(carry, β=faded(carry.β, T))
+        return vertex
+
+    def _surface_or_medium(self, v, ray, w, wanted):
+        """(interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
+
+        Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
+        """
+        si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active & ~v.scatter)
+        t, stretch = self._attached_distance(v, ray, wanted)
+        mei = medium_interaction(ray, v.end, t)
+        mei.wi = -w
+        mei.sh_frame = mi.Frame3f(-w)
+        si.t = dr.select(v.scatter, t, si.t)
+        si.p = dr.select(v.scatter, mei.p, si.p)
+        si.n = dr.select(v.scatter, mi.Normal3f(0), si.n)
+        si.sh_frame = dr.select(v.scatter, mi.Frame3f(dr.detach(w)), si.sh_frame)
+        return si, mei, stretch
+
+    def _attached_distance(self, v, ray, wanted):
+        """Distance along ``ray`` of a vertex in a medium, and the length of the stretch that it divides."""
+        if not wanted.geometry:
+            return v.t, mi.Float(1)
+        begin = mi.Float(0)
+        if self.settings.open_boundaries:
+            entered = v.scatter & v.entry.is_valid()
+            behind = v.entry.compute_surface_interaction(ray, mi.RayFlags.Minimal, entered)
+            begin = dr.select(entered, behind.t, 0)
+        exit = v.pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, v.scatter)
+        bounded = v.scatter & v.pi.is_valid()
+        end = dr.select(bounded, exit.t, begin + 1)
+        stretch = end - begin
+        ratio = dr.detach((v.t - begin) / stretch)
+        return dr.fma(ratio, stretch, begin), dr.select(bounded, stretch, 1)
+
+    def attached_transmittance(self, world, vertex, connected, active):
+        v = vertex.v
+        if connected.ahead:
+            stream, medium = EMITTING, v.after().begin
+        else:
+            stream, medium = CONNECTING, medium_behind(vertex.sid, connected.d, v.end, ~v.scatter)
+        d = v.ray.d if connected.ahead else connected.d
+        leg = Leg(v, vertex.sid.p, dr.detach(connected.p), d, connected.far, medium, stream)
+        hook = vertex.carry.β[0]
+        return with_log_slope(world.scene, self.settings, leg, vertex.si.p, connected.p, hook, active)
+
+
+def lane_numbers(sampler):
+    """The number of each lane."""
+    return dr.arange(mi.UInt32, sampler.wavefront_size())
+
+
+def reference(si, mei, scatter):
+    """The vertex as a point of reference: that of the surface, or of the medium where ``scatter``."""
+    at = dr.zeros(mi.Interaction3f)
+    at.t = dr.select(scatter, mei.t, si.t)
+    at.time = si.time
+    at.wavelengths = si.wavelengths
+    at.p = dr.select(scatter, mei.p, si.p)
+    # Without a normal, rays start at the point itself.
+    at.n = dr.select(scatter, mi.Normal3f(0), si.n)
+    return at
+
+
+def medium_behind(si, d, medium, at_surface):
+    """The medium of a ray that leaves a vertex in direction ``d``."""
+    changes = at_surface & si.is_medium_transition()
+    return dr.select(changes, si.target_medium(d), medium)

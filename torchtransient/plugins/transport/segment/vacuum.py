@@ -1,0 +1,123 @@
+"""Segments through vacuum: straight lines from surface to surface."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.sampling.visible_lights import behind_area_lights
+from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
+from torchtransient.plugins.transport.strategy import Segment, Vertex
+
+# How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
+NUMBERS = {"t": "Float", "prim_uv": "Point2f", "prim_index": "UInt32", "shape_index": "UInt32"}
+
+
+def intersection_fields(world, prefix=""):
+    """Types of the numbers that a preliminary intersection is kept as."""
+    pointers = ("shape", "instance") if world.contents.instances else ("shape",)
+    return {prefix + name: getattr(mi, kind) for name, kind in NUMBERS.items()} | {
+        prefix + name: mi.UInt32 for name in pointers
+    }
+
+
+def intersection_numbers(pi, prefix=""):
+    """A preliminary intersection as numbers."""
+    values = {prefix + name: getattr(pi, name) for name in NUMBERS}
+    return values | {prefix + n: dr.reinterpret_array(mi.UInt32, getattr(pi, n)) for n in ("shape", "instance")}
+
+
+def intersection(numbers, active, prefix=""):
+    """The preliminary intersection again."""
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    for name in NUMBERS:
+        setattr(pi, name, numbers[prefix + name])
+    for name in ("shape", "instance"):
+        if prefix + name in numbers:
+            setattr(pi, name, dr.reinterpret_array(mi.ShapePtr, numbers[prefix + name]))
+    pi.valid = active & (pi.t < dr.inf)
+    return pi
+
+
+def length_to(contents, p, q, valid, d):
+    """Length from ``p`` to the point ``q``, or to the distant light in direction ``d`` where ``q`` is not valid."""
+    length = dr.norm(dr.select(valid, q - p, mi.Vector3f(0, 0, 1)))
+    if contents.distant is None:
+        return dr.select(valid, length, 0)
+    return dr.select(valid, length, contents.distant.length(p, d))
+
+
+class Vacuum(Segment):
+    """Nothing between surfaces. A leg is the preliminary intersection at its end."""
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def first(self, world, ray, sampler):
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=True)
+        return behind_area_lights(world.scene, ray, pi) if world.hide_emitters else pi
+
+    def depart(self, world, ray, vertex, β, sampler, active):
+        return world.scene.ray_intersect_preliminary(ray, active=active)
+
+    def arrive(self, world, path):
+        si = path.leg.compute_surface_interaction(path.ray, mi.RayFlags.All)
+        return Vertex(
+            si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=path.leg,
+            opl=self.optical_length(world, path, si.p, si.is_valid()),
+        )  # fmt: skip
+
+    def optical_length(self, world, path, p, valid):
+        """Optical length of the segment that ends at ``p``, measured between hit points."""
+        length = dr.norm(p - path.prev_p)
+        if world.contents.distant is not None:
+            length = dr.select(valid, length, world.contents.distant.length(path.prev_p, path.ray.d))
+        if world.camera_unwarp:
+            length = dr.select(path.depth == 0, 0, length)
+        return mi.Float64(length * path.η)
+
+    def transmittance(self, world, vertex, ds, u, sampler, active):
+        return active & ~world.scene.ray_test(vertex.at.spawn_ray_to(ds.p), active), 1
+
+    def next_surface(self, world, ray, active):
+        return world.scene.ray_intersect_preliminary(ray, active=active)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        shifted = world.contents.delays is not None and world.contents.delays.shifts
+        of_ray = {"o": mi.Point3f, "d": mi.Vector3f} | ({"wavelengths": mi.UnpolarizedSpectrum} if shifted else {})
+        return of_ray | intersection_fields(world)
+
+    def record(self, vertex):
+        ray = vertex.ray
+        return {"o": ray.o, "d": ray.d, "wavelengths": ray.wavelengths} | intersection_numbers(vertex.leg)
+
+    def restore(self, v, ray):
+        r = v.of(self.name)
+        wavelengths = r.get("wavelengths", ray.wavelengths)
+        return mi.Ray3f(r["o"], r["d"], ray.time, wavelengths), intersection(r, v.active)
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def end(self, world, v):
+        si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active)
+        return VertexEnd(si.p, si.n, v.ray.d, si.is_valid() & v.active)
+
+    def attached(self, world, v, carry, wanted):
+        ray = mi.Ray3f(v.ray)
+        ray.o, ray.d = carry.o, carry.d
+        si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active)
+        return self.arrived(world, v, carry, ray, si, wanted)
+
+    def arrived(self, world, v, carry, ray, si, wanted):
+        """The attached vertex at ``si``, behind the optical length of its segment."""
+        vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
+        if wanted.geometry:
+            valid = vertex.sid.is_valid()
+            si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
+            length = length_to(world.contents, ray.o, si.p, valid, ray.d)
+            if world.camera_unwarp:
+                length = dr.select(v.k == 0, 0, length)
+            vertex.slope = carry.slope + slope_only(carry.η * length)
+        return vertex

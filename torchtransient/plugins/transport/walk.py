@@ -1,0 +1,117 @@
+"""The one loop: segment, vertex, connections, scattering, next segment. What becomes of it is the sink's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.polarized import product
+from torchtransient.plugins.transport.strategy import Local
+
+
+@dataclass
+class Path:
+    """Loop state of a walk. A dataclass on purpose: Dr.Jit takes it apart, so that one name is the whole state."""
+
+    ray: Any               # Ray3f      current ray
+    leg: Any               # PyTree     how it ends, in the form of the segment strategy
+    depth: Any             # UInt32     vertices so far
+    β: Any                 # Spectrum   throughput before the current segment
+    η: Any                 # Float      index of the medium of the current ray
+    τ: Any                 # Float64    optical path length so far, minus the film's start
+    prev_p: Any            # Point3f    vertex that the ray left
+    prev_n: Any            # Normal3f   normal there
+    prev_pdf: Any          # Float      density of the ray's direction, per solid angle
+    prev_unconnected: Any  # Bool       no connection could have found what lies ahead (sensor, delta lobe)
+    active: Any            # Bool
+
+
+def start(world, ray, first_opl) -> Path:
+    """A path at the sensor; ``first_opl``: optical length before the ray's origin, minus the film's start."""
+    return Path(
+        ray=mi.Ray3f(ray),
+        leg=None,
+        depth=mi.UInt32(0),
+        β=mi.Spectrum(1),
+        η=mi.Float(1),
+        τ=mi.Float64(first_opl),
+        prev_p=mi.Point3f(ray.o),
+        prev_n=mi.Normal3f(0),
+        prev_pdf=mi.Float(1),
+        prev_unconnected=mi.Bool(True),
+        active=mi.Bool(world.max_depth > 0),
+    )
+
+
+def bounce(world, path, kept, sampler, sink):
+    """One turn of the loop: changes ``path`` and ``kept``.
+
+    Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
+    """
+    # ------------------------------------------------------------------------- vertex
+    vertex = world.segment.arrive(world, path)
+    path.τ = path.τ + vertex.opl
+    β_before, path.β = path.β, vertex.β
+    vertex.goes_on = path.active & (path.depth + 1 < world.max_depth) & vertex.valid
+    vertex.goes_on = world.in_time(vertex.goes_on, path.τ, vertex.at.p)
+    world.scattering.arrive(world, path, vertex, sampler)
+
+    # ------------------------------------------------------------------------- events
+    proposals = [c.propose(world, path, vertex, sampler) for c in world.connections]
+    answers, step = world.scattering.scatter(world, path, vertex, proposals, sampler)
+    samples = {}
+    for c, proposal, answer in zip(world.connections, proposals, answers, strict=True):
+        event = c.connect(world, path, vertex, proposal, answer, sink.zeros)
+        sink.event(kept, event)
+        samples[c.name] = Local(proposal=proposal, event=event)
+
+    # ------------------------------------------------------------- to the next vertex
+    ray, leg = vertex.at.spawn_ray(step.out), None
+    if world.scattering.guides:  # the density of what a guide drew is known once the segment has ended
+        leg = world.segment.depart(world, ray, vertex, path.β, sampler, vertex.goes_on)
+        world.scattering.weigh(world, path, vertex, step, ray, leg)
+    β, goes_on, rr = roulette(world, path, vertex, step, sampler, sink.zeros)
+    samples[world.segment.name], samples[world.scattering.name] = vertex, step
+    samples["walk"] = Local(β=β_before, τ=path.τ, η=path.η, rr=rr, goes_on=goes_on)
+    sink.vertex(kept, path, samples)
+
+    path.ray, path.depth, path.active = ray, path.depth + 1, goes_on
+    path.prev_p, path.prev_n = vertex.at.p, vertex.at.n
+    path.prev_pdf, path.prev_unconnected = step.pdf, step.unconnected
+    path.β, path.η, path.τ = β, path.η * step.eta, vertex.delay.after(path.τ)
+    path.leg = leg if leg is not None else world.segment.depart(world, ray, vertex, β, sampler, goes_on)
+
+
+def roulette(world, path, vertex, step, sampler, zeros):
+    """(throughput behind the vertex, whether the path goes on, factor of the throughput)."""
+    β, goes_on = product(path.β, step.weight), vertex.goes_on
+    β_max = dr.max(mi.unpolarized_spectrum(β))
+    if zeros:
+        # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black
+        # surface.
+        weight_max = dr.max(mi.unpolarized_spectrum(step.weight))
+        first_black = (weight_max == 0) & (dr.max(mi.unpolarized_spectrum(path.β)) > 0) & (step.pdf > 0)
+        goes_on &= (weight_max > 0) | first_black
+        β_max = dr.select(β_max == 0, 1, β_max)
+    else:
+        goes_on &= β_max != 0
+    chance = dr.minimum(β_max * dr.square(path.η * step.eta), 0.95)
+    plays = path.depth >= world.rr_depth
+    rr = dr.select(plays, dr.rcp(chance), 1)
+    survives = sampler.next_1d() < chance
+    return β * rr, goes_on & (~plays | survives), rr
+
+
+@dr.syntax
+def walk(world, sampler, ray, first_opl, sink):
+    """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept)."""
+    path = start(world, ray, first_opl)
+    path.leg = world.segment.first(world, ray, sampler)
+    kept = sink.begin(world)
+    while dr.hint(path.active, max_iterations=world.max_depth, label="path"):
+        bounce(world, path, kept, sampler, sink)
+    sink.end(kept)
+    return path.depth, kept

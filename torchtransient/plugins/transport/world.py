@@ -1,0 +1,67 @@
+"""What a walk is told: scene, contents, settings of the integrator and strategies, fixed for one job."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from torchtransient.plugins.sampling.light_box import LightBox
+
+
+@dataclass(frozen=True)
+class PathSettings:
+    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`."""
+
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+    discard_direct_light: bool
+    camera_unwarp: bool
+
+
+class World:
+    """One job: a render, or a pass over it for derivatives. Built outside of traced code, not changed afterwards.
+
+    ``wanted``: which derivatives (:class:`.derivative.wanted.Wanted`), None in a render. ``window``: which arrivals the
+    film counts, None where its steady image counts them all.
+
+    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    """
+
+    def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
+        self.scene, self.contents, self.wanted = scene, contents, wanted
+        self.max_depth, self.rr_depth = settings.max_depth, settings.rr_depth
+        self.hide_emitters = settings.hide_emitters
+        self.discard_direct_light = settings.discard_direct_light
+        self.camera_unwarp = settings.camera_unwarp
+        self.window = window
+        self._light_box = None if window is None else LightBox.of(scene, contents.bsdfs)
+        self.segment, self.scattering, self.connections = strategies
+        for strategy in self.strategies():
+            strategy.prepare(self)
+
+    def strategies(self) -> list[Any]:
+        """All strategies, each once."""
+        return [self.segment, *self.connections, self.scattering]
+
+    def tables(self) -> list[Any]:
+        """What the strategies have computed of the scene's parameters."""
+        return [table for strategy in self.strategies() for table in strategy.tables()]
+
+    @property
+    def index_changes(self) -> bool:
+        """Whether paths can run in media of different indices of refraction, or through delta lobes."""
+        return self.contents.delta or self.contents.refraction is not None
+
+    def in_time(self, active: Any, τ: Any, p: Any) -> Any:
+        """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""
+        if self.window is None:
+            return active
+        least = τ if self._light_box is None else τ + mi.Float64(self._light_box.distance(p))
+        return active & ~self.window.over(least)
+
+    def counted(self, active: Any, τ: Any) -> Any:
+        """Which arrivals at ``τ`` the film counts."""
+        return active if self.window is None else active & self.window.counts(τ)
