@@ -270,7 +270,8 @@ def test_errors(node, message):
         mi.load_dict({"type": "delayed", **node})
 
 
-def test_a_delay_inside_another_bsdf_is_refused():
-    target = scene({"type": "twosided", "nested": LATE})
+@pytest.mark.parametrize("outer", [{"type": "twosided"}, {"type": "delayed", "lifetime": 1.0}])
+def test_a_delay_inside_another_bsdf_is_refused(outer):
+    target = scene({**outer, "nested": LATE})
     with pytest.raises(SceneError, match="outermost"):
         target.integrator().render(target, spp=1)

@@ -177,6 +177,52 @@ def test_table_says_what_is_differentiable(textured):
     assert "sensor.near_clip" not in table.differentiable() and "box.to_world" in table.differentiable()
 
 
+def test_table_says_what_moves(textured):
+    table = textured.parameters()
+    for key in (WALL_POSE, "box.to_world", "box.vertex_positions", "light.position", "sensor.x_fov"):
+        assert table[key].moves_path_length and table[key].moves_silhouette and not table[key].moves_medium
+    for key in ("lamp.emitter.radiance.value", "box.bsdf.alpha.value", "wall.bsdf.reflectance.data"):
+        assert not (table[key].moves_path_length or table[key].moves_silhouette or table[key].biased)
+
+
+def test_normals_of_a_mirror_take_a_filter_with_a_slope():
+    bumps = {"type": "bitmap", "raw": True, "data": np.full((2, 2, 3), 0.5, dtype=np.float32)}
+    key = "box.bsdf.normalmap.data"
+    for nested, filter_name in (("conductor", "tent"), ("diffuse", "box")):
+        room = make_room()
+        room["box"]["bsdf"] = {"type": "normalmap", "normalmap": bumps, "nested": {"type": nested}}
+        renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[key], spp=4)
+        assert renderer.effective_filter == filter_name
+        assert renderer.has_slope_for([key])
+
+
+@pytest.mark.parametrize("plugin", ["thindielectric", "hair", "roughplastic"])
+def test_indices_that_bend_nothing_keep_the_box(plugin):
+    room = make_room()
+    room["box"]["bsdf"] = {"type": plugin}
+    scene = tt.load(room, variant=VARIANT)
+    assert scene.parameters()["box.bsdf.eta"].differentiable
+    assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
+
+
+def test_table_of_a_scene_with_a_parameter_that_is_not_set():
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "hair"}
+    absorption = tt.load(room, variant=VARIANT).parameters()["box.bsdf.sigma_a"]
+    assert absorption.value is None and absorption.shape is None and not absorption.differentiable
+
+
+def test_extinction_is_told_from_albedo():
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "null"}
+    room["box"]["interior"] = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 0.3}
+    room["integrator"]["type"] = "transient_prbvolpath"
+    table = tt.load(room, variant=VARIANT).parameters()
+    moving = [key for key, info in table.items() if info.moves_medium and info.differentiable]
+    assert moving == ["box.interior_medium.sigma_t.value.value"]
+    assert table["box.interior_medium.albedo.value.value"].differentiable
+
+
 def test_unknown_key_suggests_the_right_one(room_scene):
     with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value"):
         tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])

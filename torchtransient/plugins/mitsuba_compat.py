@@ -60,8 +60,9 @@ def normal_texture(bsdf: Any) -> str | None:
 # Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
 # number for it, its rough dielectric detaches it where directions are sampled.
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
-# In polarized variants these stand in for Mitsuba's always: derivatives of theirs are NaN where frames coincide (normal
-# incidence), their rough dielectric depolarises and their wave plate jumps at oblique incidence.
+# In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
+# its conductor, dielectric, polarizer and retarder by the direction are NaN; its rough dielectric depolarises; its wave
+# plate jumps at oblique incidence.
 POLARIZED_PLUGINS = {
     **DIFFERENTIABLE_PLUGINS,
     **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},

@@ -50,6 +50,7 @@ PRINCIPLED_INDEX = replace(
     INDEX,
     reason="biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md",
 )
+COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated")
 RIGID_ONLY = replace(
     SHAPE,
     biased=True,
@@ -129,6 +130,8 @@ declare_effects(
 for _curve in ("BSplineCurve", "LinearCurve"):
     declare_effects(_curve, {"control_points": replace(SHAPE, trusted=False)})
 declare_effects("SDFGrid", {"grid": replace(SHAPE, trusted=False)})
+for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
+    declare_effects(_blobs, {"data": replace(SHAPE, trusted=False)})
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 
@@ -141,14 +144,10 @@ declare_effects("BSDF", {"eta": INDEX})
 declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})
 declare_effects("RoughDielectric", {"eta": index_by_stand_in("roughdielectric")})
 declare_effects("Principled", {"eta": PRINCIPLED_INDEX, "specular": PRINCIPLED_INDEX})
-declare_effects(
-    "RoughPlastic",
-    {
-        "alpha": ParameterEffect(
-            biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated", trusted=True
-        )
-    },
-)
+# Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
+declare_effects("ThinDielectric", {"eta": VALUE})
+declare_effects("Hair", {"eta": VALUE})
+declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
 declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})

@@ -55,7 +55,7 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
     found = []
     for name, (handle, cpptype, node, flags) in params.properties.items():
         value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
-        if dr.grad_enabled(value):
+        if can_carry_gradients(value) and dr.grad_enabled(value):
             key = name.rsplit(".", 1)[-1]
             found.append((node, key, effect_of(node, key, flags, _owners_by_name(params.hierarchy, node, name))))
     return found
@@ -105,11 +105,15 @@ class ParameterTracker:
                     waiting.append((value, inherited | flags))
 
     def _note(self, node: Any, values: list[ShownValue], inherited: int) -> None:
-        differentiable = [v for v in values if _can_carry_gradients(v.read(node))]
+        differentiable = [v for v in values if can_carry_gradients(v.read(node))]
         if any(v.cpptype is None or _is_attribute(node, v.key) for v in differentiable):
             self._shown_anew.append((node, inherited))
         else:
             self._fixed += [(node, v._replace(flags=v.flags | inherited)) for v in differentiable]
+
+    def effect_of(self, node: Any, key: str, flags: int = 0) -> ParameterEffect:
+        """As the function of this name, with everything that holds the plugin ``node``."""
+        return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
 
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]
@@ -121,8 +125,7 @@ class ParameterTracker:
     def attached(self) -> list[tuple[Any, str, ParameterEffect]]:
         """(plugin, key, effect) of the parameters that carry gradients now."""
         return [
-            (node, shown.key, effect_of(node, shown.key, shown.flags, tuple(owners_of(node, self._holders))))
-            for node, shown, _ in self._carrying()
+            (node, shown.key, self.effect_of(node, shown.key, shown.flags)) for node, shown, _ in self._carrying()
         ]
 
     def attached_values(self) -> list[Any]:
@@ -130,10 +133,11 @@ class ParameterTracker:
         return [value for _, _, value in self._carrying()]
 
 
-def _can_carry_gradients(value: Any) -> bool:
+def can_carry_gradients(value: Any) -> bool:
+    """Whether a parameter is of real numbers that Dr.Jit differentiates, instead of a plain or whole number."""
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
-    return bool(dr.is_diff_v(value) and dr.is_float_v(value))
+    return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
 def _is_attribute(node: Any, key: str) -> bool:
@@ -144,21 +148,23 @@ def _is_attribute(node: Any, key: str) -> bool:
 # ----------------------------------------------------------------------------------------------------------- the slope
 
 
-def check_slope(moving: Sequence[str], has_slope: bool, response: str, remedy: str = "") -> None:
+def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:
+    """Which parameters out of :func:`attached_effects` need a response over time with a slope: those that can change a
+    path length.
+    """
+    named = ((f"{node.id()}.{key}".lstrip("."), effect) for node, key, effect in effects)
+    return list(dict.fromkeys(name for name, effect in named if effect.moves_length))
+
+
+def check_slope(moving: Sequence[str], has_slope: bool, response: str, remedy: str) -> None:
     """Raise ``GradientError`` where a derivative through the time of flight has no slope to go through.
 
-    ``moving``: names of the parameters with a derivative that can change a path length (``moves_length``).
-    ``has_slope`` and ``response``: of the film, whose temporal filter or gate the latter names. ``remedy``: what to do,
-    the end of the message.
+    ``moving``: names of the parameters with a derivative that can change a path length. ``has_slope``: of the film.
+    ``response``: what the film calls its response over time, its temporal filter or kind of gate. ``remedy``: what to
+    do.
     """
     if moving and not has_slope:
         raise GradientError(
-            f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's response over time, "
-            f"{response!r} has no slope: the derivative through the time of flight would be lost. "
-            + (remedy or "Use temporal_filter='auto', 'tent' or 'gaussian'.")
+            f"{', '.join(repr(name) for name in moving)} can change path lengths, and the film's {response!r} has no "
+            f"slope: the derivative through the time of flight would be lost. {remedy}"
         )
-
-
-def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:
-    """Names of the parameters out of :func:`attached_effects` that can change a path length."""
-    return list(dict.fromkeys(f"{node.id()}.{key}".lstrip(".") for node, key, effect in effects if effect.moves_length))

@@ -12,6 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.errors import SceneError
+
 # The pointer type of each kind of plugin, as names: types change with the variant.
 _POINTERS = {
     "BSDF": "BSDFPtr",
@@ -24,11 +26,13 @@ _POINTERS = {
 
 
 def registry_number(plugin: Any) -> int:
-    """The number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own."""
+    """The number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own. Raises
+    ``SceneError`` for what kernels cannot point to.
+    """
     for kind, pointer in _POINTERS.items():
         if isinstance(plugin, getattr(mi, kind)):
             return int(dr.reinterpret_array(mi.UInt32, getattr(mi, pointer)(plugin))[0])
-    raise TypeError(f"registry_number: expected one of {', '.join(_POINTERS)}, got {type(plugin).__name__}.")
+    raise SceneError(f"registry_number: expected one of {', '.join(_POINTERS)}, got {type(plugin).__name__}.")
 
 
 class PointerTable:

@@ -18,6 +18,7 @@ from torchtransient._collection import let_go
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.gates import Gate, gates_to_text
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
@@ -43,13 +44,6 @@ _TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film", "gated_hdr_film")
 _PEER_FREQUENCIES = (
     "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
 )  # fmt: skip
-DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
-# In polarized variants these stand in for Mitsuba's always: derivatives of theirs are NaN where frames coincide, their
-# rough dielectric depolarises and their wave plate jumps at oblique incidence.
-POLARIZED_PLUGINS = {
-    **DIFFERENTIABLE_PLUGINS,
-    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
-}
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchtransient._collection import no_collection
-from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.interfaces import is_time_resolved
+from torchtransient.plugins.parameters import check_slope
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.filter_override import temporal_filter
 from torchtransient.render.memory import check_fits
+from torchtransient.render.parameters import needing_slope
 from torchtransient.render.variant import active_variant
 
 if TYPE_CHECKING:
@@ -340,31 +342,13 @@ def jvp(
 
 
 def _check_slope(session: _Session) -> None:
-    """A path length that changes needs a temporal filter with a slope."""
-    table = session.job.scene.parameters()
-    moving = [
-        key
-        for key, need in zip(session.job.keys, session.job.needs, strict=True)
-        if need and table[key].moves_path_length
-    ]
-    for item in session.job.items if moving else ():
+    """A path length that changes needs films whose response over time has a slope."""
+    job = session.job
+    wanted = [key for key, need in zip(job.keys, job.needs, strict=True) if need]
+    moving = needing_slope(job.scene.parameters(), wanted)
+    for item in job.items if moving else ():
         film = session.film(item)
-        if not film.has_slope:
-            raise GradientError(no_slope(moving, film.response_name, film.slope_remedy))
-
-
-def no_slope(keys: Sequence[str], temporal_filter: str, remedy: str | None = None) -> str:
-    """The message for a derivative through the time of flight that the film's response over time does not have."""
-    if remedy is not None:
-        return (
-            f"{', '.join(repr(k) for k in keys)} can change path lengths, and the film's {temporal_filter!r} has no "
-            f"slope: the derivative through the time of flight would be lost. {remedy}"
-        )
-    return (
-        f"{', '.join(repr(k) for k in keys)} can change path lengths, and the temporal filter {temporal_filter!r} has "
-        "no slope: the derivative through the time of flight would be lost. Use temporal_filter='auto', 'tent' or "
-        "'gaussian'."
-    )
+        check_slope(moving, film.has_slope, film.response_name, film.slope_remedy)
 
 
 def _steady_adjoint(g: torch.Tensor) -> Any:

@@ -7,47 +7,31 @@ and normals follow.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.render.build import DIFFERENTIABLE_PLUGINS, BuiltScene
-
-CORRECT = "correct"
-SILHOUETTES = "correct except where silhouettes move (no boundary term)"
+from torchtransient.plugins.node_walk import ShownValue
+from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
+from torchtransient.render.build import BuiltScene
 
 _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
-# Mitsuba's classes whose index of refraction is a plain float, and the plugin each was made from.
-_INDEX_CLASSES = {"SmoothDielectric": "dielectric", "RoughDielectric": "roughdielectric"}
-# In spectral variants these keep the coefficients of a smooth spectrum (Jakob and Hanika 2019).
-_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
 # Larger values are not copied into the table: textures of a real scene would fill the memory once more.
 _MAX_LISTED = 65536
-_PRINCIPLED = "biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md"
-_BIASED = {
-    ("RoughPlastic", "alpha"): "biased: Mitsuba's table of transmittances is not differentiated",
-    ("Principled", "eta"): _PRINCIPLED,
-    ("Principled", "specular"): _PRINCIPLED,
-}
-_SHAPE_KEYS = ("to_world", "vertex_positions", "vertex_normals")
-_SENSOR_KEYS = (
-    "to_world",
-    "x_fov",
-    "principal_point_offset_x",
-    "principal_point_offset_y",
-    "aperture_radius",
-    "focus_distance",
-)
-_LIGHT_KEYS = {"PointLight": ("position",), "SpotLight": ("to_world",)}
 
 
 @dataclass(frozen=True)
 class ParameterInfo:
     """One parameter. ``shape`` is that of the torch value without a batch dimension, None for what is not numeric.
-    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``."""
+    ``value`` is None for more than 65536 numbers: ask for the key and read ``renderer.values[key]``.
+
+    ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
+    visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
+    boundary term of moving silhouettes, which is missing. ``reason`` says why.
+    """
 
     key: str
     kind: str
@@ -57,6 +41,9 @@ class ParameterInfo:
     moves_path_length: bool
     reason: str
     substitute: str | None = None
+    moves_silhouette: bool = False
+    moves_medium: bool = False
+    biased: bool = False
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
@@ -110,73 +97,61 @@ def _short(value: Any) -> str:
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
     """Read the table off a built scene (unmerged, real bitmaps, no substitutions), inside its variant."""
+    tracker = ParameterTracker(built.scene)
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
-        entries.append(_describe(built, key, node))
+        entries.append(_describe(built, tracker, key, node))
         if key.endswith(".vertex_positions"):
-            entries.append(_mesh_to_world(built, key, node))
+            entries.append(_mesh_to_world(built, tracker, key, node))
     return ParameterTable(entries)
 
 
-def _mesh_to_world(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
-    value = built.mesh_to_world.get(node.id(), np.eye(4))
+def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect: ParameterEffect) -> ParameterInfo:
+    return ParameterInfo(
+        key,
+        kind,
+        shape,
+        value,
+        effect.supported,
+        effect.moves_length,
+        effect.reason,
+        moves_silhouette=effect.moves_silhouette,
+        moves_medium=effect.moves_medium,
+        biased=effect.biased,
+    )
+
+
+def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
+    value = built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
     name = key.rsplit(".", 1)[0] + ".to_world"
-    return ParameterInfo(name, "mesh_transform", (4, 4), value.astype(np.float32), True, True, SILHOUETTES)
+    return _info(name, "mesh_transform", (4, 4), value, tracker.effect_of(node, "to_world"))
 
 
-def _describe(built: BuiltScene, key: str, node: Any) -> ParameterInfo:
-    import mitsuba as mi
-
-    current = built.params[key]
+def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
+    # Not by `built.params[key]`, which fails for parameters that are not set, such as the absorption of hair.
+    handle, cpptype, _, _ = built.params.properties[key]
+    current = ShownValue(key, handle, 0, cpptype).read(node)
     name = key.rsplit(".", 1)[-1]
-    class_name = node.class_name()
     kind, shape = classify(key, current)
     few = shape is None or int(np.prod(shape, dtype=np.int64)) <= _MAX_LISTED
     value = read_value(current, shape) if few else None
-    if class_name in _INDEX_CLASSES and name == "eta":
-        twin = DIFFERENTIABLE_PLUGINS[_INDEX_CLASSES[class_name]]
-        reason = (
-            f"{CORRECT}; built as {twin} when asked for, which follows the index through direction, weight and length"
-        )
-        return ParameterInfo(key, "number", (), float(np.reshape(value, ())), True, True, reason, node.id())
-    differentiable, moves, reason = _derivative(name, kind, node, built.params.flags(key))
-    if not differentiable and isinstance(node, mi.Shape) and name == "faces":
-        reason = "a list of vertex numbers"
-    return ParameterInfo(key, kind, shape, value, differentiable, moves, reason)
-
-
-def _derivative(name: str, kind: str, node: Any, flags: int) -> tuple[bool, bool, str]:
-    """(has a derivative, can change a path length, why)."""
-    import mitsuba as mi
-
+    effect = tracker.effect_of(node, name, built.params.flags(key))
+    if effect.stand_in:
+        # What stands in for the plugin has a number there, whatever Mitsuba's has.
+        effect = tracker.effect_of(node, name)
+        return replace(_info(key, "number", (), float(np.reshape(value, ())), effect), substitute=node.id())
     if kind == "plain":
-        return False, False, "a plain value, fixed when the scene is built"
-    if kind == "integer":
-        return False, False, "not a real number"
-    if flags & mi.ParamFlags.ReadOnly:
-        return False, False, "read-only in Mitsuba"
-    if isinstance(node, mi.Shape) and name in _SHAPE_KEYS:
-        if node.is_emitter() and node.is_mesh() and not node.has_vertex_texcoords():
-            return True, True, f"{SILHOUETTES}; rigid motion only: the area of an emitting mesh is not differentiated"
-        return True, True, SILHOUETTES
-    if isinstance(node, mi.Sensor) and name in _SENSOR_KEYS:
-        return True, True, SILHOUETTES
-    if name in _LIGHT_KEYS.get(node.class_name(), ()):
-        return True, True, CORRECT
-    if (node.class_name(), name) in _BIASED:
-        return True, name in ("eta", "specular"), _BIASED[node.class_name(), name]
-    if type(node).__name__ == "DelayedBSDF":
-        return True, name == "lifetime", CORRECT
-    if name == "eta" and type(node).__name__.startswith("Diff"):
-        return True, True, CORRECT
-    if name == "eta" and isinstance(node, mi.BSDF):
-        return True, True, "biased where light is refracted: the path length does not follow this index"
-    if flags & mi.ParamFlags.NonDifferentiable:
-        return False, False, f"Mitsuba marks it as not differentiable ({node.class_name()})"
-    if mi.is_spectral and node.class_name().startswith(_COEFFICIENT_CLASSES) and name in ("value", "data"):
-        return True, False, f"{CORRECT}; the numbers are coefficients of Mitsuba's spectral model, not a colour"
-    return True, False, CORRECT
+        effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")
+    elif kind == "integer":
+        reason = "a list of vertex numbers" if name == "faces" else "not a real number"
+        effect = replace(effect, supported=False, reason=reason)
+    return _info(key, kind, shape, value, effect)
+
+
+def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str]) -> list[str]:
+    """Those of ``keys`` that can change a path length: their derivatives need a response over time with a slope."""
+    return [key for key in keys if infos[key].moves_path_length]
 
 
 def is_transform(value: Any) -> bool:
@@ -190,6 +165,8 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
     """(kind, shape of the torch value) of a Mitsuba value; the shape is None for what is not numeric."""
     import drjit as dr
 
+    if current is None:
+        return "plain", None
     if is_transform(current):
         size = len(current.matrix)
         return "transform" if dr.is_jit_v(current.matrix) else "plain", (size, size)
@@ -216,6 +193,8 @@ def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
 
     if is_transform(current):
         current = current.matrix
+    elif current is None:
+        return None
     elif not dr.is_array_v(current):
         return current if shape == () else type(current).__name__
     # Arrays of width one come with a trailing dimension of one.

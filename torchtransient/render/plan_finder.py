@@ -8,15 +8,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError, SceneError
+from torchtransient.errors import SceneError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.census import Census
-from torchtransient.render.engine import no_slope
+from torchtransient.render.parameters import needing_slope
 from torchtransient.render.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
 from torchtransient.render.scene_handle import load, unknown_key
+from torchtransient.render.slope import check_filter, filter_for
 from torchtransient.render.variant import active_variant
 
 if TYPE_CHECKING:
@@ -246,17 +247,19 @@ class Finder:
         for key in self.draft.parameters:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
-        moving = [key for key in self.draft.parameters if table[key].moves_path_length]
+        moving = needing_slope(table, self.draft.parameters)
+        pulsed = bool(self.draft.pulse or self.draft.irf or self.census.pulsed)
         own = self.census.temporal_filter or "box"
         if given is not None:
-            if given == "box" and moving and not (self.draft.pulse or self.draft.irf or self.census.pulsed):
-                raise GradientError(no_slope(moving, given))
+            check_filter(moving, given, pulsed)
             self.reasons.append(f"temporal filter: {given}, as asked for")
             return given
-        if moving and own == "box" and not (self.draft.pulse or self.draft.irf or self.census.pulsed):
-            self.reasons.append(f"temporal filter: tent, since {moving[0]} changes path lengths and a box has no slope")
-            return "tent"
-        if self.draft.film != "steady":
+        chosen = filter_for(moving, own, pulsed)
+        if chosen != own:
+            self.reasons.append(
+                f"temporal filter: {chosen}, since {moving[0]} changes path lengths and a {own} has no slope"
+            )
+        elif self.draft.film != "steady":
             why = "the scene's own" if self.census.temporal_filter else "since no parameter changes a path length"
             self.reasons.append(f"temporal filter: {own}, {why}")
-        return own
+        return chosen

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import DeviceError, GradientError, SceneError, ShapeError
+from torchtransient.errors import DeviceError, SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
@@ -37,11 +37,12 @@ from torchtransient.render.output import (
     steady_channels_first,
     transient_channels_first,
 )
-from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.parameters import ParameterInfo, needing_slope
 from torchtransient.render.plan import Plan
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
+from torchtransient.render.slope import check_filter, filter_for, has_slope
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
@@ -214,8 +215,7 @@ class TransientRenderer(nn.Module):
         """The temporal filter that renders use; empty for a film that has none."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
-        moves = any(info.moves_path_length for info in self._infos.values())
-        return "tent" if moves and self._scene_filter == "box" and not self._pulsed else self._scene_filter
+        return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
 
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
@@ -236,8 +236,7 @@ class TransientRenderer(nn.Module):
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
         """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
-        sloped = self._pulsed or self.effective_filter != "box"
-        return sloped or not any(self._infos[key].moves_path_length for key in keys)
+        return has_slope(self.effective_filter, self._pulsed) or not needing_slope(self._infos, keys)
 
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
@@ -332,13 +331,9 @@ class TransientRenderer(nn.Module):
         return tensors, batched, batch
 
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
-        if temporal_filter != "box" or self._pulsed or not torch.is_grad_enabled():
-            return
-        moving = [
-            k for k, t in zip(self._keys, tensors, strict=True) if t.requires_grad and self._infos[k].moves_path_length
-        ]
-        if moving:
-            raise GradientError(engine.no_slope(moving, temporal_filter))
+        if torch.is_grad_enabled():
+            wanted = [key for key, tensor in zip(self._keys, tensors, strict=True) if tensor.requires_grad]
+            check_filter(needing_slope(self._infos, wanted), temporal_filter, self._pulsed)
 
     def _items(self, seed: int | Sequence[int] | None, batch: int | None) -> tuple[Item, ...]:
         entries = 1 if batch is None else batch

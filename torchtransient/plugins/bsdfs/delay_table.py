@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 from torchtransient.plugins.polarized import faded
 
@@ -196,6 +197,11 @@ def _gathered(values):
     return table
 
 
+def _scatters_late(bsdf) -> bool:
+    """Whether a BSDF declares that its light comes back late."""
+    return getattr(bsdf, "scatters_late", False)
+
+
 def delays_of(bsdfs):
     """(BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is None
     where there are none. Raises SceneError for one inside another BSDF.
@@ -204,13 +210,13 @@ def delays_of(bsdfs):
         return bsdfs, None
     met, delayed = [], []
     for bsdf in bsdfs:
-        if type(bsdf).__name__ == "DelayedBSDF":
+        if _scatters_late(bsdf):
             delayed.append(bsdf)
             met += [part for part in (bsdf.nested, bsdf.elastic) if part is not None]
         else:
             met.append(bsdf)
     for bsdf in met:
-        if "DelayedBSDF[" in str(bsdf):
+        if any(_scatters_late(part) for part in [bsdf, *objects_below(bsdf, mi.BSDF)]):
             raise SceneError(
                 f"BSDF '{bsdf.id()}' has a delayed BSDF inside; expected it outermost: put {bsdf.class_name()} into "
                 "the delayed one."

@@ -49,6 +49,8 @@ class DelayedBSDF(mi.BSDF):
     part. Raises SceneError for impossible numbers and for a shift in a variant without wavelengths.
     """
 
+    scatters_late = True  # what `delay_table` asks a BSDF
+
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
         self.nested, self.elastic = _children(props)

@@ -1,0 +1,389 @@
+"""The table of parameters: which row counts, what is attached, and that every plugin's keys are in it."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from torchtransient import plugins
+from torchtransient.errors import GradientError, PluginRegistrationError
+from torchtransient.plugins import parameter_effect
+from torchtransient.plugins.parameter_effect import Row, declare_effects, lineage
+from torchtransient.plugins.parameters import (
+    CORRECT,
+    SILHOUETTES,
+    ParameterEffect,
+    ParameterTracker,
+    attached_effects,
+    can_carry_gradients,
+    check_slope,
+    effect_of,
+    moving_names,
+)
+from torchtransient.testing.every_plugin import LEFT_OUT, every_plugin
+
+NON_DIFFERENTIABLE, READ_ONLY = 0x1, 0x4
+
+
+@pytest.fixture(autouse=True)
+def rgb():
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+
+
+def normals(height=0.5):
+    pixels = np.full((2, 2, 3), (0.5, height, 0.9), dtype=np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+
+
+def attach(scene, *keys):
+    params = mi.traverse(scene)
+    for key in keys:
+        value = type(params[key])(params[key])
+        dr.enable_grad(value)
+        params[key] = value
+    params.update()
+    return params
+
+
+def letters(effect):
+    flags = (effect.moves_length, effect.moves_silhouette, effect.moves_medium)
+    return "".join(letter for letter, flag in zip("LSM", flags, strict=True) if flag)
+
+
+# plugins, keys, what they move (length, silhouette, medium) and their role; all other keys move nothing
+MOVES = [
+    ("rectangle sphere disk cylinder sdfgrid instance area directionalarea angulararea irradiancemeter", "to_world",
+     "LS", "shape"),
+    ("cube obj ply instance", "vertex_positions vertex_normals", "LS", "shape"),
+    ("bsplinecurve linearcurve", "control_points", "LS", "shape"),
+    ("sdfgrid", "grid", "LS", "shape"),
+    ("ellipsoids ellipsoidsmesh", "data", "LS", "shape"),
+    ("perspective batch transient_hdr_film phasor_hdr_film gated_hdr_film",
+     "to_world x_fov principal_point_offset_x principal_point_offset_y", "LS", "sensor"),
+    ("orthographic", "to_world", "LS", "sensor"),
+    ("thinlens", "to_world x_fov aperture_radius focus_distance", "LS", "sensor"),
+    ("point", "position", "LS", "emitter"),
+    ("spot projector directional envmap sunsky timed_sunsky", "to_world", "LS", "emitter"),
+    ("dielectric diff_dielectric", "eta", "LS", "index"),
+    ("principled", "specular", "LS", "index"),
+    ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
+    ("delayed", "lifetime", "L", "delay"),
+    ("heterogeneous", "data", "M", "medium"),
+    ("homogeneous", "sigma_t.value.value", "M", "medium"),
+]  # fmt: skip
+EXPECTED = {
+    (plugin, key): (moves, role)
+    for names, keys, moves, role in MOVES
+    for plugin in names.split()
+    for key in keys.split()
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("plugins")
+
+
+def test_every_plugin_of_mitsuba_is_gone_through(folder):
+    """A plugin that a later Mitsuba brings has to be looked at."""
+    installed = {path.stem for path in (Path(mi.__file__).parent / "plugins").glob("*.so")}
+    without_parameters = {"null", "isotropic", "rayleigh", "hg", "shapegroup", "merge", "srgb"}
+    others = {  # integrators, films, samplers, reconstruction filters
+        "aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "hdrfilm", "specfilm",
+        "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent", "gaussian", "mitchell",
+        "catmullrom", "lanczos",
+    }  # fmt: skip
+    assert installed - set(every_plugin(folder)) - set(LEFT_OUT) - without_parameters - others == set()
+
+
+def test_what_every_plugin_moves(folder):
+    met = set()
+    for name, description in every_plugin(folder).items():
+        plugin = mi.load_dict(description)
+        tracker = ParameterTracker(plugin)
+        for key, (handle, cpptype, node, flags) in mi.traverse(plugin).properties.items():
+            value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
+            effect = tracker.effect_of(node, key, flags)
+            if can_carry_gradients(value) or effect.stand_in:
+                expected = EXPECTED.get((name, key)) or EXPECTED.get((name, key.rsplit(".", 1)[-1]), ("", "value"))
+                met.add((name, key))
+                assert (letters(effect), effect.role) == expected, f"{name}: {key}"
+    assert {name for name, _ in EXPECTED} <= {name for name, _ in met}
+
+
+def test_poses_of_meshes_are_ours():
+    cube = mi.load_dict({"type": "cube"})
+    assert effect_of(cube, "to_world") == effect_of(cube, "box.vertex_positions")
+    assert effect_of(cube, "vertex_color").role == "value"
+
+
+# --------------------------------------------------------------------------------------------------- where a plugin is
+
+
+def effects_in(scene):
+    """Effects by full key, asked in both ways."""
+    found = {}
+    for key in differentiable_keys(scene):
+        params = attach(scene, key)
+        by_params, by_tracker = attached_effects(params), ParameterTracker(scene).attached()
+        assert sorted((k, str(e)) for _, k, e in by_params) == sorted((k, str(e)) for _, k, e in by_tracker)
+        last = key.rsplit(".", 1)[-1]
+        (found[key],) = (effect for _, name, effect in by_tracker if name == last)
+        params[key] = dr.detach(params[key])
+        params.update()
+    return found
+
+
+def differentiable_keys(scene):
+    params = mi.traverse(scene)
+    return [key for key in params.properties if can_carry_gradients(params[key])]
+
+
+def test_extinction_is_told_by_who_holds_a_volume():
+    grid = mi.VolumeGrid(np.ones((3, 3, 3, 1), dtype=np.float32))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "fog": {
+                "type": "sphere",
+                "bsdf": {"type": "null"},
+                "interior": {
+                    "type": "heterogeneous",
+                    "sigma_t": {"type": "gridvolume", "grid": grid, "filter_type": "nearest"},
+                    "albedo": {"type": "gridvolume", "grid": grid},
+                    "phase": {"type": "hg", "g": 0.1},
+                },
+            },
+            "haze": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.4}},
+        }
+    )
+    effects = effects_in(scene)
+    moving = {key for key, effect in effects.items() if effect.moves_medium}
+    assert moving == {"fog.interior_medium.sigma_t.data", "haze.interior_medium.sigma_t.value.value"}
+    assert all(effects[key].role == "medium" and not effects[key].moves_length for key in moving)
+    assert {"fog.interior_medium.albedo.data", "fog.interior_medium.phase_function.g"} <= effects.keys() - moving
+
+
+def test_a_volume_that_is_albedo_and_extinction_is_both():
+    shared = {"type": "ref", "id": "shared"}
+    grid = mi.VolumeGrid(np.full((3, 3, 3, 1), 0.5, dtype=np.float32))
+    medium = {"type": "heterogeneous", "albedo": shared, "sigma_t": shared}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "shared": {"type": "gridvolume", "grid": grid},
+            "fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium},
+        }
+    )
+    # Mitsuba lists it once, under the name that it meets first.
+    (key,) = (key for key in mi.traverse(scene).properties if key.endswith("data"))
+    attach(scene, key)
+    ((_, _, effect),) = ParameterTracker(scene).attached()
+    assert effect.moves_medium
+
+
+@pytest.mark.parametrize("plugin", ["normalmap", "bumpmap"])
+@pytest.mark.parametrize(("nested", "bends"), [("conductor", True), ("dielectric", True), ("diffuse", False)])
+def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, bends):
+    bsdf = {"type": plugin, "normalmap": normals(), "nested": {"type": nested}}
+    scene = mi.load_dict({"type": "scene", "mirror": {"type": "cube", "bsdf": bsdf}})
+    effects = effects_in(scene)
+    texture = next(effect for key, effect in effects.items() if key.endswith("map.data") or "texture.data" in key)
+    assert texture.moves_length == bends and texture.role == ("normal" if bends else "value")
+    assert effects["mirror.vertex_texcoords"].moves_length == bends
+    assert effects["mirror.vertex_texcoords"].supported
+    colours = [effect for key, effect in effects.items() if "reflectance" in key or ".k." in key]
+    assert not any(effect.moves for effect in colours)
+
+
+def test_coordinates_of_a_mask_over_a_normal_map():
+    inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
+    scene = mi.load_dict({"type": "scene", "it": {"type": "cube", "bsdf": {"type": "mask", "nested": inner}}})
+    assert effect_of(scene.shapes()[0], "vertex_texcoords").moves_length
+
+
+def test_an_emitting_mesh_without_coordinates_is_differentiated_in_rigid_motion_only():
+    mesh = mi.Mesh("lamp", 3, 1, props=emitting())
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
+    params["faces"] = [0, 1, 2]
+    params.update()
+    for key in ("to_world", "vertex_positions"):
+        effect = effect_of(mesh, key)
+        assert effect.biased and effect.supported and "rigid motion only" in effect.reason
+    rectangle = mi.load_dict({"type": "rectangle", "emitter": {"type": "area"}})
+    assert effect_of(rectangle, "to_world") == effect_of(mi.load_dict({"type": "disk"}), "to_world")
+
+
+def emitting():
+    props = mi.Properties()
+    props["light"] = mi.load_dict({"type": "area"})
+    return props
+
+
+# ---------------------------------------------------------------------------------------------------- marks of Mitsuba
+
+
+def test_marks_count_unless_the_row_is_trusted():
+    sphere, projector = mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "projector", "irradiance": normals()})
+    assert effect_of(sphere, "to_world", NON_DIFFERENTIABLE).supported
+    assert not effect_of(sphere, "to_world", READ_ONLY).supported
+    refused = effect_of(projector, "to_world", NON_DIFFERENTIABLE)
+    assert not refused.supported and refused.moves_length and "Projector" in refused.reason
+    assert (int(mi.ParamFlags.NonDifferentiable), int(mi.ParamFlags.ReadOnly)) == (NON_DIFFERENTIABLE, READ_ONLY)
+
+
+def test_coefficients_are_named():
+    mi.set_variant("llvm_ad_spectral")
+    texture = mi.load_dict({"type": "rgb", "value": [0.5, 0.4, 0.3]})
+    assert "coefficients" in effect_of(texture, "value").reason
+    assert effect_of(mi.load_dict({"type": "uniform", "value": 0.5}), "value").reason == CORRECT
+
+
+def test_reasons():
+    assert effect_of(mi.load_dict({"type": "sphere"}), "to_world").reason == SILHOUETTES
+    assert effect_of(mi.load_dict({"type": "point"}), "position").reason == CORRECT
+    principled = effect_of(mi.load_dict({"type": "principled"}), "specular")
+    assert principled.biased and "docs/gradients.md" in principled.reason
+
+
+# ------------------------------------------------------------------------------------------------- plugins of one's own
+
+
+@pytest.fixture
+def own_rows():
+    before = {name: dict(rows) for name, rows in parameter_effect._rows.items()}
+    yield
+    parameter_effect._rows.clear()
+    parameter_effect._rows.update(before)
+
+
+def test_a_plugin_enters_by_its_own_file(own_rows):
+    class Curtain(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.lag = mi.Float(1)
+
+        def traverse(self, cb):
+            cb.put("lag", self.lag, mi.ParamFlags.Differentiable)
+
+    class Veil(Curtain):
+        pass
+
+    mi.register_bsdf("curtain", Curtain)
+    mi.register_bsdf("veil", Veil)
+    declare_effects(Curtain, {"lag": ParameterEffect(moves_length=True, role="delay")})
+    scene = mi.load_dict({"type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "veil"}}})
+    tracker = ParameterTracker(scene)
+    assert tracker.attached() == []
+    params = attach(scene, "wall.bsdf.lag")
+    for found in (attached_effects(params), attached_effects(tracker)):
+        ((node, key, effect),) = found
+        assert (key, effect.role, effect.moves_length) == ("lag", "delay", True)
+        assert lineage(node)[:2] == ("Veil", "Curtain")
+
+
+def test_precedence(own_rows):
+    sphere = mi.load_dict({"type": "sphere"})
+    own, other = (ParameterEffect(reason=reason) for reason in ("own", "other"))
+    declare_effects("Sphere", {"*": other})
+    assert effect_of(sphere, "to_world") == other, "a special class goes before a general one"
+    declare_effects("Sphere", {"to_world": [Row(own, lambda site: False), Row(other, lambda site: True), Row(own)]})
+    assert effect_of(sphere, "to_world").reason == "other", "the first row whose condition holds"
+    declare_effects("Sphere", {"to_world": own})
+    assert effect_of(sphere, "a.b.to_world").reason == "own", "a key goes before any key, the last entry counts"
+
+
+def test_roles_are_checked():
+    with pytest.raises(PluginRegistrationError, match=r"'speed' of Sphere.*shape, normal"):
+        declare_effects("Sphere", {"speed": ParameterEffect(role="velocity")})
+
+
+# -------------------------------------------------------------------------------------------------------- the tracker
+
+
+def room():
+    return {
+        "type": "scene",
+        "group": {"type": "shapegroup", "part": {"type": "sphere", "bsdf": {"type": "diff_dielectric"}}},
+        "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        "box": {"type": "cube"},
+        "light": {"type": "point"},
+        "sensor": {"type": "perspective", "film": {"type": "transient_hdr_film"}},
+        "integrator": {"type": "transient_path"},
+    }
+
+
+def test_one_walk_answers_again_and_again():
+    scene = mi.load_dict(room())
+    tracker = ParameterTracker(scene)
+    params = mi.traverse(scene)
+    names = {"copy.to_world": "shape", "box.vertex_normals": "shape", "light.position": "emitter",
+             "sensor.x_fov": "sensor", "group.part.bsdf.eta": "index", "group.part.to_world": "shape"}  # fmt: skip
+    for key, role in names.items():
+        attach(scene, key)
+        ((_, name, effect),) = tracker.attached()
+        assert (name, effect.role) == (key.rsplit(".", 1)[-1], role)
+        assert len(tracker.attached_values()) == 1
+        params[key] = dr.detach(params[key])
+        params.update()
+        assert tracker.attached() == [] and tracker.attached_values() == []
+
+
+def test_attributes_of_meshes_are_followed():
+    scene = mi.load_dict({"type": "scene", "box": {"type": "cube"}})
+    (box,) = scene.shapes()
+    box.add_attribute("vertex_color", 1, [0.5] * box.vertex_count())
+    tracker = ParameterTracker(scene)
+    for n in range(40):  # their memory moves
+        box.add_attribute(f"vertex_more_{n}", 1, [0.5] * box.vertex_count())
+    attach(scene, "box.vertex_color")
+    ((_, name, effect),) = tracker.attached()
+    assert name == "vertex_color" and not effect.moves
+
+
+def test_a_parameter_that_is_not_set_is_no_obstacle():
+    scene = mi.load_dict({"type": "scene", "wisp": {"type": "sphere", "bsdf": {"type": "hair"}}})
+    assert ParameterTracker(scene).attached() == []
+    assert attached_effects(mi.traverse(scene)) == []
+
+
+def test_an_integrator_may_keep_it():
+    scene = mi.load_dict(room())
+    film = weakref.ref(scene.sensors()[0].film())
+    integrator = scene.integrator()
+    integrator.tracker = ParameterTracker(scene)
+    gone = weakref.ref(integrator)
+    del scene, integrator
+    gc.collect()
+    assert gone() is None and film() is None
+
+
+def test_asking_launches_no_kernel():
+    scene = mi.load_dict(room())
+    tracker = ParameterTracker(scene)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        tracker.attached()
+        assert not dr.kernel_history((dr.KernelType.JIT,))
+
+
+# ------------------------------------------------------------------------------------------------------------ the slope
+
+
+def test_one_message_for_a_missing_slope():
+    scene = mi.load_dict(room())
+    params = attach(scene, "box.vertex_positions", "group.part.bsdf.eta")
+    names = moving_names(attached_effects(params))
+    assert sorted(names) == ["box.vertex_normals", "box.vertex_positions", "bsdf.eta"]
+    check_slope([], False, "box", "")
+    check_slope(["wall.to_world"], True, "tent", "")
+    with pytest.raises(GradientError, match=r"'wall.to_world', 'x'.*'box' has no slope.*Do that\."):
+        check_slope(["wall.to_world", "x"], False, "box", "Do that.")
