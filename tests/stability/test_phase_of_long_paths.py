@@ -7,16 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
-
+VARIANT = "llvm_ad_mono"
 WAVELENGTHS = [0.1, 0.01, 0.0015]
 CYCLES = 1e-4
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def film_of(frequencies, **arguments):
