@@ -5,14 +5,28 @@ import torchtransient as torchtransient  # isort: skip
 import mitsuba as mi
 import pytest
 
+from torchtransient import plugins
+
 
 @pytest.fixture(autouse=True, scope="module")
-def _variant(request):
-    """A test module that says `VARIANT = "..."` starts with that variant active.
+def _variant_of_module(request):
+    """A test module that says `VARIANT = "..."` starts with that variant active, its own fixtures too.
 
     Rendering a scene of one variant while another one is active switches twice per call, at some 0.1 s each, and what
     an earlier module left active is chance.
     """
-    wanted = getattr(request.module, "VARIANT", None)
-    if wanted is not None and mi.variant() != wanted:
-        mi.set_variant(wanted)
+    _activate(request.module)
+
+
+@pytest.fixture(autouse=True)
+def _variant_of_test(request):
+    """So does each of its tests, whatever the test before it has left active."""
+    _activate(request.module)
+
+
+def _activate(module):
+    wanted = getattr(module, "VARIANT", None)
+    if wanted is not None:
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
+        plugins.sync()

@@ -6,14 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.plain_scenes import T, camera, load, runs
-from torchtransient import plugins
+from support.plain_scenes import camera, load
+from support.runs import T, runs
 
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
+VARIANT = "llvm_ad_rgb"
 
 
 def one_arrival(scene, spp=16, seed=0):

@@ -26,12 +26,6 @@ LATE = {"type": "delayed", "lifetime": LIFETIME, "quantum_yield": YIELD, "nested
 DECAY = {"decay_opl": "0, 0.1, 0.4, 2.0", "decay_values": "0 1 0.3 0"}
 
 
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant(VARIANT)
-    plugins.sync()
-
-
 def scene(bsdf, depth=2, side=None, integrator=None, bins=BINS, width=WIDTH):
     sensor = camera()
     sensor["film"] = film(start=START, bins=bins, width=width, filter="box", size=2)

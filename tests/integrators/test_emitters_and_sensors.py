@@ -16,15 +16,18 @@ from support.lights_and_sensors import (
     RHO,
     SENSORS,
     SPHERE,
-    T,
+    arrivals,
     bright_texel,
     facing_down,
     film,
     from_above,
+    load,
     looking_down,
+    one_arrival,
     plane,
     scene,
 )
+from support.runs import T
 from torchtransient import plugins
 from torchtransient._collection import no_collection
 from torchtransient.testing.statistics import two_sample_z_test
@@ -32,33 +35,6 @@ from torchtransient.testing.statistics import two_sample_z_test
 VARIANT = "llvm_ad_rgb"  # the sky of Mitsuba knows no monochromatic variant
 # Half a bin, and what float32 makes of lengths of ten metres.
 HALF_BIN = 5.1e-4
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant(VARIANT)
-    plugins.sync()
-
-
-def load(description):
-    with plugins.plugin_errors():
-        return mi.load_dict(description, optimize=False)
-
-
-def arrivals(loaded, spp=16, seed=0):
-    """Bins (H, W, T) and their centres; nothing may fall outside of the window."""
-    camera_film = loaded.sensors()[0].film()
-    bins = np.array(loaded.integrator().render(loaded, spp=spp, seed=seed)[1], dtype=float)[..., 0]
-    assert camera_film.energy_before == 0.0 and camera_film.energy_after == 0.0
-    return bins, camera_film.start_opl + (np.arange(bins.shape[-1]) + 0.5) * camera_film.bin_width_opl
-
-
-def one_arrival(loaded, spp=16, seed=0):
-    """Mean arrival, total, and width of what a film of one pixel sees."""
-    bins, centers = arrivals(loaded, spp, seed)
-    bins = bins[0, 0]
-    lit = np.flatnonzero(bins)
-    return centers @ bins / bins.sum(), bins.sum(), centers[lit[-1]] - centers[lit[0]]
 
 
 # -------------------------------------------------------------------------------------------------- closed forms

@@ -6,17 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.plain_scenes import T, camera, check, load, mitsuba_runs, runs
+from support.plain_scenes import camera, check, load, mitsuba_runs
+from support.runs import T, runs
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError, VariantError
 
+VARIANT = "llvm_ad_rgb"
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral"]
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
 
 
 def room():

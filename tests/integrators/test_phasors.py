@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.plain_scenes import T, camera, load
+from support.plain_scenes import camera, load
+from support.runs import T
 from torchtransient import plugins
 from torchtransient.plugins.films import phasor_events
 from torchtransient.testing.statistics import two_sample_z_test, z_test

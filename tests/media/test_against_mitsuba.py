@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.media_scenes import T, block, camera, clouds, homogeneous, load, rgb, runs, steady_runs, volume
+from support.media_scenes import block, camera, clouds, homogeneous, load, rgb, volume
+from support.runs import T, runs, steady_runs
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.testing.statistics import two_sample_z_test
 

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.media_scenes import T, film, homogeneous, load, rgb, runs, volume
+from support.media_scenes import film, homogeneous, load, rgb, volume
+from support.runs import T, runs
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.record import RecordedVertex, RecordSink
 from torchtransient.plugins.transport.walk import walk

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from support.media_scenes import T, block, camera, clouds, film, homogeneous, load, runs, volume
+from support.media_scenes import block, camera, clouds, film, homogeneous, load, volume
+from support.runs import T, runs
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 
 VARIANT = "llvm_ad_mono"

@@ -11,12 +11,8 @@ import torch
 from torchtransient.plugins.bsdfs.fresnel import fresnel, refract
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction
 
+VARIANT = "llvm_ad_mono"
 INDICES = [0.5, 1 / 1.5, 0.9, 1.1, 1.33, 1.5, 2.4]
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
 
 
 def grid(eta: float, margin: float) -> tuple[np.ndarray, np.float32]:

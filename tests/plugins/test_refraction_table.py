@@ -7,18 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
 from torchtransient.plugins.bsdfs.refraction_table import RefractionTable
 
+VARIANT = "llvm_ad_mono"
 DIFFUSE = {"type": "diffuse"}
 GLASS = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
 OURS = {**GLASS, "type": "diff_rough_dielectric"}
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def scene_of(*bsdfs):

@@ -24,12 +24,6 @@ LAMP = {"type": "regular", "wavelength_min": 360, "wavelength_max": 830, "values
 WALL = {"type": "regular", "wavelength_min": 360, "wavelength_max": 830, "values": "0.1, 0.9, 0.3"}
 
 
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant(VARIANT)
-    plugins.sync()
-
-
 def film(kind="transient_hdr_film", bands=BANDS):
     time = {"temporal_bins": 50, "bin_width_opl": 0.5} if kind == "transient_hdr_film" else {}
     return {"type": kind, "width": 2, "height": 2, "rfilter": {"type": "box"}, **time, **bands}

@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.media_scenes import block, camera, clouds, film, homogeneous, load, runs, volume
+from support.media_scenes import block, camera, clouds, film, homogeneous, load, volume
+from support.runs import runs
 from torchtransient.testing.statistics import z_test
 
 VARIANT = "llvm_ad_mono"

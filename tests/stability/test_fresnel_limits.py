@@ -11,12 +11,8 @@ import pytest
 
 from torchtransient.plugins.bsdfs.fresnel import fresnel
 
+VARIANT = "llvm_ad_mono"
 getcontext().prec = 60
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
 
 
 def reflectance(cosine: float, eta: Decimal) -> Decimal:

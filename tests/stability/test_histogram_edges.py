@@ -7,16 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
 from torchtransient.testing.film_storage import storage
 
+VARIANT = "llvm_ad_mono"
 BINS = 16
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def put(opl, width, filter="box"):

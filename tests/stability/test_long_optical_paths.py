@@ -6,13 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
+VARIANT = "llvm_ad_mono"
 
 
 def T():

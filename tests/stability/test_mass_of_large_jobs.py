@@ -7,16 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
-
+VARIANT = "llvm_ad_mono"
 FILM = "torchtransient.plugins.films.base.MAX_SINGLE_PRECISION_SAMPLES"
 LANES = "torchtransient.plugins.integrators.launch.MAX_LANES"
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def mass(samples, count, packets=True):

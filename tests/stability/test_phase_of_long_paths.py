@@ -7,17 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins
 from torchtransient.testing.film_storage import storage
 
+VARIANT = "llvm_ad_mono"
 WAVELENGTHS = [0.1, 0.01, 0.0015]
 CYCLES = 1e-4
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def film_of(frequencies, **arguments):

@@ -6,16 +6,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient import plugins, scenes
+from torchtransient import scenes
 from torchtransient.testing.statistics import z_test
 
+VARIANT = "llvm_ad_mono"
 REFLECTANCE, RADIANCE = 0.8, 2.0
-
-
-@pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
 
 
 def build(node):

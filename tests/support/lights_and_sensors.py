@@ -15,13 +15,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from support.runs import T
+from torchtransient import plugins
+
 RHO = 0.5
 HALF = 3.0
 SPHERE = HALF * math.sqrt(2.0)
-
-
-def T():
-    return mi.ScalarTransform4f()
 
 
 def plane():
@@ -199,3 +198,25 @@ def scene(sensor, light, integrator="transient_path", depth=2, **objects):
         **({"light": light} if light is not None else {}),
         **objects,
     }
+
+
+def load(description):
+    """The scene with every shape and material kept apart."""
+    with plugins.plugin_errors():
+        return mi.load_dict(description, optimize=False)
+
+
+def arrivals(loaded, spp=16, seed=0):
+    """Bins (H, W, T) and their centres; nothing may fall outside of the window."""
+    camera_film = loaded.sensors()[0].film()
+    bins = np.array(loaded.integrator().render(loaded, spp=spp, seed=seed)[1], dtype=float)[..., 0]
+    assert camera_film.energy_before == 0.0 and camera_film.energy_after == 0.0
+    return bins, camera_film.start_opl + (np.arange(bins.shape[-1]) + 0.5) * camera_film.bin_width_opl
+
+
+def one_arrival(loaded, spp=16, seed=0):
+    """Mean arrival, total, and width of what a film of one pixel sees."""
+    bins, centers = arrivals(loaded, spp, seed)
+    bins = bins[0, 0]
+    lit = np.flatnonzero(bins)
+    return centers @ bins / bins.sum(), bins.sum(), centers[lit[-1]] - centers[lit[0]]

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import mitsuba as mi
-import numpy as np
 
+from support.runs import T, steady_runs
 from torchtransient import plugins
-from torchtransient._collection import no_collection
 from torchtransient.testing.statistics import two_sample_z_test
-
-
-def T():
-    return mi.ScalarTransform4f()
 
 
 def camera(
@@ -36,16 +31,9 @@ def load(sensor, objects, integrator="transient_path", **arguments):
         return mi.load_dict({"type": "scene", "integrator": node, "sensor": sensor, **objects})
 
 
-def runs(scene, count=6, spp=64, seed=0):
-    results = [scene.integrator().render(scene, seed=seed + k, spp=spp) for k in range(count)]
-    return [np.array([np.array(r[i]) for r in results], dtype=float) for i in (0, 1)]
-
-
 def mitsuba_runs(sensor, objects, count=6, spp=64, **arguments):
-    scene = load(sensor, objects, "path", **arguments)
-    with no_collection():
-        images = np.array([np.array(mi.render(scene, seed=700 + k, spp=spp)) for k in range(count)], dtype=float)
-    return images[..., :1] if mi.is_monochromatic else images
+    """Images of Mitsuba's `path`."""
+    return steady_runs(load(sensor, objects, "path", **arguments), count, spp)
 
 
 def check(a, b):
