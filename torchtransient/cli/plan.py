@@ -44,16 +44,14 @@ def command(scene: Path, **options: Any) -> None:
     """
     import torchtransient as tt
 
-    bins, width = (options[name] if options["start_opl"] is None else None for name in ("num_bins", "bin_width_opl"))
-    # Without a start they belong to an axis that the plan finds.
-    film = from_options({**options, "num_bins": None, "bin_width_opl": None} if options["start_opl"] is None else options)
+    # Without a start, bins and their width are wishes for the axis that the plan finds.
+    wishes = ("num_bins", "bin_width_opl") if options["start_opl"] is None else ()
+    film = from_options({name: value for name, value in options.items() if name not in wishes})
     asked = {} if film is None else {film.argument: film.argument_value()}
     found = tt.plan(
         load_scene(scene, None, options["params"]),
         options["outputs"],
         parameters=options["gradients"],
-        num_bins=bins,
-        bin_width_opl=width,
         max_depth=options["max_depth"],
         variant=options["variant"],
         tail=options["tail"],
@@ -61,6 +59,7 @@ def command(scene: Path, **options: Any) -> None:
         strict=options["strict"],
         pilot=not options["no_pilot"],
         seed=options["seed"],
+        **{name: options[name] for name in wishes},
         **asked,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if options["as_json"] else str(found))
