@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from types import SimpleNamespace
 
 import entries_cameras
 import entries_counting
@@ -10,6 +11,7 @@ import pytest
 import torch
 from contract import LOOSE, expected, parts, pickled, through_state_dict
 
+from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
 ENTRIES = [*entries_counting.ENTRIES, *entries_cameras.ENTRIES]
@@ -32,6 +34,19 @@ def test_batch_invariance(entry):
     for i in range(x.shape[0]):
         for together, alone in zip(whole, parts(expected(module, x[i])), strict=True):
             torch.testing.assert_close(together[i], alone, rtol=1e-10, atol=1e-12)
+
+
+@each
+@pytest.mark.parametrize("what", ["no transient", "output"])
+def test_what_a_film_does_not_measure_is_refused(entry, what):
+    """`out.transient` of a gated film is None; the output itself is for chains."""
+    module = entry.module()
+    output = SimpleNamespace(transient=None, gated=entry.x(), gates=(1, 2), axis=None)
+    given = None if what == "no transient" else output
+    for name in ("forward", "expected", "sample"):
+        if hasattr(module, name):
+            with pytest.raises(ShapeError, match=r"gated|gates|Give its tensor"):
+                getattr(module, name)(given)
 
 
 @each

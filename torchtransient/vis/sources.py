@@ -48,7 +48,7 @@ def transient_of(
     if loaded.transient is None and loaded.gated is not None:
         raise ShapeError(
             f"{who}: expected a transient (C, T, H, W), and the source holds {loaded.gated.shape[-3]} images of time "
-            "gates, which are no bins. Draw them with frames, video, frame_grid or histogram, or render with time_axis=..."
+            "gates, which are no bins. Draw them with frames, frame_grid or histogram, or render with time_axis=..."
         )
     cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
     return _checked_cube(cube, axis or loaded.axis, who, any_channels)

@@ -55,9 +55,10 @@ def frames(
 
     `source`: a transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, or a file; `axis` for sources that
     have none. The images of a gated film are frames too, in the order of its gates. `exposure` multiplies the radiance
-    of a bin (None: 99 % of the lit pixels of all frames are below white); `curve` as in `tone_map`. `accumulate` shows the light that has arrived so far. `every` adds up that many
-    bins to a frame. `scale` enlarges pixels (None: small pictures to some 320 pixels). `stamp` puts the time under
-    each frame. Pixels that are not finite are magenta. Raises ShapeError and UnitError.
+    of a bin (None: 99 % of the lit pixels of all frames are below white); `curve` as in `tone_map`. `accumulate` shows
+    the light that has arrived so far. `every` adds up that many bins to a frame. `scale` enlarges pixels (None: small
+    pictures to some 320 pixels). `stamp` puts the time under each frame. Pixels that are not finite are magenta. Raises
+    ShapeError and UnitError.
     """
     cube, axis, word = images_of(source, axis, "frames")
     if every < 1 or int(every) != every:
