@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from torchtransient.render.films.choice import CommandOption
-from torchtransient.render.films.choices import CHOICES
+from torchtransient.render.films.choices import all_films
 
 if TYPE_CHECKING:
     import torch
@@ -28,7 +28,7 @@ def scene_options(command: Command) -> Command:
         click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of the scene file."),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same image."),
         click.option("--max-depth", type=int, help="Longest path, in segments; -1 for no limit."),
-        *(_film_option(option) for kind in CHOICES for option in kind.options),
+        *(_film_option(option) for kind in all_films() for option in kind.options),
     )
     for option in reversed(options):
         command = option(command)

@@ -19,7 +19,7 @@ from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
-from torchtransient.render.films.choices import CHOICES, of_plugin, plugins_in_words
+from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
@@ -244,7 +244,7 @@ def _override_film(state: Any, index: int, options: BuildOptions) -> None:
     plugin = props.plugin_name()
     if film is None:
         if options.transient and plugin in _STEADY_FILMS:
-            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in CHOICES)
+            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in all_films())
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give one: {ways}, or make the film one of "
                 f"{plugins_in_words()}."

@@ -16,9 +16,11 @@ from torchtransient.errors import SceneError, TorchTransientError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
+from torchtransient.render.arguments import film_asked_for
 from torchtransient.render.census import Census, take_census
 from torchtransient.render.effects import Effects
-from torchtransient.render.films.choices import CHOICES, planned
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.choices import all_films, planned
 from torchtransient.render.plan_finder import Draft, Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
@@ -77,7 +79,7 @@ class Plan(Effects):
         """Everything but the scene, as plain data for JSON."""
         names = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "reasons")
         plain: dict[str, Any] = {name: getattr(self, name) for name in names}
-        for kind in CHOICES:
+        for kind in all_films():
             plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
@@ -112,6 +114,7 @@ def plan(
     pilot: bool = True,
     sensor: int = 0,
     seed: int = 0,
+    film: FilmChoice | None = None,
 ) -> Plan:
     """Choose how to render ``scene``, what :func:`load` takes.
 
@@ -128,8 +131,8 @@ def plan(
 
     Every choice can be taken over: ``variant``, ``integrator``, ``max_depth`` (a number, or "scene" for the scene's
     own), ``time_axis`` (an axis, or "scene"), ``num_bins`` and ``bin_width_opl`` of the axis to be found,
-    ``temporal_filter``, ``frequencies``, ``gates``. ``pulse`` and ``irf`` are handed to the renderer, and widen the
-    axis. A bin width that the scene's film has is kept.
+    ``temporal_filter``, ``frequencies``, ``gates``, or ``film``, an object that says the same. ``pulse`` and ``irf``
+    are handed to the renderer, and widen the axis. A bin width that the scene's film has is kept.
 
     The variant with which a scene was loaded only says on which device to compute. Depths and times hold for the
     description's values: parameters that change brightness or geometry very much call for another plan.
@@ -146,16 +149,21 @@ def plan(
     asked = choices.checked_outputs(outputs)
     census = census_of(loaded)
     device = loaded.variant.split("_")[0]
-    film = planned(asked)
+    given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
+    if given is not None and given.has_axis:
+        if time_axis is not None:
+            raise SceneError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
+        time_axis = given.argument_value()
+    kind = planned(asked)
     best, notes = choices.choose_variant(census, asked, device, strict)
     tracer, more = choices.choose_integrator(census)
-    reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, film.reason)
+    reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, kind.reason)
     draft = Draft(
         scene=load(loaded, variant=variant or best.value),
         variant=variant or best.value,
         integrator=integrator or tracer.value,
-        film=film,
-        film_choice=choices.film_settings(film, {"frequencies": frequencies, "gates": gates}, census.film),
+        film=kind,
+        film_choice=choices.film_settings(kind, given, census.film),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=tuple(parameters),
@@ -165,7 +173,7 @@ def plan(
     finder = Finder(draft, reasons, census, tail, missed, seed)
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
-    return Plan(outputs=asked, film=film.name, **kept, **vars(found))
+    return Plan(outputs=asked, film=kind.name, **kept, **vars(found))
 
 
 def census_of(scene: Scene) -> Census:

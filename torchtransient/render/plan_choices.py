@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.render.census import Census, Finding
 from torchtransient.render.films.choice import FilmChoice, PlannedFilm
-from torchtransient.render.films.choices import CHOICES, chosen
+from torchtransient.render.films.choices import all_films
 
 # What every film can show beside its own measurement.
 _OF_ANY_FILM = ("steady", "stokes", "bands")
@@ -37,7 +36,7 @@ def some(findings: Sequence[Finding], most: int = 3) -> str:
 def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     """The outputs as a tuple. Raises ``SceneError`` for unknown ones, and for two that need different films."""
     asked = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    of_films = tuple(kind.output for kind in CHOICES)
+    of_films = tuple(kind.output for kind in all_films())
     known = (*of_films, *_OF_ANY_FILM)
     if not asked or any(name not in known for name in asked):
         raise SceneError(f"tt.plan: outputs are some of {', '.join(known)}; got {list(asked)}.")
@@ -49,19 +48,17 @@ def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     return asked
 
 
-def film_settings(film: PlannedFilm, arguments: Mapping[str, Any], plugin: str | None) -> FilmChoice | None:
-    """The film with the settings of the call; None to keep those of the scene's film, whose plugin is ``plugin``, or to
-    find them. ``arguments`` are those of :func:`chosen`. Raises ``SceneError``.
+def film_settings(film: PlannedFilm, given: FilmChoice | None, plugin: str | None) -> FilmChoice | None:
+    """The settings of the plan's film: those ``given`` by the call; None to keep those of the scene's film, which is a
+    ``plugin``, or to find them. Raises ``SceneError``.
     """
-    for kind in CHOICES:
-        if arguments.get(kind.argument) is not None and kind is not film.kind:
-            raise SceneError(
-                f"tt.plan: {kind.argument} have no effect on a {film.name} film; add {kind.output!r} to the outputs."
-            )
-    found = chosen(arguments)
-    if found is None and plugin != film.kind.plugin and film.kind.needed():
+    if given is not None and type(given) is not film.kind:
+        raise SceneError(
+            f"tt.plan: {given.argument} have no effect on a {film.name} film; add {given.output!r} to the outputs."
+        )
+    if given is None and plugin != film.kind.plugin and film.kind.needed():
         raise SceneError(film.kind.needed())
-    return found
+    return given
 
 
 def choose_variant(census: Census, outputs: Sequence[str], device: str, strict: bool) -> tuple[Choice, list[str]]:

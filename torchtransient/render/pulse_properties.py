@@ -6,7 +6,7 @@ from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
-from torchtransient.render.films.choices import CHOICES, of_plugin, plugins_in_words
+from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 
 _NAMES = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
 PREFIXES = ("pulse", "irf")
@@ -29,7 +29,7 @@ def write_pulse(props: Any, prefix: str, pulse: Pulse | None) -> None:
         return
     kind = of_plugin(props.plugin_name())
     if kind is None or not kind.takes_pulse:
-        spread = plugins_in_words([kind for kind in CHOICES if kind.takes_pulse])
+        spread = plugins_in_words([kind for kind in all_films() if kind.takes_pulse])
         raise SceneError(
             f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, {spread} does. "
             "Multiply a phasor by torchtransient.pulses.transform(pulse, frequencies) instead, or leave it out."
