@@ -166,7 +166,8 @@ class Runner:
         if self.case.gradients:
             self.renderer.zero_grad()
             out = self.renderer(seed=seed, spp=spp or self.spp)
-            measured = out.transient if out.phasor is None else torch.view_as_real(out.phasor)
+            measured = next(tensor for tensor in (out.transient, out.phasor, out.gated) if tensor is not None)
+            measured = torch.view_as_real(measured) if measured.is_complex() else measured
             (measured * weights(measured)).sum().backward()
         else:
             with torch.no_grad():

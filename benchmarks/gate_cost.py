@@ -69,7 +69,7 @@ def main() -> None:
         for way, (renderer, weights) in ways.items():
             out = renderer(seed=seed)
             begun = time.perf_counter()
-            image = out.transient if weights is None else torch.einsum("cthw,gt->cghw", out.transient, weights)
+            image = out.gated if weights is None else torch.einsum("cthw,gt->cghw", out.transient, weights)
             gating = time.perf_counter() - begun
             if seed > 0:  # the first round compiles
                 seconds[way].append(out.stats.seconds + gating)

@@ -152,7 +152,8 @@ def mirrored():
 
 def runs(renderer, count=8):
     outs = [renderer(seed=k) for k in range(count)]
-    return [torch.stack([getattr(out, name) for out in outs]).double().numpy() for name in ("transient", "steady")]
+    names = (renderer.film.measures, "steady")
+    return [torch.stack([getattr(out, name) for out in outs]).double().numpy() for name in names]
 
 
 def test_gated_render_is_the_full_one_gated_afterwards():
@@ -211,7 +212,7 @@ def test_derivatives_through_torch():
 
     def loss(value):
         out = renderer({GREY: value}, seed=3)
-        return ((out.transient.sum((0, 2, 3)) * weights).sum() + 0.3 * out.steady.sum()).double()
+        return ((out.gated.sum((0, 2, 3)) * weights).sum() + 0.3 * out.steady.sum()).double()
 
     x = renderer.values[GREY].detach()
     gradient = torch.autograd.functional.jacobian(loss, x)
@@ -228,19 +229,20 @@ def test_a_rectangular_gate_has_no_derivative_in_time():
         tt.load(make_room(), variant=VARIANT), parameters=[WALL_POSE], gates=[tt.Gate.rectangular(7, 8)], spp=4
     )
     with pytest.raises(GradientError, match=r"rectangular gate.*rise from zero"):
-        renderer(seed=0).transient.sum().backward()
+        renderer(seed=0).gated.sum().backward()
 
 
 def test_output_and_file(tmp_path):
     scene = tt.load(make_room(), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, gates=GATES, spp=4)
     out = renderer(seed=0)
-    assert out.axis is None and out.phasor is None and out.gates == GATES
-    assert out.transient.shape == (3, 3, 3, 4) and "gates=3" in repr(renderer)
+    assert out.axis is None and out.phasor is None and out.transient is None and out.gates == GATES
+    assert out.gated.shape == (3, 3, 3, 4) and "gates=3" in repr(renderer)
     assert out.stats.energy_before == out.stats.energy_after == (0.0,)
     for name in ("a.h5", "a.npz"):
         back = read_result(write_result(tmp_path / name, out))
-        assert back.gates == GATES and back.axis is None and torch.equal(back.transient, out.transient)
+        assert back.gates == GATES and back.axis is None and torch.equal(back.gated, out.gated)
+        assert back.transient is None and back.phasor is None
 
 
 def test_arguments():

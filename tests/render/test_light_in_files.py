@@ -69,10 +69,10 @@ def test_gates(write):
     gates = '<string name="gates" value="rectangular 8.0 8.1; gaussian 8.05 0.05"/>'
     path = write("gated_hdr_film", gates)
     out = tt.render(tt.load(path, variant="llvm_ad_mono"), seed=0)
-    assert out.transient.shape == (1, 2, 2, 2) and out.gates[0] == tt.Gate.rectangular(8.0, 8.1)
+    assert out.gated.shape == (1, 2, 2, 2) and out.gates[0] == tt.Gate.rectangular(8.0, 8.1)
     twin = tt.render(tt.load(write(), variant="llvm_ad_mono"), seed=0, gates=out.gates)
-    torch.testing.assert_close(twin.transient, out.transient)
-    assert out.transient.min() > 0
+    torch.testing.assert_close(twin.gated, out.gated)
+    assert out.gated.min() > 0
 
 
 def test_delays(write):

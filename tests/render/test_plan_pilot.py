@@ -12,6 +12,7 @@ from support import plan_scenes
 from torchtransient.cli.main import main
 from torchtransient.errors import SceneError
 from torchtransient.render.build import BuildOptions
+from torchtransient.render.films.histogram import Histogram
 from torchtransient.render.plan_pilot import Arrivals, axis_over
 from torchtransient.render.variant import active_variant
 from torchtransient.testing.statistics import two_sample_z_test
@@ -25,7 +26,7 @@ def pilot_of(scene, seed=0):
     with active_variant(VARIANT):
         from torchtransient.plugins.integrators.pilot import pilot_events
 
-        options = BuildOptions(time_axis=(0.0, 1.0, 1), transient=True, merge=True)
+        options = BuildOptions(film=Histogram(tt.TimeAxis(0.0, 1.0, 1)), transient=True, merge=True)
         built = loaded.built(options).scene
         return pilot_events(built, built.integrator(), 0, seed=seed, pixels=256, paths=8192)
 
@@ -310,7 +311,7 @@ def test_gated_outputs():
     assert early.max_depth < late.max_depth
     output = early.renderer()(seed=0, spp=4)
     assert output.gates == tuple(gates)
-    assert output.transient.shape[1] == 2
+    assert output.gated.shape[1] == 2 and output.transient is None
     deep = tt.plan(scene, ("gates",), gates=gates, max_depth=60)
     found, full = means(early.renderer(), spp=512), means(deep.renderer(), spp=512)
     # The steady image of a gated film is the sum over its gates; a hundredth of it was given up.

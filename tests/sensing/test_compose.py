@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.pulses import Pulse
 from torchtransient.sensing import (
     Compose,
     GaussianResponse,
@@ -21,10 +22,12 @@ from torchtransient.sensing import (
     PixelElectronics,
     ScoreFunction,
     ShotNoise,
+    SynchronousSPAD,
     sine_code,
 )
 from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.linear_part import adjoint, linearity_error
+from torchtransient.sensing.pulse import apply_pulse
 
 AXIS = TimeAxis(1.0, 0.1, 32)
 
@@ -38,6 +41,14 @@ class Rendered:
     phasor: Any = None
     axis: Any = None
     frequencies: Any = None
+
+
+@dataclass
+class Gated(Rendered):
+    """The same of a gated film."""
+
+    gated: Any = None
+    gates: Any = None
 
 
 def chain(grad="expected", axis=AXIS):
@@ -172,3 +183,35 @@ def test_adjoint(length):
 def test_errors(call, error):
     with pytest.raises(error, match="expected"):
         call()
+
+
+# ------------------------------------------------------------------------------------------------ gated films
+
+
+STAGES = {"spad": [SynchronousSPAD(10)], "shot": [ShotNoise()], "chain": list(chain().stages)}
+
+
+@pytest.mark.parametrize("stages", STAGES.values(), ids=STAGES)
+def test_gates_are_no_bins(stages):
+    """A detector would take gates for moments: they are refused, whatever the stages, and the way out is said."""
+    images, sensor = light(), Compose(stages)
+    for output in (
+        Gated(gated=images, gates=("a", "b"), steady=images.sum(-3)),
+        Gated(transient=images, gates=("a", "b"), steady=images.sum(-3)),  # as outputs of earlier versions
+    ):
+        for run in (sensor, sensor.expected, sensor.sample):
+            with pytest.raises(ShapeError, match=r"2 time gates.*GatedIntegration.*out\.gated"):
+                run(output)
+    # what follows a gate takes the tensor
+    after = Compose([PixelElectronics(read_noise_e=2.0)])
+    assert after.expected(images).shape == images.shape
+
+
+def test_an_output_without_an_axis():
+    with pytest.raises(UnitError, match="time axis"):
+        Compose([SynchronousSPAD(10)])(Rendered(transient=light()))
+
+
+def test_a_pulse_on_nothing():
+    with pytest.raises(ShapeError, match="time_axis"):
+        apply_pulse(None, AXIS, Pulse.gaussian(0.1))

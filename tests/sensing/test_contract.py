@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from support.sensing.all_entries import ENTRIES, each
 from support.sensing.contract import LOOSE, expected, parts, pickled, through_state_dict
+from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
 each_random = pytest.mark.parametrize("entry", [e for e in ENTRIES if e.random], ids=lambda e: e.name)
@@ -29,6 +31,19 @@ def test_batch_invariance(entry):
     for i in range(x.shape[0]):
         for together, alone in zip(whole, parts(expected(module, x[i])), strict=True):
             torch.testing.assert_close(together[i], alone, rtol=1e-10, atol=1e-12)
+
+
+@each
+@pytest.mark.parametrize("what", ["no transient", "output"])
+def test_what_a_film_does_not_measure_is_refused(entry, what):
+    """`out.transient` of a gated film is None; the output itself is for chains."""
+    module = entry.module()
+    output = SimpleNamespace(transient=None, gated=entry.x(), gates=(1, 2), axis=None)
+    given = None if what == "no transient" else output
+    for name in ("forward", "expected", "sample"):
+        if hasattr(module, name):
+            with pytest.raises(ShapeError, match=r"gated|gates|Give its tensor"):
+                getattr(module, name)(given)
 
 
 @each

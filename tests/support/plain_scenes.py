@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 
 from support.runs import T, steady_runs
 from torchtransient import plugins

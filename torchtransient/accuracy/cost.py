@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.render.films.choices import of_output
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.variant import active_variant
@@ -25,12 +26,22 @@ def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
 
     It is linear in what is measured, so that its gradient has no bias, and it changes with energy and arrival time.
     """
-    if out.transient is None:
-        return out.phasor.real.sum() / (out.phasor.shape[-2] * out.phasor.shape[-1])
-    bins = out.transient.shape[-3]
-    phase = 2.0 * math.pi * (torch.arange(bins, device=out.transient.device) + 0.5) / bins
-    pixels = out.transient.shape[-2] * out.transient.shape[-1]
-    return (out.transient * torch.cos(phase)[:, None, None]).sum() / pixels
+    response = _response(out)
+    pixels = response.shape[-2] * response.shape[-1]
+    if response.is_complex():
+        return response.real.sum() / pixels
+    bins = response.shape[-3]
+    phase = 2.0 * math.pi * (torch.arange(bins, device=response.device) + 0.5) / bins
+    return (response * torch.cos(phase)[:, None, None]).sum() / pixels
+
+
+def _response(out: RenderOutput) -> torch.Tensor:
+    """What the film of a render measured."""
+    film = of_output(out)
+    response = None if film is None else film.tensor(out)
+    if response is None:
+        raise ShapeError("cost_of_accuracy: expected a render with what its film measured, got a steady image alone.")
+    return response
 
 
 def cost_of_accuracy(
@@ -61,7 +72,7 @@ def cost_of_accuracy(
     take turns. A loss that is not linear has a biased gradient, which only a reference shows, and only in part.
 
     Of a phasor film the quantity "phasor" takes the place of "transient": real and imaginary parts, frequencies in the
-    place of bins; it has no temporal filters to choose from.
+    place of bins; of a gated film "gated". Both have no temporal filters to choose from.
 
     Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises SceneError for a key or sampler
     that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
@@ -95,7 +106,7 @@ def cost_of_accuracy(
         "spp": list(spp),
         "gradients": list(gradients),
         "loss": getattr(loss, "__name__", type(loss).__name__),
-        "measured": repr(renderer.axis or renderer.frequencies or renderer.gates),
+        "measured": repr(renderer.film.argument_value()),
         "time_axis": axis and [axis.start_opl, axis.bin_width_opl, axis.num_bins],
         "without_gradients": without,
     }
@@ -113,16 +124,17 @@ def cost_of_accuracy(
 
 
 def _values_task(renderer: TransientRenderer) -> Task:
+    film = renderer.film
+
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
-        if out.transient is None:
-            estimate = {"phasor": _array(torch.view_as_real(out.phasor))}
-        else:
-            estimate = {"transient": _array(out.transient)}
-        return Estimates(estimate, renderer.samples_drawn(spp))
+        response = _response(out)
+        numbers = torch.view_as_real(response) if film.is_complex else response
+        return Estimates({film.measures: _array(numbers)}, renderer.samples_drawn(spp))
 
-    return Task(run, {"transient": -3, "phasor": -4})
+    # After the film's own dimension come rows and columns, and real and imaginary parts of complex numbers.
+    return Task(run, {film.measures: -4 if film.is_complex else -3})
 
 
 def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:

@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import load_scene, scene_options, time_axis
+from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.render.films.choices import from_options
 
 
 class Counts(click.ParamType):
@@ -41,13 +42,13 @@ def command(scene: Path, **options: Any) -> None:
     from torchtransient.data.result_file import check_folder
     from torchtransient.vis.overview import check_picture
 
-    axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
+    film = from_options(options)
     if options["plot"]:
         check_picture(options["plot"])
     if options["json_path"]:
         check_folder(options["json_path"])
     described = load_scene(scene, options["variant"], options["params"])
-    report = _measure(described, axis, options)
+    report = _measure(described, film, options)
     click.echo(report.table())
     if options["plot"]:
         report.plot(options["plot"])
@@ -57,11 +58,11 @@ def command(scene: Path, **options: Any) -> None:
         click.echo(f"{options['json_path']}: the numbers")
 
 
-def _measure(described: Any, axis: Any, options: dict[str, Any]) -> Any:
+def _measure(described: Any, film: Any, options: dict[str, Any]) -> Any:
     import torchtransient as tt
 
     renderer = tt.TransientRenderer(
-        described, parameters=list(options["gradients"]), time_axis=axis, max_depth=options["max_depth"]
+        described, parameters=list(options["gradients"]), film=film, max_depth=options["max_depth"]
     )
     return tt.cost_of_accuracy(
         renderer,

@@ -9,30 +9,35 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from torchtransient.render.films.choice import CommandOption
+from torchtransient.render.films.choices import all_films
+
 if TYPE_CHECKING:
     import torch
 
-    from torchtransient.axes import FrequencyAxis, TimeAxis
     from torchtransient.render.scene_handle import Scene
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def scene_options(command: Command) -> Command:
-    """The scene file and what changes how it is read and rendered."""
+    """The scene file and what changes how it is read and rendered, the settings of every film included."""
     options = (
         click.argument("scene", type=click.Path(path_type=Path)),
         click.option("--variant", help="Mitsuba variant, such as llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb."),
         click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of the scene file."),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same image."),
         click.option("--max-depth", type=int, help="Longest path, in segments; -1 for no limit."),
-        click.option("--start-opl", type=float, help="Start of the time axis, metres of optical path."),
-        click.option("--bin-width-opl", type=float, help="Width of a bin, metres of optical path."),
-        click.option("--num-bins", type=int, help="Number of bins."),
+        *(_film_option(option) for kind in all_films() for option in kind.options),
     )
     for option in reversed(options):
         command = option(command)
     return command
+
+
+def _film_option(option: CommandOption) -> Callable[[Command], Command]:
+    flag = f"--{option.name.replace('_', '-')}"
+    return click.option(flag, type=option.kind, metavar=option.metavar, help=option.help)
 
 
 def assignments(given: Sequence[str], option: str) -> dict[str, str]:
@@ -61,32 +66,6 @@ def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
                 f"expected a number, or numbers with commas, for '{key}', got '{text}'", param_hint=option
             ) from None
     return values
-
-
-def frequency_list(given: str | None, option: str) -> FrequencyAxis | None:
-    """`"0,0.5,1"` as an axis of frequencies in cycles per metre; None without any."""
-    if given is None:
-        return None
-    from torchtransient.axes import FrequencyAxis
-
-    try:
-        return FrequencyAxis(tuple(float(text) for text in given.split(",")))
-    except ValueError:
-        raise click.BadParameter(f"expected numbers with commas, got '{given}'", param_hint=option) from None
-
-
-def time_axis(start_opl: float | None, bin_width_opl: float | None, num_bins: int | None) -> TimeAxis | None:
-    """The axis of the three options, None without any. A usage error when only some are given."""
-    given = (start_opl, bin_width_opl, num_bins)
-    if given == (None, None, None):
-        return None
-    if start_opl is None or bin_width_opl is None or num_bins is None:
-        raise click.UsageError(
-            "--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all."
-        )
-    from torchtransient.axes import TimeAxis
-
-    return TimeAxis(start_opl, bin_width_opl, num_bins)
 
 
 def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene:

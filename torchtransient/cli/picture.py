@@ -40,15 +40,18 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
 def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
     from torchtransient.data.result_file import read_result
+    from torchtransient.render.films.choices import of_output
 
     def overview() -> None:
         from torchtransient.vis.sources import steady_of, transient_of
 
-        axis = read_result(result).axis
-        if axis is None:
-            raise click.UsageError("--kind overview shows a histogram over time, and this file holds phasors.")
+        held = read_result(result)
+        film = of_output(held)
+        if held.axis is None:
+            what = "something else" if film is None else film.plural
+            raise click.UsageError(f"--kind overview shows a histogram over time, and this file holds {what}.")
         cube, _ = transient_of(result)
-        tt.vis.plot_overview(cube, steady_of(result), axis, target, pixel=options["pixel"], title=result.name)
+        tt.vis.plot_overview(cube, steady_of(result), held.axis, target, pixel=options["pixel"], title=result.name)
 
     draw: dict[str, Callable[[], Any]] = {
         "overview": overview,

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+if TYPE_CHECKING:
+    from torchtransient.render.films.choice import FilmChoice
+
+PICTURES = ("overview", "peak_time", "rainbow", "video")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -41,28 +45,29 @@ def picture_options(command: Command) -> Command:
     return command
 
 
-def check_pictures(options: dict[str, Any], phasors: bool) -> None:
-    """Raise StorageError when one of the pictures of `picture_options` could not be written, UsageError when it shows
-    a histogram over time and the film keeps phasors.
+def check_pictures(options: dict[str, Any], film: FilmChoice | None) -> None:
+    """Raise StorageError when one of the pictures of `picture_options` could not be written, UsageError when it does
+    not show what the film measures. None: it is not known yet.
     """
     from torchtransient.vis.overview import check_picture
     from torchtransient.vis.video_file import check_video
 
-    for name in ("overview", "peak_time", "rainbow"):
-        if options[name] and phasors:
+    for name in PICTURES:
+        if not options[name]:
+            continue
+        if film is not None and name not in film.pictures:
             flag = name.replace("_", "-")
-            raise click.UsageError(f"--{flag} shows a histogram over time; leave it out for phasors and gates.")
-        if options[name]:
+            raise click.UsageError(f"--{flag} shows a histogram over time; leave it out for {film.plural}.")
+        if name == "video":
+            check_video(options[name])
+        else:
             check_picture(options[name])
-    if options["video"]:
-        check_video(options["video"])
 
 
-def write_pictures(output: Any, options: dict[str, Any], title: str) -> None:
-    """Write the pictures of `picture_options` that are asked for, and say so. Phasors become a video of a wave."""
+def write_pictures(output: Any, film: FilmChoice, options: dict[str, Any], title: str) -> None:
+    """Write the pictures of `picture_options` that are asked for, and say so."""
     import torchtransient as tt
 
-    progress = not options["quiet"]
     if options["overview"]:
         power = (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
         tt.vis.plot_overview(*power, output.axis, options["overview"], pixel=options["pixel"], title=title)
@@ -73,9 +78,6 @@ def write_pictures(output: Any, options: dict[str, Any], title: str) -> None:
     if options["rainbow"]:
         tt.vis.rainbow(output, options["rainbow"])
         click.echo(f"{options['rainbow']}: hue by arrival")
-    if options["video"] and output.transient is None:
-        tt.vis.phasor_video(output, options["video"], progress=progress)
-        click.echo(f"{options['video']}: the wave of the first frequency")
-    elif options["video"]:
-        tt.vis.video(output, options["video"], progress=progress)
-        click.echo(f"{options['video']}: {output.transient.shape[-3]} frames")
+    if options["video"]:
+        shown = film.write_video(output, options["video"], progress=not options["quiet"])
+        click.echo(f"{options['video']}: {shown}")

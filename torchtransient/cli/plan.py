@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import load_scene, scene_options, time_axis
+from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.render.films.choices import from_options
 
 
 class Names(click.ParamType):
@@ -21,21 +22,6 @@ class Names(click.ParamType):
         return value if isinstance(value, tuple) else tuple(part.strip() for part in value.split(",") if part.strip())
 
 
-class Numbers(click.ParamType):
-    """Numbers with commas between them."""
-
-    name = "X,X,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        """The numbers of a text; a usage error for anything else."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            return tuple(float(part) for part in value.split(","))
-        except ValueError:
-            self.fail(f"expected numbers such as 0.5,1.5, got '{value}'", param, ctx)
-
-
 @click.command()
 @scene_options
 @click.option(
@@ -46,7 +32,6 @@ class Numbers(click.ParamType):
     help="Some of transient, steady, phasor, stokes, gates, bands.",
 )
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")
-@click.option("--frequencies", type=Numbers(), help="For phasors: cycles per metre of optical path.")
 @click.option("--tail", type=float, default=1e-3, show_default=True, help="Share of the light left to deeper paths.")
 @click.option("--missed", type=float, default=1e-3, show_default=True, help="Share of the light outside the time axis.")
 @click.option("--strict", is_flag=True, help="Carry polarization between smooth surfaces too.")
@@ -59,16 +44,14 @@ def command(scene: Path, **options: Any) -> None:
     """
     import torchtransient as tt
 
-    start, width, bins = options["start_opl"], options["bin_width_opl"], options["num_bins"]
-    axis = time_axis(start, width, bins) if start is not None else None
+    # Without a start, bins and their width are wishes for the axis that the plan finds.
+    wishes = ("num_bins", "bin_width_opl") if options["start_opl"] is None else ()
+    film = from_options({name: value for name, value in options.items() if name not in wishes})
+    asked = {} if film is None else {film.argument: film.argument_value()}
     found = tt.plan(
         load_scene(scene, None, options["params"]),
         options["outputs"],
         parameters=options["gradients"],
-        frequencies=options["frequencies"],
-        time_axis=axis,
-        num_bins=None if axis else bins,
-        bin_width_opl=None if axis else width,
         max_depth=options["max_depth"],
         variant=options["variant"],
         tail=options["tail"],
@@ -76,5 +59,7 @@ def command(scene: Path, **options: Any) -> None:
         strict=options["strict"],
         pilot=not options["no_pilot"],
         seed=options["seed"],
+        **{name: options[name] for name in wishes},
+        **asked,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if options["as_json"] else str(found))

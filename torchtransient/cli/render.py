@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import assignments, frequency_list, load_scene, scene_options, scene_values, time_axis
+from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
 from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
+from torchtransient.render.films.choices import from_options, of_output
 
 
 @click.command()
@@ -20,7 +21,6 @@ from torchtransient.cli.pictures import check_pictures, picture_options, write_p
 @click.option("--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]")
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
 @click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
-@click.option("--frequencies", metavar="NU,NU,...", help="Phasors at these cycles per metre instead of a transient.")
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
 @click.option("--list-parameters", is_flag=True, help="Print the keys that --set takes, and stop.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
@@ -28,47 +28,40 @@ def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
     The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
-    polarized variant, the time axis in metres of optical path, and how it was made; with --frequencies, or for a scene
-    with a phasor film, phasor (C, F, H, W) in place of the transient.
+    polarized variant, the time axis in metres of optical path, and how it was made. With --frequencies or --gates, or
+    for a scene with such a film, phasor (C, F, H, W) or gated (C, G, H, W) stands in place of the transient.
     torchtransient.data.result_file.read_result reads it.
     """
     from torchtransient.data.result_file import check_target, write_result
 
     assignments(options["params"], "--param")
-    axis = time_axis(options["start_opl"], options["bin_width_opl"], options["num_bins"])
-    frequencies = frequency_list(options["frequencies"], "--frequencies")
-    if axis is not None and frequencies is not None:
-        raise click.UsageError("--frequencies renders phasors, which have no time axis: leave out one of the two.")
+    film = from_options(options)
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
-    check_pictures(options, phasors=frequencies is not None)
+    check_pictures(options, film)
     described = load_scene(scene, options["variant"], options["params"])
     if options["list_parameters"]:
         click.echo(described.parameters())
         return
-    output = _render(described, values, axis, frequencies, options)
+    output = _render(described, values, film, options)
     write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
-    stats = output.stats
-    stokes = "Stokes x " if output.polarized else ""
-    if output.gates is not None:
-        what, how = f"{_sizes(output.transient)} ({stokes}C x G x H x W) gates", ""
-    elif output.transient is None:
-        what, how = f"{_sizes(output.phasor)} ({stokes}C x F x H x W) phasors", ""
-    else:
-        what, how = f"{_sizes(output.transient)} ({stokes}C x T x H x W)", f", {stats.temporal_filter} filter"
+    stats, film = output.stats, of_output(output)
+    what, how = film.summary(
+        _sizes(film.tensor(output)), "Stokes x " if output.polarized else "", stats.temporal_filter
+    )
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
     if output.axis is not None:
         _report_energy(output)
-    check_pictures(options, phasors=output.axis is None)
-    write_pictures(output, options, scene.name)
+    check_pictures(options, film)
+    write_pictures(output, film, options, scene.name)
 
 
 def _sizes(tensor: Any) -> str:
     return " x ".join(map(str, tensor.shape))
 
 
-def _render(described: Any, values: dict[str, Any], axis: Any, frequencies: Any, options: dict[str, Any]) -> Any:
+def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str, Any]) -> Any:
     import torch
 
     import torchtransient as tt
@@ -80,11 +73,10 @@ def _render(described: Any, values: dict[str, Any], axis: Any, frequencies: Any,
             spp=options["spp"],
             seed=options["seed"],
             progress=not options["quiet"],
-            time_axis=axis,
+            film=film,
             max_depth=options["max_depth"],
             temporal_filter=options["temporal_filter"],
             sensors=options["sensor"],
-            frequencies=frequencies,
         )
 
 

@@ -1,10 +1,10 @@
 """A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
-Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and either `transient` float32
-(..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; or `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path. A gated film's images are
-a `transient` (..., C, G, H, W) with `gates` (the text of scene files) instead of an axis. Polarized variants have
-the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
+Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
+(..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; or `gated` float32 (...,
+C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`. Polarized variants
+have the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
 metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
 the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
 needed.
@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
-from torchtransient.gates import Gate, gates_from_text, gates_to_text
-from torchtransient.render.output import RenderOutput
+from torchtransient.gates import Gate
+from torchtransient.render.films.choices import of_entries, of_output
+from torchtransient.render.output import RenderOutput, named_fields
 
 FORMAT = "torchtransient result 1"
 _HDF5 = (".h5", ".hdf5")
@@ -41,7 +42,8 @@ _PART_BYTES = 2**26
 class Result:
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    Either `transient` with `axis` or `gates`, or `phasor` and `frequencies`; the others are None.
+    `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
+    and settings of films that have no attribute here, by name.
     """
 
     transient: torch.Tensor | None
@@ -52,6 +54,8 @@ class Result:
     frequencies: FrequencyAxis | None = None
     channels: tuple[str, ...] = ()
     gates: tuple[Gate, ...] | None = None
+    gated: torch.Tensor | None = None
+    others: Mapping[str, Any] = field(default_factory=dict)
 
 
 def check_target(path: str | Path) -> Path:
@@ -88,9 +92,16 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
         note = json.dumps({**(metadata or {}), "stats": stats})
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
-    measured, numbers = _measured(output)
-    entries: dict[str, Any] = {"format": FORMAT, **numbers, "channels": json.dumps(output.channels), "metadata": note}
-    arrays = {"steady": output.steady.detach().cpu().numpy(), **measured}
+    film = of_output(output)
+    tensor = None if film is None else film.tensor(output)
+    if film is None or tensor is None:
+        raise StorageError(
+            "result file: expected an output with what its film measured, transient and axis for instance, got neither."
+        )
+    entries: dict[str, Any] = {
+        "format": FORMAT, **film.numbers(), "channels": json.dumps(output.channels), "metadata": note,
+    }  # fmt: skip
+    arrays = {"steady": _array(output.steady), film.measures: _array(tensor), **film.arrays()}
     with _replacing(target) as unfinished:
         if target.suffix.lower() in _HDF5:
             _write_hdf5(unfinished, arrays, entries)
@@ -102,23 +113,9 @@ def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, 
     return target
 
 
-def _measured(output: RenderOutput) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Arrays and numbers of what the film measured beside the steady image."""
-    if output.transient is not None and output.axis is not None:
-        axis = output.axis
-        arrays = {"transient": output.transient.detach().cpu().numpy(), "edges_opl": axis.edges_opl.numpy()}
-        return arrays, {
-            "start_opl": axis.start_opl,
-            "bin_width_opl": axis.bin_width_opl,
-            "num_bins": axis.num_bins,
-        }
-    if output.transient is not None and output.gates is not None:
-        return {"transient": output.transient.detach().cpu().numpy()}, {"gates": gates_to_text(output.gates)}
-    if output.phasor is not None and output.frequencies is not None:
-        phasor = output.phasor.detach().resolve_conj().cpu().numpy()
-        arrays = {"phasor": phasor, "frequencies_per_metre": output.frequencies.per_metre.numpy()}
-        return arrays, {"start_opl": output.frequencies.start_opl}
-    raise StorageError("result file: expected an output with a transient or a phasor, got neither.")
+def _array(tensor: torch.Tensor) -> NDArray[Any]:
+    array: NDArray[Any] = tensor.detach().resolve_conj().cpu().numpy()
+    return array
 
 
 def read_result(path: str | Path) -> Result:
@@ -136,42 +133,28 @@ def read_result(path: str | Path) -> Result:
         form = str(values["format"])
         if form != FORMAT:
             raise StorageError(f"result file: '{source}' is of format '{form}'; this version reads '{FORMAT}'.")
-        result = _result(values)
+        result = _result(values, source)
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise StorageError(
             f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
         ) from error
-    name, letter, cube = "transient", "T", result.transient
-    count = 0 if result.axis is None else result.axis.num_bins
-    if result.frequencies is not None:
-        name, letter, cube, count = "phasor", "F", result.phasor, result.frequencies.num_frequencies
-    elif result.gates is not None:
-        letter, count = "G", len(result.gates)
-    if cube is None or cube.ndim < 4 or cube.shape[-3] != count:
-        shape = None if cube is None else tuple(cube.shape)
-        raise StorageError(
-            f"result file: '{source}' holds a {name} of shape {shape}; expected "
-            f"(..., C, {letter}, H, W) with {letter} = {count}."
-        )
     return result
 
 
-def _result(values: Mapping[str, Any]) -> Result:
+def _result(values: Mapping[str, Any], source: Path) -> Result:
     metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
     # Files of earlier versions have no names of channels.
     channels = tuple(json.loads(str(values.get("channels", "[]"))))
-    if "gates" in values:
-        transient, gates = torch.from_numpy(values["transient"]), gates_from_text(str(values["gates"]))
-        return Result(transient, steady, None, metadata, channels=channels, gates=gates)
-    start = float(values["start_opl"])
-    if "phasor" in values:
-        frequencies = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), start)
-        phasor = torch.from_numpy(values["phasor"])
-        return Result(None, steady, None, metadata, phasor=phasor, frequencies=frequencies, channels=channels)
-    axis = TimeAxis(start, float(values["bin_width_opl"]), int(values["num_bins"]))
-    return Result(torch.from_numpy(values["transient"]), steady, axis, metadata, channels=channels)
+    film = of_entries(values)
+    response = torch.from_numpy(film.tensor_in(values))
+    if response.ndim < 4 or response.shape[-3] != film.count:
+        raise StorageError(
+            f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
+            f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
+        )
+    return Result(steady=steady, metadata=metadata, channels=channels, **named_fields(film, response))
 
 
 @contextmanager

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.gates import Gate
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.choices import chosen
 
 SEED_RANGE = 2**32
 
@@ -92,27 +92,16 @@ def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[to
     raise ShapeError(f"value of {key!r}: expected shape {shape}, or {with_batch} with a batch, got {got}.")
 
 
-def film_choice(time_axis: Any, frequencies: Any, gates: Any) -> dict[str, Any]:
-    """What the films are to measure, as build options: ``time_axis``, ``frequencies`` and ``gates``, at most one of
-    them set. Raises ``SceneError``.
-    """
-    if time_axis is not None and not isinstance(time_axis, TimeAxis):
-        raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(time_axis).__name__}.")
-    if sum(choice is not None for choice in (time_axis, frequencies, gates)) > 1:
-        raise SceneError(
-            "time_axis, frequencies, gates: a film is a histogram, a phasor film or a gated film; give one of them."
-        )
-    if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-        frequencies = FrequencyAxis(frequencies)
-    if gates is not None:
-        gates = (gates,) if isinstance(gates, Gate) else tuple(gates)
-        if not gates or not all(isinstance(gate, Gate) for gate in gates):
-            raise SceneError(
-                "gates: expected one or more tt.Gate objects, for instance [tt.Gate.gaussian(6.0, 0.2)], got "
-                f"{gates!r}."
-            )
-    axis = None if time_axis is None else (time_axis.start_opl, time_axis.bin_width_opl, time_axis.num_bins)
-    return {"time_axis": axis, "frequencies": frequencies, "gates": gates}
+def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:
+    """The film of a call: an object, or one of the ``named`` arguments. Raises ``SceneError``."""
+    found = chosen(named)
+    if film is None:
+        return found
+    if found is not None:
+        raise SceneError(f"film, {', '.join(named)}: a film measures one thing; give one of them.")
+    if not isinstance(film, FilmChoice):
+        raise SceneError(f"film: expected a film such as Histogram(axis) of torchtransient.render.films, got {film!r}.")
+    return film
 
 
 class Values(Mapping[str, nn.Parameter]):

@@ -15,14 +15,13 @@ import numpy as np
 
 from torchtransient import plugins
 from torchtransient._collection import let_go
-from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import SceneError, TorchTransientError
-from torchtransient.gates import Gate, gates_to_text
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
-from torchtransient.render.pulse_properties import FILMS as PULSED_FILMS
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -39,41 +38,32 @@ _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
 )  # fmt: skip
-_TIME_FILMS = ("transient_hdr_film", "phasor_hdr_film", "gated_hdr_film")
-# Properties of a phasor film that say which frequencies it keeps; explicit frequencies replace them.
-_PEER_FREQUENCIES = (
-    "wl_mean", "wl_sigma", "temporal_bins", "bin_width_opl", "frequency_first", "frequency_step", "frequency_count",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class BuildOptions:
     """What is changed of a description when it is built.
 
-    ``time_axis``: (start_opl, bin_width_opl, num_bins) for every film, or None to keep the films. ``max_depth``: for
-    the integrator, or None. ``substitute``: names of BSDFs that are built as their differentiable twins.
-    ``real_bitmaps``: store every bitmap as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no
-    derivative. ``merge``: let Mitsuba merge meshes and equal materials, which is faster to trace but takes parameters
-    away. ``transient``: turn a steady film and integrator into transient ones. ``sampler``: plugin name of a sampler
-    that replaces those of the sensors, with the same number of samples; None to keep them. ``frequencies``: every film
-    becomes a phasor film with these, None to keep the films; not together with ``time_axis``. ``pulse``, ``irf``:
-    shape of the light's pulse and impulse response of the sensor for every film, None to keep what the films have.
-    ``integrator``: plugin name of a transient integrator that replaces the scene's, with the parameters that both have;
-    None to keep it.
-    ``gates``: every film becomes a gated film with these. ``steady``: False takes the steady image from the histograms.
+    ``film``: what every film becomes, None to keep them. ``max_depth``: for the integrator, or None. ``substitute``:
+    names of BSDFs that are built as their differentiable twins. ``real_bitmaps``: store every bitmap as real numbers;
+    Mitsuba keeps 8-bit images in 8 bits, which have no derivative. ``merge``: let Mitsuba merge meshes and equal
+    materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into
+    transient ones. ``sampler``: plugin name of a sampler that replaces those of the sensors, with the same number of
+    samples; None to keep them. ``pulse``, ``irf``: shape of the light's pulse and impulse response of the sensor for
+    every film, None to keep what the films have. ``integrator``: plugin name of a transient integrator that replaces
+    the scene's, with the parameters that both have; None to keep it. ``steady``: False takes the steady image from the
+    histograms.
     """
 
-    time_axis: tuple[float, float, int] | None = None
+    film: FilmChoice | None = None
     max_depth: int | None = None
     substitute: frozenset[str] = frozenset()
     real_bitmaps: bool = False
     merge: bool = False
     transient: bool = False
     sampler: str | None = None
-    frequencies: FrequencyAxis | None = None
     pulse: Pulse | None = None
     irf: Pulse | None = None
-    gates: tuple[Gate, ...] | None = None
     steady: bool = True
     integrator: str | None = None
 
@@ -216,7 +206,7 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
 def _override_films(state: Any, options: BuildOptions) -> None:
     import mitsuba as mi
 
-    if options.time_axis is None and options.frequencies is None and options.gates is None and not options.transient:
+    if options.film is None and not options.transient:
         return
     for index in range(len(state.nodes)):
         node = state.nodes[index]
@@ -230,48 +220,42 @@ def _override_films(state: Any, options: BuildOptions) -> None:
             for prefix in PREFIXES:
                 write_pulse(props, prefix, getattr(options, prefix))
             if not options.steady:
-                if props.plugin_name() != "transient_hdr_film":
-                    raise SceneError(
-                        f"steady=False spares a histogram the light outside of its window; the film is a "
-                        f"{props.plugin_name()!r}. Leave it out."
-                    )
-                props["steady"] = False
+                _leave_out_steady(props)
+
+
+def _leave_out_steady(props: Any) -> None:
+    kind = of_plugin(props.plugin_name())
+    if kind is None or not kind.spares_steady:
+        raise SceneError(
+            f"steady=False spares a histogram the light outside of its window; the film is a {props.plugin_name()!r}. "
+            "Leave it out."
+        )
+    props["steady"] = False
 
 
 def _override_film(state: Any, index: int, options: BuildOptions) -> None:
-    props = state.nodes[index].props
+    props, film = state.nodes[index].props, options.film
     plugin = props.plugin_name()
-    if options.time_axis is None and options.frequencies is None and options.gates is None:
+    if film is None:
         if options.transient and plugin in _STEADY_FILMS:
+            ways = " or ".join(f"TransientRenderer(..., {kind.example})" for kind in all_films())
             raise SceneError(
-                f"the film is a steady {plugin!r}, which has no time axis. Give one: TransientRenderer(..., "
-                "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...)) or TransientRenderer(..., "
-                "frequencies=tt.FrequencyAxis(...)), or make the film a transient_hdr_film or a phasor_hdr_film."
+                f"the film is a steady {plugin!r}, which has no time axis. Give one: {ways}, or make the film one of "
+                f"{plugins_in_words()}."
             )
         return
-    wanted = "gated_hdr_film" if options.gates is not None else "phasor_hdr_film"
-    wanted = "transient_hdr_film" if options.time_axis is not None else wanted
     if plugin in _STEADY_FILMS and not options.transient:
         return
-    if plugin in (*_STEADY_FILMS, *_TIME_FILMS) and plugin != wanted:
-        if wanted not in PULSED_FILMS and any(prefix in props for prefix in PREFIXES):
-            raise SceneError(f"the film {plugin!r} has a pulse or an irf, which a {wanted} would lose; take it out.")
-        _become(state, index, wanted, keep=_FILM_PROPERTIES + PROPERTIES)
+    if plugin != film.plugin and (plugin in _STEADY_FILMS or of_plugin(plugin) is not None):
+        if not film.takes_pulse and any(prefix in props for prefix in PREFIXES):
+            raise SceneError(
+                f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
+            )
+        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + PROPERTIES)
         props = state.nodes[index].props
-    if options.time_axis is not None:
-        start, width, bins = options.time_axis
-        props["start_opl"], props["bin_width_opl"], props["temporal_bins"] = float(start), float(width), int(bins)
-        return
-    if props.plugin_name() != wanted:
-        raise SceneError(f"the film {plugin!r} cannot become a {wanted}; make it one of {', '.join(_TIME_FILMS)}.")
-    if options.gates is not None:
-        props["gates"] = gates_to_text(options.gates)
-    elif options.frequencies is not None:
-        for name in _PEER_FREQUENCIES:
-            if name in props:
-                del props[name]
-        props["frequencies"] = ", ".join(repr(f) for f in options.frequencies.frequencies)
-        props["start_opl"] = options.frequencies.start_opl
+    if not film.fits(props.plugin_name()):
+        raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one of {plugins_in_words()}.")
+    film.write(props)
 
 
 def _become(state: Any, index: int, plugin: str, keep: tuple[str, ...], nested: bool = True) -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from torchtransient.axes import TimeAxis
 from torchtransient.render.census_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
+from torchtransient.render.films.choices import of_plugin
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
@@ -57,7 +59,7 @@ class Census:
     integrator: str | None = None
     max_depth: int | None = None
     film: str | None = None
-    film_axis: tuple[float, float, int] | None = None
+    film_axis: TimeAxis | None = None
     temporal_filter: str | None = None
     pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
@@ -156,11 +158,8 @@ def _note_film(census: Census, state: Any, node: Any) -> None:
     census.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
         census.temporal_filter = str(props["temporal_filter"])
-    if census.film == "transient_hdr_film":
-        start, width, bins = (
-            props.get("start_opl", 0.0), props.get("bin_width_opl", 0.003), props.get("temporal_bins", 2048),
-        )  # fmt: skip
-        census.film_axis = (float(start), float(width), int(bins))
+    kind = of_plugin(census.film)
+    census.film_axis = None if kind is None else kind.axis_in(props)
 
 
 def _note_integrator(census: Census, state: Any) -> None:

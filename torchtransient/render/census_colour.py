@@ -36,8 +36,8 @@ _TRANSPARENT = frozenset((
     "uniform", "rawconstant", "d65", "volume", "cube", "sphere", "rectangle", "disk", "cylinder", "obj", "ply",
     "serialized", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids",
     "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens", "radiancemeter", "irradiancemeter",
-    "nlos_capture_meter", "distant", "batch", "hdrfilm", "specfilm", "transient_hdr_film", "phasor_hdr_film",
-    "gated_hdr_film", "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent",
+    "nlos_capture_meter", "distant", "batch", "hdrfilm", "specfilm",
+    "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent",
     "gaussian", "mitchell", "catmullrom", "lanczos",
 ))  # fmt: skip
 _MEASURED_PLUGINS = {

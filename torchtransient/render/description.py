@@ -98,6 +98,35 @@ class Pixels:
         return bitmap
 
 
+def same_description(a: Description, b: Description) -> bool:
+    """Whether two descriptions are of one scene: equal values throughout, and files looked up in the same places."""
+    if isinstance(a, XmlDescription) or isinstance(b, XmlDescription):
+        return a == b
+    if not _same(a.tree, b.tree):
+        return False
+    return a.folder == b.folder or not _names_files(a.tree)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        # The order counts: it numbers the nameless children.
+        return list(a) == list(b) and all(_same(a[key], b[key]) for key in a)
+    if isinstance(a, Pixels) and isinstance(b, Pixels):
+        return a.srgb_gamma == b.srgb_gamma and _same(a.values, b.values)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        same_kind = isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and a.dtype == b.dtype
+        return same_kind and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+    return isinstance(a, bool) is isinstance(b, bool) and bool(a == b)
+
+
+def _names_files(tree: Mapping[str, Any]) -> bool:
+    """Whether a relative file name may stand anywhere in a scene dictionary."""
+    return any(
+        _names_files(value) if isinstance(value, Mapping) else isinstance(value, str) and "file" in key
+        for key, value in tree.items()
+    )
+
+
 @contextmanager
 def _search_path(folder: str) -> Iterator[None]:
     import mitsuba as mi

@@ -20,9 +20,10 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
-from torchtransient.interfaces import is_time_resolved
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.render.build import BuildOptions
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.choices import of_film
 from torchtransient.render.filter_override import temporal_filter
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
@@ -237,22 +238,24 @@ def _take(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, torch.Ten
     return steady, response
 
 
-def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> None:
-    """All sensors of a call must fill films of one shape. Raises ``SceneError``."""
+def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
+    """What the films of a call measure, which has to be the same in one shape. Raises ``SceneError``."""
+    found: dict[int, tuple[FilmChoice, tuple[int, ...], tuple[str, ...]]] = {}
     for item in items:
         if not 0 <= item.sensor < len(sensors):
             raise SceneError(f"sensors: the scene has {len(sensors)}, numbered from 0; got {item.sensor}.")
-        if not is_time_resolved(sensors[item.sensor].film()):
-            raise SceneError(
-                "the sensor's film has no time axis; use transient_hdr_film or phasor_hdr_film, or give "
-                "time_axis=tt.TimeAxis(...) or frequencies=tt.FrequencyAxis(...)."
-            )
-    shapes = {item.sensor: tuple(sensors[item.sensor].film().cube_shape()) for item in items}
-    if len(set(shapes.values())) > 1:
-        raise SceneError(
-            f"sensors: films rendered in one call must have one shape (H, W, T, C) or (H, W, F, 2 C), got {shapes}. "
-            "Use one TransientRenderer per sensor."
+        film = sensors[item.sensor].film()
+        found[item.sensor] = of_film(film), tuple(film.cube_shape()), tuple(film.channel_names())
+    if len(set(found.values())) > 1:
+        said = "; ".join(
+            f"sensor {sensor}: {choice} of shape {shape} and channels {'/'.join(channels)}"
+            for sensor, (choice, shape, channels) in found.items()
         )
+        raise SceneError(
+            f"sensors: films rendered in one call must measure the same in one shape, got {said}. Use one "
+            "TransientRenderer per sensor."
+        )
+    return next(iter(found.values()))[0]
 
 
 def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:

@@ -7,7 +7,7 @@ arrivals are listed one by one), or from the caller, and ``plan.reasons`` says f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from torchtransient import plugins
@@ -16,17 +16,24 @@ from torchtransient.errors import SceneError, TorchTransientError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
-from torchtransient.render.arguments import film_choice
+from torchtransient.render.arguments import film_asked_for
 from torchtransient.render.census import Census, take_census
-from torchtransient.render.plan_finder import Finder
+from torchtransient.render.effects import Effects
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.choices import all_films, planned
+from torchtransient.render.plan_finder import Draft, Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
+from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
 
+# Decisions of a draft that a plan takes over as they are.
+_OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
 
-@dataclass(frozen=True)
-class Plan:
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(Effects):
     """What :func:`plan` decided. Use it with :meth:`renderer` or ``tt.TransientRenderer(scene, effects=plan)``.
 
     ``film`` is "transient", "steady" (one bin), "phasor" or "gated". ``max_depth`` None keeps the scene's; so do
@@ -35,58 +42,47 @@ class Plan:
     that was planned for. ``str(plan)`` prints the reasons.
     """
 
-    scene: Scene = field(repr=False)
     outputs: tuple[str, ...]
-    variant: str
-    integrator: str
     film: str
-    max_depth: int | None
-    time_axis: TimeAxis | None
-    frequencies: FrequencyAxis | None
-    gates: tuple[Gate, ...] | None
-    pulse: Pulse | None
-    irf: Pulse | None
-    temporal_filter: str
     parameters: tuple[str, ...]
     reasons: tuple[str, ...]
     pilot: PilotReport | None = None
     sensor: int = 0
 
-    def renderer(self, **settings: Any) -> Any:
+    @property
+    def time_axis(self) -> TimeAxis | None:
+        """The time axis of the film, None to keep the scene's or for a film without one."""
+        return self._setting("axis")
+
+    @property
+    def frequencies(self) -> FrequencyAxis | None:
+        """The frequencies of a phasor film, None to keep the scene's."""
+        return self._setting("frequencies")
+
+    @property
+    def gates(self) -> tuple[Gate, ...] | None:
+        """The gates of a gated film, None to keep the scene's."""
+        return self._setting("gates")
+
+    def _setting(self, name: str) -> Any:
+        return None if self.film_choice is None else self.film_choice.attributes().get(name)
+
+    def renderer(self, **settings: Any) -> TransientRenderer:
         """A :class:`TransientRenderer` of the planned scene; ``settings`` are its other arguments and go before the
         plan's.
         """
-        from torchtransient.render.renderer import TransientRenderer
-
         settings.setdefault("parameters", self.parameters)
         settings.setdefault("sensors", self.sensor)
         return TransientRenderer(self.scene, effects=self, **settings)
-
-    def film_settings(
-        self, time_axis: TimeAxis | None, frequencies: Any, gates: Any, temporal_filter: str
-    ) -> tuple[TimeAxis | None, Any, Any, str]:
-        """What a renderer's film measures: its own arguments where it has some, else the plan's."""
-        if frequencies is not None or gates is not None:
-            return time_axis, frequencies, gates, temporal_filter
-        if time_axis is None:
-            time_axis, frequencies, gates = self.time_axis, self.frequencies, self.gates
-        # A planned box stays "auto": parameters that were not planned for may call for a slope.
-        if temporal_filter == "auto" and self.temporal_filter not in ("box", ""):
-            temporal_filter = self.temporal_filter
-        return time_axis, frequencies, gates, temporal_filter
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, as plain data for JSON."""
         names = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "reasons")
         plain: dict[str, Any] = {name: getattr(self, name) for name in names}
-        axis, frequencies = self.time_axis, self.frequencies
-        plain["time_axis"] = None if axis is None else {
-            "start_opl": axis.start_opl, "bin_width_opl": axis.bin_width_opl, "num_bins": axis.num_bins,
-        }  # fmt: skip
-        plain["frequencies"] = None if frequencies is None else list(frequencies.frequencies)
+        for kind in all_films():
+            plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
         for name in ("pulse", "irf"):
             plain[name] = None if getattr(self, name) is None else asdict(getattr(self, name))
-        plain["gates"] = None if self.gates is None else [asdict(gate) for gate in self.gates]
         found = {} if self.pilot is None else asdict(self.pilot)
         # A dark scene has no relative error, and JSON no number for that.
         plain["pilot"] = {key: None if value != value else value for key, value in found.items()} or None
@@ -118,6 +114,7 @@ def plan(
     pilot: bool = True,
     sensor: int = 0,
     seed: int = 0,
+    film: FilmChoice | None = None,
 ) -> Plan:
     """Choose how to render ``scene``, what :func:`load` takes.
 
@@ -134,8 +131,8 @@ def plan(
 
     Every choice can be taken over: ``variant``, ``integrator``, ``max_depth`` (a number, or "scene" for the scene's
     own), ``time_axis`` (an axis, or "scene"), ``num_bins`` and ``bin_width_opl`` of the axis to be found,
-    ``temporal_filter``, ``frequencies``, ``gates``. ``pulse`` and ``irf`` are handed to the renderer, and widen the
-    axis. A bin width that the scene's film has is kept.
+    ``temporal_filter``, ``frequencies``, ``gates``, or ``film``, an object that says the same. ``pulse`` and ``irf``
+    are handed to the renderer, and widen the axis. A bin width that the scene's film has is kept.
 
     The variant with which a scene was loaded only says on which device to compute. Depths and times hold for the
     description's values: parameters that change brightness or geometry very much call for another plan.
@@ -152,30 +149,31 @@ def plan(
     asked = choices.checked_outputs(outputs)
     census = census_of(loaded)
     device = loaded.variant.split("_")[0]
-    film = choices.choose_film(census, asked)
+    given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
+    if given is not None and given.has_axis:
+        if time_axis is not None:
+            raise SceneError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
+        time_axis = given.argument_value()
+    kind = planned(asked)
     best, notes = choices.choose_variant(census, asked, device, strict)
     tracer, more = choices.choose_integrator(census)
-    reasons = [_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, film.reason]
-    draft = Plan(
+    reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, kind.reason)
+    draft = Draft(
         scene=load(loaded, variant=variant or best.value),
-        outputs=asked,
         variant=variant or best.value,
         integrator=integrator or tracer.value,
-        film=film.value,
-        max_depth=None,
-        time_axis=None,
-        frequencies=_frequencies(frequencies, film.value, census),
-        gates=film_choice(None, None, gates)["gates"],
+        film=kind,
+        film_choice=choices.film_settings(kind, given, census.film),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
-        temporal_filter="",
         parameters=tuple(parameters),
-        reasons=tuple(reasons),
         sensor=sensor,
     )
-    _check_known(draft, gates, census)
-    finder = Finder(draft, census, tail, missed, seed)
-    return finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
+    _check_known(draft, reasons)
+    finder = Finder(draft, reasons, census, tail, missed, seed)
+    found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
+    kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
+    return Plan(outputs=asked, film=kind.name, **kept, **vars(found))
 
 
 def census_of(scene: Scene) -> Census:
@@ -210,28 +208,11 @@ def _taken(name: str, given: str | None, best: choices.Choice) -> str:
     return f"{name}: {given}, as asked for; the plan's own would have been {best.reason.removeprefix(f'{name}: ')}"
 
 
-def _frequencies(given: Any, film: str, census: Census) -> FrequencyAxis | None:
-    if given is None:
-        if film == "phasor" and census.film != choices.FILM_PLUGINS["phasor"]:
-            raise SceneError(
-                "tt.plan: phasors are asked for, and neither the film nor the call has frequencies. Give "
-                "frequencies=tt.FrequencyAxis(...), or make the film a phasor_hdr_film."
-            )
-        return None
-    if film != "phasor":
-        raise SceneError(f"tt.plan: frequencies have no effect on a {film} film; add 'phasor' to the outputs.")
-    return given if isinstance(given, FrequencyAxis) else FrequencyAxis(given)
-
-
-def _check_known(draft: Plan, gates: Any, census: Census) -> None:
+def _check_known(draft: Draft, reasons: Sequence[str]) -> None:
     """What the plan calls for has to be part of this installation."""
-    for kind, plugin in (("integrator", draft.integrator), ("film", choices.FILM_PLUGINS[draft.film])):
+    for kind, plugin in (("integrator", draft.integrator), ("film", draft.film.kind.plugin)):
         if plugins.kind_of(plugin) != kind:
             raise SceneError(
                 f"tt.plan: the plan calls for the {kind} {plugin!r}, which is not registered here:\n"
-                + "\n".join(draft.reasons)
+                + "\n".join(reasons)
             )
-    if gates is not None and draft.film != "gated":
-        raise SceneError(f"tt.plan: gates have no effect on a {draft.film} film; add 'gates' to the outputs.")
-    if draft.film == "gated" and gates is None and census.film != choices.FILM_PLUGINS["gated"]:
-        raise SceneError("tt.plan: gates are asked for, and neither the film nor the call has some. Give gates=...")

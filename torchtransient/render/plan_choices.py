@@ -8,15 +8,11 @@ from dataclasses import dataclass
 
 from torchtransient.errors import SceneError
 from torchtransient.render.census import Census, Finding
+from torchtransient.render.films.choice import FilmChoice, PlannedFilm
+from torchtransient.render.films.choices import all_films
 
-OUTPUTS = ("transient", "steady", "phasor", "stokes", "gates", "bands")
-# What a plan calls the films, and the plugin that measures it.
-FILM_PLUGINS = {
-    "transient": "transient_hdr_film",
-    "steady": "transient_hdr_film",
-    "phasor": "phasor_hdr_film",
-    "gated": "gated_hdr_film",
-}
+# What every film can show beside its own measurement.
+_OF_ANY_FILM = ("steady", "stokes", "bands")
 SURFACES, VOLUMES = "transient_path", "transient_prbvolpath"
 _ALIASES = {"transient_volpath": VOLUMES}
 # Depth of integrators that say nothing, as in Mitsuba's transient plugins.
@@ -40,28 +36,29 @@ def some(findings: Sequence[Finding], most: int = 3) -> str:
 def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     """The outputs as a tuple. Raises ``SceneError`` for unknown ones, and for two that need different films."""
     asked = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    unknown = [name for name in asked if name not in OUTPUTS]
-    if unknown or not asked:
-        raise SceneError(f"tt.plan: outputs are some of {', '.join(OUTPUTS)}; got {list(asked)}.")
-    films = [name for name in asked if name in ("transient", "phasor", "gates")]
+    of_films = tuple(kind.output for kind in all_films())
+    known = (*of_films, *_OF_ANY_FILM)
+    if not asked or any(name not in known for name in asked):
+        raise SceneError(f"tt.plan: outputs are some of {', '.join(known)}; got {list(asked)}.")
+    films = [name for name in asked if name in of_films]
     if len(set(films)) > 1:
         raise SceneError(
-            f"tt.plan: a film measures one of transient, phasor and gates, got {' and '.join(films)}; make a plan for "
-            "each."
+            f"tt.plan: a film measures one of {', '.join(of_films)}, got {' and '.join(films)}; make a plan for each."
         )
     return asked
 
 
-def choose_film(census: Census, outputs: Sequence[str]) -> Choice:
-    """steady, transient, phasor or gated."""
-    if "phasor" in outputs:
-        return Choice("phasor", "film: phasor, since phasors are asked for; no time axis is stored")
-    if "gates" in outputs:
-        return Choice("gated", "film: gated, since gates are asked for")
-    if "steady" in outputs and "transient" not in outputs:
-        return Choice("steady", "film: steady, one bin for all times, since nothing over time is asked for")
-    asked = "transients are" if "transient" in outputs else f"{outputs[0]} over time is"
-    return Choice("transient", f"film: transient, since {asked} asked for")
+def film_settings(film: PlannedFilm, given: FilmChoice | None, plugin: str | None) -> FilmChoice | None:
+    """The settings of the plan's film: those ``given`` by the call; None to keep those of the scene's film, which is a
+    ``plugin``, or to find them. Raises ``SceneError``.
+    """
+    if given is not None and type(given) is not film.kind:
+        raise SceneError(
+            f"tt.plan: {given.argument} have no effect on a {film.name} film; add {given.output!r} to the outputs."
+        )
+    if given is None and plugin != film.kind.plugin and film.kind.needed():
+        raise SceneError(film.kind.needed())
+    return given
 
 
 def choose_variant(census: Census, outputs: Sequence[str], device: str, strict: bool) -> tuple[Choice, list[str]]:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import SceneError
-from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.census import Census
+from torchtransient.render.films.choice import FilmChoice, PlannedFilm
 from torchtransient.render.parameters import needing_slope
 from torchtransient.render.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
-from torchtransient.render.scene_handle import load, unknown_key
+from torchtransient.render.scene_handle import Scene, load, unknown_key
 from torchtransient.render.slope import check_filter, filter_for
 from torchtransient.render.variant import active_variant
-
-if TYPE_CHECKING:
-    from torchtransient.render.plan import Plan
 
 PILOT_PATHS = 32768
 PILOT_PIXELS = 2048
@@ -33,23 +28,45 @@ def _share(part: float, error: float) -> str:
     return f"{part:.2g} +- {error:.1g} of the light" if part > 0 else "no light of the pilot run"
 
 
-def _seen(gates: Sequence[Gate], pulses: Sequence[Pulse]) -> tuple[Gate, ...]:
-    """Gates as light sees them that pulses spread."""
-    seen = tuple(gates)
-    for pulse in pulses:
-        seen = tuple(gate.spread(pulse) for gate in seen)
-    return seen
+@dataclass(frozen=True)
+class Draft:
+    """What is decided before a pilot run: the arguments of a :class:`~torchtransient.render.plan.Plan` but ``film``,
+    which is the plan's word and class of the film, while ``film_choice`` holds its settings, None to keep or find them.
+    """
+
+    scene: Scene
+    variant: str
+    integrator: str
+    film: PlannedFilm
+    film_choice: FilmChoice | None
+    pulse: Pulse | None
+    irf: Pulse | None
+    parameters: tuple[str, ...]
+    sensor: int
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is decided with a pilot run, or without one."""
+
+    max_depth: int | None
+    film_choice: FilmChoice | None
+    temporal_filter: str
+    reasons: tuple[str, ...]
+    pilot: PilotReport | None
 
 
 class Finder:
     """The decisions that may need a render: depth, window, temporal filter."""
 
-    def __init__(self, draft: Plan, census: Census, tail: float, missed: float, seed: int):
+    def __init__(
+        self, draft: Draft, reasons: tuple[str, ...], census: Census, tail: float, missed: float, seed: int
+    ):
         self.draft, self.census, self.tail, self.missed = draft, census, tail, missed
         self.seed = seed
         self.arrivals: Arrivals | None = None
         self.report: PilotReport | None = None
-        self.reasons: list[str] = list(draft.reasons)
+        self.reasons: list[str] = list(reasons)
         # How far before and after its arrival a pulse or an impulse response spreads light.
         self.spread = (0.0, 0.0)
 
@@ -60,33 +77,26 @@ class Finder:
         time_axis: TimeAxis | str | None,
         bins: tuple[int | None, float | None],
         temporal_filter: str | None,
-    ) -> Plan:
-        wants_axis = self.draft.film == "transient" and time_axis is None
+    ) -> Findings:
+        wants_axis = self.draft.film.kind.has_axis and not self.draft.film.all_times and time_axis is None
         if pilot and (max_depth is None or wants_axis):
             self._run()
         depth = self._depth(max_depth)
         axis = self._axis(time_axis, bins, depth)
-        chosen = self._filter(temporal_filter)
+        filter_name = self._filter(temporal_filter)
         if self.report is not None:
             self.reasons.append(self._pilot_line())
-        return replace(
-            self.draft,
-            max_depth=depth,
-            time_axis=axis,
-            temporal_filter=chosen,
-            reasons=tuple(self.reasons),
-            pilot=self.report,
-        )
+        film = self.draft.film_choice if axis is None else self.draft.film.kind.from_argument(axis)
+        return Findings(depth, film, filter_name, tuple(self.reasons), self.report)
 
     def _run(self) -> None:
         """The pilot run, without polarization: it costs most of the time and changes neither depth nor time."""
         started = time.perf_counter()
         variant = self.draft.variant.removesuffix("_polarized")
         scene = load(self.draft.scene, variant=variant)
-        gated = self.draft.film == "gated"
+        kind = self.draft.film.kind
         options = BuildOptions(
-            time_axis=None if gated else (0.0, 1.0, 1),
-            gates=self.draft.gates,
+            film=kind.film_of_pilot(self.draft.film_choice),
             merge=True,
             transient=True,
             integrator=self.draft.integrator,
@@ -103,15 +113,13 @@ class Finder:
                     f"sensor: the scene has {len(sensors)}, numbered from 0; got {self.draft.sensor}. Give an index."
                 )
             film = sensors[self.draft.sensor].film()
-            pulses = getattr(film, "pulses", [])
-            self.spread = tuple(sum(p.support_opl[side] for p in pulses) for side in (0, 1))
+            early, late = (sum(p.support_opl[side] for p in film.pulses) for side in (0, 1))
+            self.spread = (early, late)
             events = pilot_events(
                 built, built.integrator(), self.draft.sensor, seed=self.seed, pixels=PILOT_PIXELS, paths=PILOT_PATHS
             )
             scene.drop(options)
-        found = Arrivals(events)
-        if gated:
-            found = found.through(_seen(film.gates, pulses))
+        found = kind.seen(film, Arrivals(events))
         self.arrivals = found
         dark = found.dark
         self.report = PilotReport(
@@ -182,16 +190,18 @@ class Finder:
     def _axis(
         self, given: TimeAxis | str | None, bins: tuple[int | None, float | None], depth: int | None
     ) -> TimeAxis | None:
-        if self.draft.film in ("phasor", "gated"):
+        if not self.draft.film.kind.has_axis:
             if given is not None or bins != (None, None):
-                raise SceneError(f"tt.plan: a {self.draft.film} film has no time axis; leave time_axis and bins out.")
+                raise SceneError(
+                    f"tt.plan: a {self.draft.film.name} film has no time axis; leave time_axis and bins out."
+                )
             return None
         if isinstance(given, TimeAxis):
             self.reasons.append(f"time axis: {given}, as asked for")
             return given
         if given is not None and given != "scene":
             raise SceneError(f"time_axis: expected a tt.TimeAxis, 'scene' or None, got {given!r}.")
-        if self.draft.film == "steady":
+        if self.draft.film.all_times:
             last = _ALL_TIMES if self.arrivals is None or self.arrivals.dark else 4 * float(self.arrivals.opl.max())
             return TimeAxis(0.0, last, 1)
         if given == "scene" or self.arrivals is None or self.arrivals.dark:
@@ -211,7 +221,7 @@ class Finder:
                 f"tt.plan: the scene's film has no time axis, which would be taken {why}. Give "
                 "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...), or let a pilot run find one."
             )
-        axis = TimeAxis(*self.census.film_axis)
+        axis = self.census.film_axis
         self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
         return axis
 
@@ -220,7 +230,7 @@ class Finder:
         first, last = arrivals.window(depth or -1, self.missed)
         how = ""
         if width is None and num_bins is None and self.census.film_axis is not None:
-            width, how = self.census.film_axis[1], ", bin width of the scene's film"
+            width, how = self.census.film_axis.bin_width_opl, ", bin width of the scene's film"
             if (last - first) / width > MOST_BINS:
                 width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
         if self.spread != (0.0, 0.0):
@@ -239,9 +249,9 @@ class Finder:
     # --------------------------------------------------------------------------------------------- temporal filter
 
     def _filter(self, given: str | None) -> str:
-        if self.draft.film in ("phasor", "gated"):
+        if not self.draft.film.kind.has_filter:
             if given is not None:
-                raise SceneError(f"tt.plan: a {self.draft.film} film takes no temporal filter; leave it out.")
+                raise SceneError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
             return ""
         table = self.draft.scene.parameters() if self.draft.parameters else {}
         for key in self.draft.parameters:
@@ -259,7 +269,7 @@ class Finder:
             self.reasons.append(
                 f"temporal filter: {chosen}, since {moving[0]} changes path lengths and a {own} has no slope"
             )
-        elif self.draft.film != "steady":
+        elif not self.draft.film.all_times:
             why = "the scene's own" if self.census.temporal_filter else "since no parameter changes a path length"
             self.reasons.append(f"temporal filter: {own}, {why}")
         return chosen

@@ -6,9 +6,9 @@ from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
+from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 
 _NAMES = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
-FILMS = ("transient_hdr_film", "gated_hdr_film")
 PREFIXES = ("pulse", "irf")
 # Every property that a pulse can have in a film.
 PROPERTIES = tuple(prefix + suffix for prefix in PREFIXES for suffix in ("", *(f"_{name}" for name in _NAMES)))
@@ -27,9 +27,11 @@ def write_pulse(props: Any, prefix: str, pulse: Pulse | None) -> None:
     """Replace the pulse of a film node; None leaves the film its own. Raises ``SceneError`` for films without one."""
     if pulse is None:
         return
-    if props.plugin_name() not in FILMS:
+    kind = of_plugin(props.plugin_name())
+    if kind is None or not kind.takes_pulse:
+        spread = plugins_in_words([kind for kind in all_films() if kind.takes_pulse])
         raise SceneError(
-            f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, {', '.join(FILMS)} does. "
+            f"{prefix}: the film {props.plugin_name()!r} does not spread arrivals over time, {spread} does. "
             "Multiply a phasor by torchtransient.pulses.transform(pulse, frequencies) instead, or leave it out."
         )
     for name in _NAMES:

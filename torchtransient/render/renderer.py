@@ -20,7 +20,7 @@ from torchtransient.render.arguments import (
     Values,
     as_float,
     checked_grad_seed,
-    film_choice,
+    film_asked_for,
     fit_shape,
     mangle,
     mix_seed,
@@ -29,16 +29,12 @@ from torchtransient.render.arguments import (
 )
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
+from torchtransient.render.effects import Effects
 from torchtransient.render.engine import Item, RenderJob
-from torchtransient.render.output import (
-    RenderOutput,
-    RenderStats,
-    phasor_channels_first,
-    steady_channels_first,
-    transient_channels_first,
-)
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.films.layout import steady_channels_first
+from torchtransient.render.output import RenderOutput, RenderStats
 from torchtransient.render.parameters import ParameterInfo, needing_slope
-from torchtransient.render.plan import Plan
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
@@ -61,8 +57,9 @@ class TransientRenderer(nn.Module):
 
     ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
-    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films. At most one of the
-    three. ``max_depth``: replaces the integrator's. ``spp``,
+    place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films with ``out.gated``.
+    ``film``: the same as an object of ``torchtransient.render.films``, and how films of others are asked for. At most
+    one of the four. ``max_depth``: replaces the integrator's. ``spp``,
     ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
@@ -78,8 +75,8 @@ class TransientRenderer(nn.Module):
     and every filter has a slope then. After a render ``sensing.pulse.apply_pulse`` does the same to a transient.
 
     ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
-    have one shape. ``grad_seed``: None draws the samples of the derivative independently of the render (which makes
-    gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
+    measure the same in one shape. ``grad_seed``: None draws the samples of the derivative independently of the render
+    (which makes gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
 
     ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
     its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
@@ -100,7 +97,7 @@ class TransientRenderer(nn.Module):
         max_depth: int | None = None,
         temporal_filter: str = "auto",
         sensors: int | Sequence[int] | str = 0,
-        effects: Plan | str = "auto",
+        effects: Effects | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
         frequencies: FrequencyAxis | Sequence[float] | torch.Tensor | None = None,
@@ -108,13 +105,13 @@ class TransientRenderer(nn.Module):
         irf: Pulse | None = None,
         gates: Sequence[Gate] | None = None,
         steady: bool = True,
+        film: FilmChoice | None = None,
     ):
         super().__init__()
-        if isinstance(effects, Plan):
-            scene = load(scene, variant=effects.variant)
-            time_axis, frequencies, gates, temporal_filter = effects.film_settings(
-                time_axis, frequencies, gates, temporal_filter
-            )
+        film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
+        if isinstance(effects, Effects):
+            scene = effects.planned_scene(scene)
+            film, temporal_filter = effects.film_settings(film, temporal_filter)
             max_depth = effects.max_depth if max_depth is None else max_depth
             pulse, irf = pulse or effects.pulse, irf or effects.irf
         elif effects != "auto":
@@ -133,8 +130,8 @@ class TransientRenderer(nn.Module):
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
-        changes |= film_choice(time_axis, frequencies, gates)
-        changes |= {"steady": bool(steady), "integrator": effects.integrator if isinstance(effects, Plan) else None}
+        changes |= {"film": film, "steady": bool(steady)}
+        changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
         self._options = self._build_options(max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
@@ -163,28 +160,27 @@ class TransientRenderer(nn.Module):
         if not found:
             raise SceneError(f"{self.scene!r} has no sensor; add one.")
         self._sensors, self._stack_sensors = sensor_list(sensors, len(found))
-        engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
-        film = found[self._sensors[0]].film()
-        self.axis: TimeAxis | None = None
-        self.frequencies: FrequencyAxis | None = None
-        self.gates: tuple[Gate, ...] | None = None
-        self._cube_shape = tuple(film.cube_shape())
-        self._channels = tuple(film.channel_names())
+        self.film = engine.check_items(found, [Item(0, sensor, 0, 0) for sensor in self._sensors])
+        films = [found[sensor].film() for sensor in self._sensors]
+        self._cube_shape = tuple(films[0].cube_shape())
+        self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
-        self._scene_filter, self._pulsed = "", False
-        self._pulsed = bool(getattr(film, "pulses", ()))
-        if film.measures != "transient":
-            if film.measures == "phasor":
-                self.frequencies = FrequencyAxis(tuple(film.frequencies.tolist()), film.start_opl)
-            else:
-                self.gates = film.gates
+        self._pulsed = all(film.pulses for film in films)
+        self._scene_filter = films[0].temporal_filter
+        if not self.film.has_filter:
             if self.temporal_filter != "auto":
                 raise SceneError(
-                    f"temporal_filter: a {film.measures} film has none, expected 'auto', got {self.temporal_filter!r}."
+                    f"temporal_filter: a {self.film.noun} has none, expected 'auto', got {self.temporal_filter!r}."
                 )
             return
-        self.axis = TimeAxis(film.start_opl, film.bin_width_opl, film.temporal_bins)
-        self._scene_filter = getattr(built.scene.integrator(), "temporal_filter", "") or film.temporal_filter
+        of_integrator = getattr(built.scene.integrator(), "temporal_filter", "")
+        self._scene_filter = of_integrator or self._scene_filter
+        names = sorted({film.temporal_filter for film in films})
+        if self.temporal_filter == "auto" and not of_integrator and len(names) > 1:
+            raise SceneError(
+                f"temporal_filter: the films of sensors {list(self._sensors)} have different ones, {', '.join(names)}. "
+                "Say which, for instance temporal_filter='box', or use one TransientRenderer per sensor."
+            )
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
         slots = self.scene.slots(self._keys, self._options).slots
@@ -206,6 +202,21 @@ class TransientRenderer(nn.Module):
     # ------------------------------------------------------------------------------------------------------ use
 
     @property
+    def axis(self) -> TimeAxis | None:
+        """The time axis; None for a film without one."""
+        return self.film.attributes().get("axis")
+
+    @property
+    def frequencies(self) -> FrequencyAxis | None:
+        """The frequencies of a phasor film, else None."""
+        return self.film.attributes().get("frequencies")
+
+    @property
+    def gates(self) -> tuple[Gate, ...] | None:
+        """The gates of a gated film, else None."""
+        return self.film.attributes().get("gates")
+
+    @property
     def values(self) -> Mapping[str, nn.Parameter]:
         """The parameters under their Mitsuba keys."""
         return Values(self, self._names)
@@ -225,7 +236,7 @@ class TransientRenderer(nn.Module):
             raise SceneError(
                 f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
             )
-        if self.axis is None and temporal_filter not in (None, "auto"):
+        if not self.film.has_filter and temporal_filter not in (None, "auto"):
             raise SceneError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
@@ -293,11 +304,9 @@ class TransientRenderer(nn.Module):
         leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
         stats, components = self._stats(job), stokes_components(self.scene.variant)
         steady = steady_channels_first(steady, leading, components)
-        if self.frequencies is not None:
-            phasor = phasor_channels_first(response, leading, components)
-            return RenderOutput(None, steady, phasor, None, stats, self.frequencies, self._channels)
-        transient = transient_channels_first(response, leading, components)
-        return RenderOutput(transient, steady, None, self.axis, stats, channels=self._channels, gates=self.gates)
+        return RenderOutput.of(
+            self.film, steady, self.film.channels_first(response, leading, components), stats, self._channels
+        )
 
     def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
@@ -379,7 +388,4 @@ class TransientRenderer(nn.Module):
     def extra_repr(self) -> str:
         """Shown by ``print(renderer)``."""
         keys, used = list(self._keys), self.effective_filter
-        measured = f"axis={self.axis}, temporal_filter={used!r}" if self.axis else f"frequencies={self.frequencies}"
-        if self.gates is not None:
-            measured = f"gates={len(self.gates)}"
-        return f"{self.scene!r}, parameters={keys}, {measured}"
+        return f"{self.scene!r}, parameters={keys}, {self.film.describe(used)}"

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.render.build import BuildOptions, BuiltScene, build
-from torchtransient.render.description import Description, describe_dict, describe_xml
+from torchtransient.render.description import Description, describe_dict, describe_xml, same_description
 from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table
 from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
 
@@ -102,6 +102,10 @@ class Scene:
         if wanted not in tables:
             tables[wanted] = SlotTable(built, wanted)
         return tables[wanted]
+
+    def same_description(self, other: Scene) -> bool:
+        """Whether both describe one scene, in whichever variants."""
+        return same_description(self._description, other._description)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}

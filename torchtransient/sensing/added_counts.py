@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.sensing.draws import WHOLE_FLOAT32, fast_poisson
-from torchtransient.sensing.layout import TIME
+from torchtransient.sensing.layout import TIME, check_tensor
 from torchtransient.sensing.policies import record_score
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.shot_noise import poisson_log_prob
@@ -56,7 +56,7 @@ class AddedCounts(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            given = x.detach()
+            given = check_tensor(x, type(self).__name__).detach()
             counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
             events = self.share() * self._total(counts)
             if not is_whole(counts) or events > _MOST_EVENTS * counts.numel():

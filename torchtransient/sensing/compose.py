@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import ItofCorrelation
+from torchtransient.sensing.layout import not_a_transient
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
 
@@ -83,6 +84,12 @@ class Compose(Sensor):
     def _opened(self, output: Any) -> tuple[Tensor, int]:
         """The tensor of a renderer's output, and how many stages it has passed already."""
         transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
+        if getattr(output, "gates", None) is not None:
+            raise ShapeError(
+                f"Compose: expected a transient over time, got the images of {len(output.gates)} time gates, which are "
+                "no bins. Render with time_axis=... and gate the transient with GatedIntegration; or, for stages that "
+                "come after a gate, give the tensor itself: chain(out.gated)."
+            )
         if isinstance(transient, Tensor):
             self.check_axis(output.axis)
             return transient, 0
@@ -94,11 +101,14 @@ class Compose(Sensor):
                 raise ShapeError(f"Compose: expected ItofCorrelation as the first stage, got {type(first).__name__}.")
             return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), 1
         raise ShapeError(
-            f"Compose: expected a tensor (..., C, T, H, W) or the output of a renderer, got {type(output).__name__}."
+            "Compose: expected a tensor (..., C, T, H, W) or the output of a renderer with a transient, got "
+            f"{not_a_transient(output)}"
         )
 
     def check_axis(self, axis: TimeAxis) -> None:
-        """UnitError when a stage was made for other bins than those of ``axis``."""
+        """UnitError when a stage was made for other bins than those of ``axis``, or without an axis."""
+        if not isinstance(axis, TimeAxis):
+            raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
         for name, module in self.named_modules():
             if not isinstance(module, Sensor):
                 continue  # a measured response has bins of its own

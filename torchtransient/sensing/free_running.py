@@ -21,7 +21,7 @@ from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
 from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state, whole_and_part
-from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_transient
+from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_tensor, check_transient
 from torchtransient.sensing.policies import GradPolicy, record_score
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.sensor import RandomSensor
@@ -192,14 +192,14 @@ class FreeRunningSPAD(RandomSensor):
         """One draw of the non-paralyzable detector, step by step."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s.detach()))
-            rate = check_rates(x.detach().double(), "FreeRunningSPAD")
+            rate = check_rates(check_tensor(x, "FreeRunningSPAD").detach().double(), "FreeRunningSPAD")
             return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.kind == "non_paralyzable":
             return self._path(x, generator).counts.to(x.dtype)
         with torch.no_grad():
-            p = self.probabilities(check_rates(x.detach().double(), "FreeRunningSPAD"))
+            p = self.probabilities(check_rates(check_tensor(x, "FreeRunningSPAD").detach().double(), "FreeRunningSPAD"))
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

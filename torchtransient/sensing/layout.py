@@ -39,14 +39,34 @@ def without_autocast(
     return run
 
 
+def check_tensor(x: object, where: str) -> Tensor:
+    """`x` when it is a tensor, else ShapeError: a renderer's output, or the transient that a film does not measure."""
+    if not isinstance(x, Tensor):
+        raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {not_a_transient(x)}")
+    return x
+
+
 def check_transient(x: Tensor, where: str) -> Tensor:
     """`x` when it is a floating tensor (..., C, T, H, W), else ShapeError or UnitError."""
-    if not isinstance(x, Tensor) or x.ndim < 4:
-        shape = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
-        raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {shape}. Add the missing dimensions.")
+    if check_tensor(x, where).ndim < 4:
+        raise ShapeError(
+            f"{where}: expected a tensor (..., C, T, H, W), got {tuple(x.shape)}. Add the missing dimensions."
+        )
     if not x.is_floating_point():
         raise UnitError(f"{where}: expected a floating dtype, got {x.dtype}. Convert with .float().")
     return x
+
+
+def not_a_transient(x: object) -> str:
+    """What was given instead of a transient, and what to do: the end of a message."""
+    if x is None:
+        return (
+            "None, which is the transient of a render with a phasor or gated film. Render with time_axis=...; gated "
+            "images (out.gated) are no bins, and only what follows a gate may take them."
+        )
+    if hasattr(x, "transient"):
+        return f"{type(x).__name__}. Give its tensor, out.transient, or put the sensor into Compose([...])."
+    return f"{type(x).__name__}."
 
 
 def check_number(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
+from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_tensor, check_transient
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -186,6 +186,7 @@ class PhotonBudget(Sensor):
 
     def expected(self, x: Tensor) -> Tensor:
         dark = self.dark_count_rate_hz
+        check_tensor(x, "PhotonBudget")
         if any(have not in (1, wanted) for have, wanted in zip(dark.shape, x.shape[-2:], strict=False)):
             raise ShapeError(
                 f"PhotonBudget: expected an image {tuple(dark.shape)} as in dark_count_rate_hz, got "

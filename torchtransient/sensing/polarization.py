@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import check_number, without_autocast
+from torchtransient.sensing.layout import check_number, check_tensor, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -248,7 +248,7 @@ def _extinction(extinction_ratio: float, where: str) -> float:
 
 
 def _check_stokes(stokes: Tensor, where: str) -> None:
-    if stokes.ndim < 5 or stokes.shape[TRANSIENT_DIM] != 4 or not stokes.dtype.is_floating_point:
+    if check_tensor(stokes, where).ndim < 5 or stokes.shape[TRANSIENT_DIM] != 4 or not stokes.dtype.is_floating_point:
         raise ShapeError(
             f"{where}: expected Stokes vectors (..., 4, C, T, H, W), got {stokes.dtype} {tuple(stokes.shape)}. Give "
             "a steady image a T of one: stokes.unsqueeze(-3)."

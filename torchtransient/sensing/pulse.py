@@ -14,7 +14,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.pulses import Pulse, cumulative_of_sum
-from torchtransient.sensing.layout import without_autocast
+from torchtransient.sensing.layout import check_tensor, without_autocast
 
 # Longer kernels are applied by a Fourier transform in double precision, whose rounding stays 1e-12 below the largest
 # bin where one in single precision would drown the late ones.
@@ -66,7 +66,7 @@ def apply_pulse(transient: Tensor, axis: TimeAxis, *pulses: Pulse, keep: TimeAxi
     Differentiable in ``transient``, in both modes and twice. Raises ShapeError where T is not that of ``axis``, or
     ``keep`` does not consist of its bins; UnitError without a pulse or for whole numbers.
     """
-    if transient.ndim < 3 or transient.shape[-3] != axis.num_bins:
+    if check_tensor(transient, "apply_pulse").ndim < 3 or transient.shape[-3] != axis.num_bins:
         raise ShapeError(
             f"apply_pulse: expected (..., T, H, W) with T = {axis.num_bins}, got {tuple(transient.shape)}."
         )

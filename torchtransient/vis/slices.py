@@ -14,7 +14,7 @@ from torchtransient.errors import ShapeError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
 from torchtransient.vis.overview import moments_of_arrival
-from torchtransient.vis.sources import Source, transient_of
+from torchtransient.vis.sources import Source, images_of, transient_of
 from torchtransient.vis.stamps import moment
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
@@ -80,7 +80,7 @@ def frame_grid(
     `source`, `axis` and `curve` as in `frames`. Writes the figure when `path` is given. Raises ShapeError for a bin
     outside of the axis or no bins, UnitError and StorageError.
     """
-    cube, axis = transient_of(source, axis, "frame_grid")
+    cube, axis, word = images_of(source, axis, "frame_grid")
     total = cube.shape[1]
     if bins is None:
         shares = tuple(float(s) for s in (np.arange(max(count, 0)) + 0.5) / max(count, 1))
@@ -93,7 +93,7 @@ def frame_grid(
     figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
     for panel, index in zip(panels, bins, strict=False):
         panel.imshow(tone_map(cube[:, index], exposure, curve).numpy(), interpolation="nearest")
-        panel.set_title(moment(axis, index, total).replace("   ", " = "), fontsize=8)
+        panel.set_title(moment(axis, index, total, word).replace("   ", " = "), fontsize=8)
     if title:
         figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, "frame_grid")
@@ -114,7 +114,7 @@ def histogram(
     logarithmic scale. `source` and `axis` as in `frames`, with any number of channels. Writes the figure when `path` is
     given. Raises ShapeError without pixels, or for one outside of the image, and StorageError.
     """
-    cube, axis = transient_of(source, axis, "histogram", any_channels=True)
+    cube, axis, word = images_of(source, axis, "histogram", any_channels=True)
     height, width = cube.shape[2:]
     if not len(pixels):
         raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
@@ -132,12 +132,12 @@ def histogram(
         for curve, colour in zip(shown, colours, strict=True):
             panel.stairs(curve, edges, baseline=None if log else 0, color=colour, linewidth=1.0)
         panel.set_title(f"row {row}, column {column}", fontsize=9, loc="left")
-        panel.set_ylabel("radiance in a bin")
+        panel.set_ylabel(f"radiance in a {word}")
         if log and bool((curves > 0).any()):
             panel.set_yscale("log")
         panel.margins(x=0)
         panel.grid(True, color="0.9", linewidth=0.6)
-    panels[-1].set_xlabel("bin" if axis is None else "optical path length (m)")
+    panels[-1].set_xlabel(word if axis is None else "optical path length (m)")
     if axis is not None:
         top = panels[0].secondary_xaxis("top", functions=(_to_nanoseconds, _to_metres))
         top.set_xlabel("time (ns)")

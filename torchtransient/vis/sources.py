@@ -19,6 +19,7 @@ from torchtransient.errors import ShapeError, StorageError, TorchTransientError
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
 _HDF5 = (".h5", ".hdf5")
+_TENSORS = ("transient", "steady", "phasor", "gated")
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Loaded:
     phasor: Tensor | None = None
     axis: TimeAxis | None = None
     frequencies: tuple[float, ...] | None = None
+    gated: Tensor | None = None
 
 
 def transient_of(
@@ -43,7 +45,30 @@ def transient_of(
     for a file that cannot be read.
     """
     loaded = _load(source, "transient")
+    if loaded.transient is None and loaded.gated is not None:
+        raise ShapeError(
+            f"{who}: expected a transient (C, T, H, W), and the source holds {loaded.gated.shape[-3]} images of time "
+            "gates, which are no bins. Draw them with frames, frame_grid or histogram, or render with time_axis=..."
+        )
     cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
+    return _checked_cube(cube, axis or loaded.axis, who, any_channels)
+
+
+def images_of(
+    source: Source, axis: TimeAxis | None = None, who: str = "picture", any_channels: bool = False
+) -> tuple[Tensor, TimeAxis | None, str]:
+    """As :func:`transient_of`, and also the images of time gates (C, G, H, W); what one of them is: "bin" or "gate"."""
+    loaded = _load(source, "transient")
+    if loaded.transient is not None or loaded.gated is None:
+        return *transient_of(loaded, axis, who, any_channels), "bin"
+    if axis is not None:
+        raise ShapeError(f"{who}: images of time gates have no time axis, got {axis}; leave it out.")
+    return *_checked_cube(loaded.gated, None, who, any_channels), "gate"
+
+
+def _checked_cube(
+    cube: Tensor, axis: TimeAxis | None, who: str, any_channels: bool
+) -> tuple[Tensor, TimeAxis | None]:
     if cube.ndim == 5 and cube.shape[0] == 4:
         cube = cube[0]
     if cube.ndim != 4 or cube.numel() == 0 or not (any_channels or cube.shape[0] in (1, 3)):
@@ -51,7 +76,6 @@ def transient_of(
             f"{who}: expected a transient (C, T, H, W) or (4, C, T, H, W) with C = 1 or 3, got {tuple(cube.shape)}; of "
             "a batch, choose one, and of many channels, choose one or three."
         )
-    axis = axis or loaded.axis
     if axis is not None and axis.num_bins != cube.shape[1]:
         raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the transient {cube.shape[1]}.")
     return cube, axis
@@ -74,7 +98,7 @@ def steady_of(source: Source, who: str = "picture") -> Tensor:
     loaded = _load(source, "")
     image = loaded.steady
     if image is None:
-        image = transient_of(source, None, who)[0].sum(1)
+        image = images_of(loaded, None, who)[0].sum(1)
     if image.ndim == 4 and image.shape[0] == 4:
         image = image[0]
     if image.ndim != 3 or image.shape[0] not in (1, 3) or image.numel() == 0:
@@ -88,7 +112,7 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
     no such bin.
     """
     loaded = _load(source, "")
-    cube, image = loaded.transient, loaded.steady
+    cube, image = loaded.gated if loaded.transient is None else loaded.transient, loaded.steady
     if image is not None and (cube is None or frame is None) and image.ndim == 4 and image.shape[0] == 4:
         result = image
     elif cube is not None and cube.ndim == 5 and cube.shape[0] == 4:
@@ -144,12 +168,13 @@ def as_tensor(value: Any, who: str) -> Tensor:
 
 def _refuse_batch(source: Any) -> None:
     """Four entries of a batch must not pass for four components of polarized light, where the source can tell."""
-    transient, polarized = getattr(source, "transient", None), getattr(source, "polarized", None)
+    given = [getattr(source, name, None) for name in ("transient", "gated")]
+    cube, polarized = next((c for c in given if c is not None), None), getattr(source, "polarized", None)
     if polarized is None and isinstance(getattr(source, "metadata", None), dict):
         polarized = _variant_is_polarized(source.metadata)
-    if polarized is False and transient is not None and transient.ndim > 4:
+    if polarized is False and cube is not None and cube.ndim > 4:
         raise ShapeError(
-            f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(transient.shape)}; "
+            f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(cube.shape)}; "
             "choose one entry."
         )
 
@@ -182,12 +207,12 @@ def _load(source: Source, name: str) -> Loaded:
         source = read_file(Path(source))
     if isinstance(source, Loaded):
         return source
-    if hasattr(source, "transient") or hasattr(source, "phasor"):
+    if any(hasattr(source, name) for name in ("transient", "phasor", "gated")):
         _refuse_batch(source)
-        given = [(key, getattr(source, key, None)) for key in ("transient", "steady", "phasor")]
+        given = {key: getattr(source, key, None) for key in _TENSORS}
         known = frequencies_of(getattr(source, "frequencies", None))
-        transient, steady, phasor = (None if value is None else as_tensor(value, key) for key, value in given)
-        return Loaded(transient, steady, phasor, axis=getattr(source, "axis", None), frequencies=known)
+        tensors = {key: as_tensor(value, key) for key, value in given.items() if value is not None}
+        return Loaded(**tensors, axis=getattr(source, "axis", None), frequencies=known)
     tensor = as_tensor(source, "picture")
     if name == "phasor":
         return Loaded(phasor=tensor)
@@ -199,7 +224,7 @@ def _load(source: Source, name: str) -> Loaded:
 def read_file(path: Path) -> Any:
     """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
 
-    Of a result, the names `transient`, `steady`, `phasor` and the numbers of the axis are read, each if it is
+    Of a result, the names `transient`, `steady`, `phasor`, `gated` and the numbers of the axis are read, each if it is
     there. Raises StorageError for a missing, damaged or unknown file.
     """
     if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
@@ -213,23 +238,18 @@ def read_file(path: Path) -> Any:
         axis = None
         if "num_bins" in values:
             axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
-        arrays = {key: as_tensor(values[key], key) for key in ("transient", "steady", "phasor") if key in values}
+        if "gates" in values and "gated" not in values:
+            values["gated"] = values.pop("transient")  # as files of earlier versions call it
+        arrays = {key: as_tensor(values[key], key) for key in _TENSORS if key in values}
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, TorchTransientError):
             raise
         raise StorageError(f"picture: '{path}' cannot be read: {error}.") from error
-    if (cube := arrays.get("transient")) is not None and cube.ndim > 4 and "metadata" in values:
-        metadata = json.loads(str(values["metadata"]))
-        _refuse_batch(SimpleNamespace(transient=cube, metadata=metadata))
+    if any(arrays[key].ndim > 4 for key in ("transient", "gated") if key in arrays) and "metadata" in values:
+        _refuse_batch(SimpleNamespace(**arrays, metadata=json.loads(str(values["metadata"]))))
     if not arrays:
-        raise StorageError(f"picture: '{path}' holds none of transient, steady and phasor.")
-    return Loaded(
-        transient=arrays.get("transient"),
-        steady=arrays.get("steady"),
-        phasor=arrays.get("phasor"),
-        axis=axis,
-        frequencies=frequencies_of(values.get("frequencies_per_metre")),
-    )
+        raise StorageError(f"picture: '{path}' holds none of {', '.join(_TENSORS[:-1])} and {_TENSORS[-1]}.")
+    return Loaded(**arrays, axis=axis, frequencies=frequencies_of(values.get("frequencies_per_metre")))
 
 
 def _npz_values(path: Path) -> dict[str, NDArray[Any]]:

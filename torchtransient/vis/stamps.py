@@ -13,10 +13,13 @@ from torchtransient.vis.files import Image
 INK, DIM, GROUND = (235, 235, 235), (95, 95, 95), (20, 20, 20)
 
 
-def moment(axis: TimeAxis | None, index: int, bins: int) -> str:
-    """What a stamp says about a bin: its centre in metres and nanoseconds, or its number when no axis is known."""
+def moment(axis: TimeAxis | None, index: int, bins: int, word: str = "bin") -> str:
+    """What a stamp says about a bin: its centre in metres and nanoseconds, or its number when no axis is known.
+
+    `word`: what an entry is without an axis, "gate" for those of a gated film.
+    """
     if axis is None:
-        return f"bin {index} of {bins}"
+        return f"{word} {index} of {bins}"
     opl = axis.start_opl + (index + 0.5) * axis.bin_width_opl
     return f"{_digits(opl, axis.bin_width_opl)} m   {_digits(*_nanoseconds(opl, axis.bin_width_opl))} ns"
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.vis.files import Image, enlarge, to_bytes
-from torchtransient.vis.sources import Source, transient_of
+from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.stamps import moment, with_strip
 from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
 from torchtransient.vis.video_file import check_video, write_video
@@ -54,12 +54,13 @@ def frames(
     """The frames of a transient under one exposure, one after the other in time.
 
     `source`: a transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, or a file; `axis` for sources that
-    have none. `exposure` multiplies the radiance of a bin (None: 99 % of the lit pixels of all frames are below
-    white); `curve` as in `tone_map`. `accumulate` shows the light that has arrived so far. `every` adds up that many
-    bins to a frame. `scale` enlarges pixels (None: small pictures to some 320 pixels). `stamp` puts the time under
-    each frame. Pixels that are not finite are magenta. Raises ShapeError and UnitError.
+    have none. The images of a gated film are frames too, in the order of its gates. `exposure` multiplies the radiance
+    of a bin (None: 99 % of the lit pixels of all frames are below white); `curve` as in `tone_map`. `accumulate` shows
+    the light that has arrived so far. `every` adds up that many bins to a frame. `scale` enlarges pixels (None: small
+    pictures to some 320 pixels). `stamp` puts the time under each frame. Pixels that are not finite are magenta. Raises
+    ShapeError and UnitError.
     """
-    cube, axis = transient_of(source, axis, "frames")
+    cube, axis, word = images_of(source, axis, "frames")
     if every < 1 or int(every) != every:
         raise ShapeError(f"frames: expected every to be a whole number of at least 1, got {every!r}.")
     bins, (height, width) = cube.shape[1], cube.shape[2:]
@@ -74,7 +75,7 @@ def frames(
         light = cube[:, first:last].sum(1) if running is None else running.until(last)
         shown = enlarge(to_bytes(tone_map(light, exposure, curve).numpy()), factor)
         middle = (first + last - 1) // 2 if running is None else last - 1
-        return with_strip(shown, moment(axis, middle, bins), last / bins) if stamp else shown
+        return with_strip(shown, moment(axis, middle, bins, word), last / bins) if stamp else shown
 
     return Frames(count, make)
 

@@ -1,0 +1,54 @@
+"""What a plan hands to a renderer."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass, field
+from typing import Any
+
+from torchtransient.errors import SceneError
+from torchtransient.pulses import Pulse
+from torchtransient.render.films.choice import FilmChoice
+from torchtransient.render.scene_handle import Scene, load
+
+
+@dataclass(frozen=True)
+class Effects(abc.ABC):
+    """The decisions about one scene that a renderer takes over where its own arguments do not say otherwise.
+
+    ``film_choice``, ``max_depth``, ``pulse`` and ``irf`` None keep what the scene has; ``temporal_filter`` is empty for
+    films without one.
+    """
+
+    scene: Scene = field(repr=False)
+    variant: str
+    integrator: str
+    film_choice: FilmChoice | None
+    max_depth: int | None
+    pulse: Pulse | None
+    irf: Pulse | None
+    temporal_filter: str
+
+    @abc.abstractmethod
+    def __str__(self) -> str:
+        """The reasons of the decisions."""
+
+    def planned_scene(self, scene: Any) -> Scene:
+        """A scene in the variant of the plan. Raises ``SceneError`` for one that was not planned for."""
+        given = load(scene)
+        if not given.same_description(self.scene):
+            raise SceneError(
+                f"effects: the plan was made for {self.scene!r}, got {given!r}, which is another scene: its depth, "
+                "window and variant would be those of the other. Make a plan of this one with tt.plan(scene, ...), or "
+                "take plan.renderer()."
+            )
+        return load(given, variant=self.variant)
+
+    def film_settings(self, film: FilmChoice | None, temporal_filter: str) -> tuple[FilmChoice | None, str]:
+        """Film and temporal filter of a renderer: its own where it has some, else the plan's."""
+        film = self.film_choice if film is None else film
+        # A planned box stays "auto": parameters that were not planned for may call for a slope.
+        takes_it = film is None or film.has_filter
+        if temporal_filter == "auto" and takes_it and self.temporal_filter not in ("box", ""):
+            temporal_filter = self.temporal_filter
+        return film, temporal_filter

@@ -1,0 +1,30 @@
+"""From a film's memory order to torch's: channels first, behind batch and sensors."""
+
+from __future__ import annotations
+
+import torch
+
+
+def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """From the film's (H, W, C), with or without one dimension of items, to (C, H, W) behind ``leading``.
+
+    ``components``: Stokes components that the film's channels are made of; more than one come before C.
+    """
+    steady = steady.reshape(*leading, *steady.shape[-3:])
+    return _stokes_first(steady.movedim(-1, -3), -3, components)
+
+
+def cube_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """From the film's (H, W, T, C), with or without one dimension of items, to (C, T, H, W) behind ``leading``."""
+    cube = cube.reshape(*leading, *cube.shape[-4:])
+    return _stokes_first(cube.movedim((-1, -2), (-4, -3)), -4, components)
+
+
+def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """From the film's (H, W, F, 2 C) of real and imaginary parts to complex (C, F, H, W) behind ``leading``."""
+    pairs = cube.reshape(*leading, *cube.shape[-4:-1], -1, 2)
+    return _stokes_first(torch.view_as_complex(pairs).movedim((-1, -2), (-4, -3)), -4, components)
+
+
+def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:
+    return tensor if components == 1 else tensor.unflatten(channel_dim, (components, -1))
