@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import product, scattered
+from torchtransient.plugins.polarized import product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, distance, solid_angle_over_area
@@ -55,7 +55,8 @@ class OwnPointLight(Connection):
         out = direction_to(si.p, p, lit, fixed)
         towards = world.scattering.evaluate(world, vertex, out, lit)
         length = distance(si.p, p, lit)
-        value = scattered(towards.value, vertex.turn) * (self.intensity / dr.square(length)) * r.get("T", 1)
+        value = scatter_unpolarized(towards.value, vertex.rotation) * r.get("T", 1)
+        value *= self.intensity / dr.square(length)
         end = Local(p=p, d=fixed, far=mi.Bool(False), ahead=False)
         value *= world.segment.attached_transmittance(world, vertex, end, lit)
         slope = vertex.scattered_slope

@@ -30,14 +30,7 @@ def intensity(light):
     return light[0] if mi.is_polarized else light
 
 
-def transported(β, weight, x):
-    """``β x`` scaled by ``weight``, where ``x`` is light or a throughput."""
-    if not mi.is_polarized:
-        return β * weight * x
-    return product(β, x) * weight
-
-
-def faded(β, T):
+def attenuated(β, T):
     """A throughput times a spectrum ``T`` that acts on all of its components alike."""
     if not mi.is_polarized:
         return β * T
@@ -53,84 +46,23 @@ def product(a, b):
     return mi.SpectrumEntry(*[sum(a[i, k] * b[k] for k in range(1, 4)) + a[i, 0] * b[0] for i in range(4)])
 
 
-def column(matrix):
+def first_column(matrix):
     """What a throughput makes of unpolarized light of power one; Mitsuba's emitters emit no other."""
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[i, 0] for i in range(4)])
 
 
-# ------------------------------------------------------------------------------------------------------- adjoints
-#
-# Every event of a path has its own adjoint A, a vector in polarized variants, and the throughput stands between it and
-# the light f: A^T β f. What lies beyond a vertex is therefore kept as the matrix f A^T per unit throughput, so that the
-# number is trace(β f A^T); no matrix is ever inverted.
-
-
-def matched(A, light):
-    """``f A^T``: an event and its adjoint without the throughput. ``light`` may be a spectrum: unpolarized emission."""
-    if not mi.is_polarized:
-        return A * light
-    if isinstance(light, mi.SpectrumEntry):
-        return mi.Spectrum(*[light[i] * A[j] for i in range(4) for j in range(4)])
-    none = mi.UnpolarizedSpectrum(0)
-    return mi.Spectrum(*[light * A[j] for j in range(4)], *[none] * 12)
-
-
-def traced(β, beyond):
-    """The number that events contribute: ``trace(β S)`` over the matrices of :func:`matched`, summed over colours."""
-    return dr.sum(traced_colours(β, beyond))
-
-
-def traced_colours(β, beyond):
-    """``traced`` for each colour."""
-    if not mi.is_polarized:
-        return β * beyond
-    return sum(β[i, k] * beyond[k, i] for i in range(4) for k in range(4))
-
-
-def traced_attached(β, A_e, Le, A_n, f, W, S):
-    """``traced`` of emission, next-event estimation and scattering ``W`` into ``S``, attached to ``Le``, ``f``, ``W``.
-
-    What stands before an attached factor is multiplied out first: that keeps the derivatives' graph small.
-    """
-    if not mi.is_polarized:
-        return dr.sum(β * (A_e * Le + A_n * f + W * S))
-    before_e = sum(β[i, 0] * A_e[i] for i in range(4))
-    before_n = [sum(β[i, k] * A_n[i] for i in range(4)) for k in range(4)]
-    before_w = S @ β
-    total = before_e * Le
-    for k in range(4):
-        total += before_n[k] * f[k]
-        for j in range(4):
-            total += before_w[j, k] * W[k, j]
-    return dr.sum(total)
-
-
-def whole(beyond):
-    """``traced`` for a throughput of one."""
-    if not mi.is_polarized:
-        return dr.sum(beyond)
-    return dr.sum(sum(beyond[i, i] for i in range(4)))
-
-
-def turning(beyond):
-    """Derivative of :func:`traced` by twice the angle by which the frame in front of it turns, at no turn."""
-    return dr.sum(beyond[2, 1] - beyond[1, 2])
-
-
-def turning_throughput(t_turn):
-    """Tangent of a throughput of one whose frame turns by half of ``t_turn``; None leaves it as it is."""
-    if t_turn is None:
-        return mi.Spectrum(0)
-    zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_turn)
+def rotation_tangent(t_rotation):
+    """Tangent of a throughput of one whose frame turns by half of ``t_rotation``, in polarized variants."""
+    zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_rotation)
     return mi.Spectrum(*[zero] * 6, t, *[zero] * 2, -t, *[zero] * 6)
 
 
 # --------------------------------------------------------------------------------------------------------- frames
 
 
-class Turn:
+class FrameRotation:
     """Rotation of a Stokes frame by its cosine and sine of twice the angle, counter-clockwise for the receiver."""
 
     def __init__(self, c, s):
@@ -141,39 +73,40 @@ class Turn:
         return dr.detach(self.c) * self.s - dr.detach(self.s) * self.c
 
 
-def turn_between(forward, current, target):
+def rotation_between(forward, current, target):
     """The rotation from the frame with x along ``current`` to that along ``target``, projected across ``forward``.
 
     ``forward`` is the direction in which light travels, ``current`` a vector across it of any length. No rotation where
     ``target`` is parallel to the direction.
     """
-    return turn_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
+    return rotation_along(dr.dot(current, target), dr.dot(forward, dr.cross(current, target)))
 
 
-def turn_along(c, s):
+def rotation_along(c, s):
     """The rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
     n = c * c + s * s
     there = n > 0
     scale = dr.rcp(dr.select(there, n, 1))
-    return Turn(dr.select(there, (c - s) * (c + s) * scale, 1), dr.select(there, 2 * c * s * scale, 0))
+    return FrameRotation(dr.select(there, (c - s) * (c + s) * scale, 1), dr.select(there, 2 * c * s * scale, 0))
 
 
-def segment_frame(d):
+def stokes_frame_of(d):
     """The vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
     return mi.coordinate_system(-dr.detach(d))[0]
 
 
-def turn_out(si, d):
+def rotation_to_sensor(si, d):
     """From the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in direction ``d`` found.
 
-    None in unpolarized variants, as :func:`turn_in`. Where ``si.wi`` is attached to the direction, ``d`` must be.
+    None in unpolarized variants, as :func:`rotation_from_light`. Where ``si.wi`` is attached to the direction, ``d``
+    must be.
     """
     if not mi.is_polarized:
         return None
-    return turn_between(-d, si.to_world(mi.coordinate_system(si.wi)[0]), segment_frame(d))
+    return rotation_between(-d, si.to_world(mi.coordinate_system(si.wi)[0]), stokes_frame_of(d))
 
 
-def turn_in(si, wo, out=None, d=None):
+def rotation_from_light(si, wo, out=None, d=None):
     """From the BSDF's frame to the segment's, on the side of the light, where the path goes on in direction ``wo``.
 
     ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
@@ -182,25 +115,25 @@ def turn_in(si, wo, out=None, d=None):
     if not mi.is_polarized:
         return None
     out = si.to_world(wo) if out is None else out
-    return turn_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), segment_frame(out if d is None else d))
+    return rotation_between(-out, si.to_world(mi.coordinate_system(-wo)[0]), stokes_frame_of(out if d is None else d))
 
 
-def turned(light, turn):
-    """A Stokes vector in the turned frame."""
+def rotate_stokes(light, rotation):
+    """A Stokes vector in the rotate_stokes frame."""
     if not mi.is_polarized:
         return light
-    c, s = turn.c, turn.s
+    c, s = rotation.c, rotation.s
     return mi.SpectrumEntry(light[0], light[1] * c + light[2] * s, light[2] * c - light[1] * s, light[3])
 
 
-def scattered(value, turn):
+def scatter_unpolarized(value, rotation):
     """What a BSDF's value makes of unpolarized light, in the frame of the segment towards the sensor."""
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
-    return turned(column(value), turn)
+    return rotate_stokes(first_column(value), rotation)
 
 
-def scattering(value, out, into):
+def rotate_mueller(value, out, into):
     """A BSDF's value between the frames of the two segments: ``out`` towards the sensor, ``into`` towards the light."""
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
@@ -214,17 +147,17 @@ def scattering(value, out, into):
     return mi.Spectrum(*[entry for row in m for entry in row])
 
 
-def from_mirrored(value, wi, wo, mirrored):
+def from_mirrored_frames(value, wi, wo, mirrored):
     """A BSDF's value between the frames of its directions, where ``mirrored`` lanes hold it between the frames of their
     mirror images at the surface.
 
     Reflected, a frame changes its hand: S2 and S3 change their signs on both sides.
     """
     m = [[value[i, j] if (i < 2) == (j < 2) else -value[i, j] for j in range(4)] for i in range(4)]
-    out = turn_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])
-    into = turn_between(-wo, _mirror(mi.coordinate_system(_mirror(-wo))[0]), mi.coordinate_system(-wo)[0])
-    upright = scattering(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
-    return dr.select(mirrored, upright, value)
+    out = rotation_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])
+    into = rotation_between(-wo, _mirror(mi.coordinate_system(_mirror(-wo))[0]), mi.coordinate_system(-wo)[0])
+    correct_two_sided = rotate_mueller(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
+    return dr.select(mirrored, correct_two_sided, value)
 
 
 def _mirror(v):

@@ -1,4 +1,4 @@
-"""Which BSDFs of a scene answer late, looked up by their number in Dr.Jit's registry.
+"""Which BSDFs of a scene scatter late, looked up by their number in Dr.Jit's registry.
 
 A path chooses at each such surface, once for everything that it does there, whether it takes part in the elastic or in
 the delayed scattering; from then on it sees the BSDF of that part alone, by a pointer of its own. So nothing has to be
@@ -16,7 +16,7 @@ import numpy as np
 from torchtransient.errors import SceneError
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
-from torchtransient.plugins.polarized import faded
+from torchtransient.plugins.polarized import attenuated
 
 DECAY_NODES = 4097
 # Both parts are drawn at least this often, so that the derivative by a yield of zero is there.
@@ -31,8 +31,8 @@ def note_creation():
     _created += 1
 
 
-class Answer:
-    """How a surface answers a path: ``bsdf`` in its stead, the factor ``weight``, the ``delay`` in metres and the
+class DelaySample:
+    """How a surface scatters a path: ``bsdf`` in its stead, the factor ``weight``, the ``delay`` in metres and the
     ``wavelengths`` beyond the surface; None where nothing changes. A plain object that lives within one iteration.
     """
 
@@ -45,18 +45,9 @@ class Answer:
 
     def scaled(self, value):
         """A BSDF's value or weight times the factor."""
-        return value if self.weight is None else faded(value, self.weight)
+        return value if self.weight is None else attenuated(value, self.weight)
 
-    def scaled_light(self, light):
-        """Light that was scattered here times the factor."""
-        return light if self.weight is None else light * self.weight
-
-    def scaled_both(self, sampled):
-        """Value and weight in the result of ``BSDF.eval_pdf_sample``."""
-        value, pdf, bs, weight = sampled
-        return self.scaled(value), pdf, bs, self.scaled(weight)
-
-    def move(self, *interactions):
+    def shift_wavelengths(self, *interactions):
         """Give interactions the wavelengths beyond the surface."""
         if self.wavelengths is not None:
             for interaction in interactions:
@@ -150,7 +141,7 @@ class DelayTable:
         """The tables that carry derivatives."""
         return [t for t in (self.lifetimes, self.elastic_weights, self.late_weights) if dr.grad_enabled(t)]
 
-    def answer(self, bsdf, u, wavelengths) -> Answer:
+    def sample(self, bsdf, u, wavelengths) -> DelaySample:
         """How surfaces with BSDFs ``bsdf`` answer, for two uniform numbers ``u``."""
         row = self._of.rows.look_up(bsdf)
         there = row > 0
@@ -172,7 +163,7 @@ class DelayTable:
                 absorbed, factor = shift.draw(u.y, wavelengths)
                 weight = dr.select(chosen, weight * factor, weight)
                 beyond = dr.select(chosen, absorbed, beyond)
-        return Answer(dr.reinterpret_array(mi.BSDFPtr, pointer), weight, delay, beyond)
+        return DelaySample(dr.reinterpret_array(mi.BSDFPtr, pointer), weight, delay, beyond)
 
     def _delay(self, v, row, active):
         """Delay in units of the lifetime for uniform numbers in [0, 1)."""

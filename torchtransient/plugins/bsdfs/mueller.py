@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.fresnel import sqrt_with_bounded_slope
-from torchtransient.plugins.polarized import scattering, turn_between
+from torchtransient.plugins.polarized import rotate_mueller, rotation_between
 
 # A direction whose sine to the normal is below 1e-9 has no plane of incidence.
 _SINE_SQUARED_ALONG_NORMAL = 1e-18
@@ -89,9 +89,9 @@ def across_plane(matrix: Any, normal: Any, wi: Any, wo: Any) -> Any:
     along = (dr.squared_norm(s_in) < _SINE_SQUARED_ALONG_NORMAL) | (dr.squared_norm(s_out) < _SINE_SQUARED_ALONG_NORMAL)
     s_in = dr.select(along, mi.Vector3f(1, 0, 0), s_in)
     s_out = dr.select(along, mi.Vector3f(1, 0, 0), s_out)
-    out = turn_between(wi, s_out, mi.coordinate_system(wi)[0])
-    into = turn_between(-wo, s_in, mi.coordinate_system(-wo)[0])
-    return scattering(matrix, out, into)
+    out = rotation_between(wi, s_out, mi.coordinate_system(wi)[0])
+    into = rotation_between(-wo, s_in, mi.coordinate_system(-wo)[0])
+    return rotate_mueller(matrix, out, into)
 
 
 def metal_reflection(cos_theta_i: Any, eta: Any, k: Any) -> Any:

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.bsdfs.mueller import two_by_two
-from torchtransient.plugins.polarized import scattering, turn_along
+from torchtransient.plugins.polarized import rotate_mueller, rotation_along
 
 
 class ThinElement(mi.BSDF):
@@ -79,11 +79,11 @@ def _turned_to_basis(matrix: Any, forward: Any, x: Any, y: Any, z: Any) -> Any:
     """
     basis = mi.coordinate_system(forward)[0]
     across = dr.cross(basis, forward)
-    turn = turn_along(
+    rotation = rotation_along(
         x * basis.x + y * basis.y + z * basis.z,
         x * across.x + y * across.y + z * across.z,
     )
-    return scattering(matrix, turn, turn)
+    return rotate_mueller(matrix, rotation, rotation)
 
 
 class DiffPolarizer(ThinElement):

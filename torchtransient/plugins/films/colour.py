@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import Turn, turned
+from torchtransient.plugins.polarized import FrameRotation, rotate_stokes
 
 
 class ChannelMatch:
@@ -16,12 +16,12 @@ class ChannelMatch:
     ray instead of once per event.
 
     In polarized variants a sample is a Stokes vector in the frame of its ray, and the channels are those of S0, S1, S2,
-    S3 one after the other, in the frame of the sensor that ``turn`` leads to.
+    S3 one after the other, in the frame of the sensor that ``rotation`` leads to.
     """
 
-    def __init__(self, wavelengths, weight, response=None, turn=None):
+    def __init__(self, wavelengths, weight, response=None, rotation=None):
         self.weight = mi.unpolarized_spectrum(weight)
-        self.turn = turn
+        self.rotation = rotation
         self.matrix = None
         if response is not None:
             self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
@@ -36,7 +36,7 @@ class ChannelMatch:
     def to_channels(self, value) -> list:
         """Channel values (list of Float) of what an event contributes."""
         if mi.is_polarized:
-            return [c for component in turned(value, self.turn) for c in self._to_channels(component)]
+            return [c for component in rotate_stokes(value, self.rotation) for c in self._to_channels(component)]
         return self._to_channels(value)
 
     def to_spectrum(self, channels: list):
@@ -44,7 +44,7 @@ class ChannelMatch:
         if mi.is_polarized:
             n = len(channels) // 4
             parts = [self._to_spectrum(channels[n * i : n * (i + 1)]) for i in range(4)]
-            return turned(mi.SpectrumEntry(*parts), Turn(self.turn.c, -self.turn.s))
+            return rotate_stokes(mi.SpectrumEntry(*parts), FrameRotation(self.rotation.c, -self.rotation.s))
         return self._to_spectrum(channels)
 
     def _to_channels(self, value) -> list:

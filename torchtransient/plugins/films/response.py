@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.polarized import faded
+from torchtransient.plugins.polarized import attenuated
 
 # The density that wavelengths are drawn from is tabulated; curves finer than this are covered by its floor.
 MAX_NODES = 4096
@@ -117,7 +117,7 @@ class SensorResponse:
         _, drawn = mi.sample_rgb_spectrum(mi.sample_shifted(u))
         wavelengths, own = self.sample(u)
         ray.wavelengths = wavelengths
-        return ray, faded(weight, own / mi.UnpolarizedSpectrum(drawn))
+        return ray, attenuated(weight, own / mi.UnpolarizedSpectrum(drawn))
 
     def _check(self, sensor):
         if sensor.ptr in self.sensors:

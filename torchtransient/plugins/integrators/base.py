@@ -12,10 +12,10 @@ from torchtransient.plugins.films.temporal_filter import check_name, check_stdde
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
 from torchtransient.plugins.parameters import check_slope, moving_names
-from torchtransient.plugins.polarized import turning_throughput
+from torchtransient.plugins.polarized import rotation_tangent
 from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
-from torchtransient.plugins.sensors.stokes_frame import sensor_turn
+from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.forward import forward, tangents_of
@@ -188,8 +188,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     def channel_match(self, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
         ray = dr.detach(rays.ray)
-        turn = sensor_turn(rays.seen, ray) if mi.is_polarized else None
-        return ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves, turn)
+        rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
+        return ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves, rotation)
 
     def pixel_indices(self, film, job, rays):
         """Index of a pixel's first entry in its band, and of the pixel in the film."""
@@ -319,7 +319,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                     objective += adjoint.slope * length_to_sensor_origin(rays.seen, rays.ray)
                 if mi.is_polarized:
                     turning = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-                    objective += turning * sensor_turn(rays.seen, rays.ray).angle()
+                    objective += turning * sensor_rotation(rays.seen, rays.ray).angle()
                 dr.backward_from(objective)
 
     @no_collection()
@@ -334,7 +334,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             contents, wanted = self._wanted(scene, sensor, film)
             world = self.world(scene, sensor, contents, wanted, film.arrivals())
             with dr.resume_grad():
-                settle_tangents(world)
+                propagate_tangents(world)
             jobs, samples = self.passes(sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for job in jobs:
@@ -361,13 +361,13 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.resume_grad():
             attached = [rays.ray.o, rays.ray.d, length_to_sensor_origin(rays.seen, rays.ray)]
             if mi.is_polarized:
-                attached.append(sensor_turn(rays.seen, rays.ray).angle())
-            o, d, length, *turn = tangents_of(attached)
+                attached.append(sensor_rotation(rays.seen, rays.ray).angle())
+            o, d, length, *rotation = tangents_of(attached)
         tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
         tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
         tangent.slope = mi.Float(0) if self.camera_unwarp else mi.Float(length)
         if mi.is_polarized:
-            tangent.β = turning_throughput(turn[0])
+            tangent.β = rotation_tangent(rotation[0])
         return tangent
 
     @staticmethod
@@ -389,7 +389,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         )
 
 
-def settle_tangents(world):
+def propagate_tangents(world):
     """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
     attached = world.contents.parameters(world.scene).attached_values()
     attached += [table for table in world.tables() if dr.grad_enabled(table)]

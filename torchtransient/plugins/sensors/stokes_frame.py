@@ -5,10 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import segment_frame, turn_between
+from torchtransient.plugins.polarized import rotation_between, stokes_frame_of
 
 
-def sensor_turn(seen, ray):
+def sensor_rotation(seen, ray):
     """Rotation from the frame of the primary ray to the sensor's, attached where the sensor's pose is.
 
     ``seen``: the :class:`~.origin.View` of every sensor that the rays belong to. The sensor's horizontal axis is
@@ -21,6 +21,6 @@ def sensor_turn(seen, ray):
         up = dr.select(view.active, view.sensor.world_transform() @ mi.Vector3f(0, 1, 0), up)
     horizontal = dr.cross(ray.d, up)
     # The frame of the ray is the projection of a fixed vector: unit length only where nothing is attached.
-    current = segment_frame(ray.d)
+    current = stokes_frame_of(ray.d)
     current = dr.normalize(current - ray.d * dr.dot(current, ray.d))
-    return turn_between(-ray.d, current, horizontal)
+    return rotation_between(-ray.d, current, horizontal)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import column, product, scattered
+from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     direction_to,
@@ -44,7 +44,7 @@ class EmitterFound(Connection):
         connected = hit & ~path.prev_unconnected
         others = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
         mis = dr.select(hit, mis_weight(path.prev_pdf, sum(others)), 0)
-        value = column(path.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
+        value = first_column(path.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
         return Event(value=value, opl=path.τ, active=hit, depth=path.depth + 1, mis=mis)
 
     # ------------------------------------------------------------------------------------------------- record
@@ -71,7 +71,7 @@ class EmitterFound(Connection):
         elif (claimed := self._claimed(world, emitter, wanted)) is not None:
             hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~claimed
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
-        return EventTerm(value=column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
+        return EventTerm(value=first_column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
 
     def _claimed(self, world, emitter, wanted):
         """Mask of the emitters that derivatives reach by another strategy alone; None for none."""
@@ -94,7 +94,7 @@ class EmitterFound(Connection):
         J *= dr.relative_grad(dr.select(lit, area, 1))
         towards = world.scattering.evaluate(world, vertex, out, lit)
         Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))
-        value = scattered(towards.value, vertex.turn) * (step.inv_pdf * J * mis) * Le
+        value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * J * mis) * Le
         end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
         value = product(vertex.carry.β, dr.select(lit, value * T, 0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import intensity, product, scattered, transported
+from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     direction_to,
@@ -45,7 +45,7 @@ class EmitterSampled(Connection):
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
-        value = transported(path.β, self.mis(ds, answer.pdf, ds.delta), answer.value)
+        value = product(path.β, answer.value) * self.mis(ds, answer.pdf, ds.delta)
         value *= mi.unpolarized_spectrum(proposal.weight)
         if not zeros:  # shadow rays only where they can matter; the derivative of a zero may matter
             active = active & (dr.max(dr.abs(intensity(value))) > 0)
@@ -96,7 +96,7 @@ class EmitterSampled(Connection):
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit)
         mis = self.mis(light.ds, dr.detach(towards.pdf), light.ds.delta | light.cone)
-        value = scattered(towards.value, vertex.turn) * Le * mis
+        value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
         if "T" in r:
             value *= r["T"]
         end = Local(p=light.p, d=mi.Vector3f(light.ds.d), far=light.far, ahead=False)

@@ -39,7 +39,7 @@ class AttachedVertex(Local):
     ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``carry`` (with the throughput at the vertex),
     ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``, ``delay``,
     ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind
-    its delay) and ``turn``.
+    its delay) and ``rotation``.
     """
 
 

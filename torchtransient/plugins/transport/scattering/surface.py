@@ -5,8 +5,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.bsdfs.delay_table import Answer as DelaySample
-from torchtransient.plugins.polarized import from_mirrored, product, scattered, scattering, turn_in, turn_out
+from torchtransient.plugins.bsdfs.delay_table import DelaySample
+from torchtransient.plugins.polarized import (
+    from_mirrored_frames,
+    product,
+    rotate_mueller,
+    rotation_from_light,
+    rotation_to_sensor,
+    scatter_unpolarized,
+)
 from torchtransient.plugins.transport.carry import Carry, slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, solid_angle_over_area
 from torchtransient.plugins.transport.segment.vacuum import length_to
@@ -42,7 +49,7 @@ class Surface(Scattering):
 
     def delay(self, bsdf, u, wavelengths):
         """Whether a surface scatters late: which BSDF takes its place, when, and with which weight."""
-        return DelaySample(bsdf) if self.delays is None else self.delays.answer(bsdf, u, wavelengths)
+        return DelaySample(bsdf) if self.delays is None else self.delays.sample(bsdf, u, wavelengths)
 
     @staticmethod
     def behind(delay, *interactions):
@@ -50,7 +57,7 @@ class Surface(Scattering):
         if delay.wavelengths is None:
             return interactions
         copies = {id(i): dr.copy(i) for i in interactions}
-        delay.move(*copies.values())
+        delay.shift_wavelengths(*copies.values())
         return tuple(copies[id(i)] for i in interactions)
 
     def connectable(self, world, vertex):
@@ -70,10 +77,10 @@ class Surface(Scattering):
                 value, pdf, *sample = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u_dir, vertex.goes_on)
             else:
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
-            value = self.upright(world, bsdf, si, wo, vertex.delay.scaled(value))
+            value = self.correct_two_sided(world, bsdf, si, wo, vertex.delay.scaled(value))
             answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo)))
         bs, weight = sample or bsdf.sample(ctx, si, u_lobe, u_dir, vertex.goes_on)
-        weight = self.upright(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
+        weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
             u_delay=vertex.u_delay,
@@ -81,11 +88,11 @@ class Surface(Scattering):
         )  # fmt: skip
         step.unconnected = step.delta
         self.elsewhere(world, vertex, proposals, answers, step)
-        turn = turn_out(si, path.ray.d)
+        rotation = rotation_to_sensor(si, path.ray.d)
         for answer in answers:
             if answer is not None:
-                answer.value = scattered(answer.value, turn)
-        step.weight = scattering(step.weight, turn, turn_in(si, step.wo, step.out))
+                answer.value = scatter_unpolarized(answer.value, rotation)
+        step.weight = rotate_mueller(step.weight, rotation, rotation_from_light(si, step.wo, step.out))
         for guide in self.guides:
             point, chosen = guide.draw(vertex, sampler)
             step.out = dr.select(chosen & ~step.delta, dr.normalize(point - vertex.at.p), step.out)
@@ -101,8 +108,8 @@ class Surface(Scattering):
         wo = si.to_local(step.out)
         value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
         pdf = own * pdf + sum(guide.share * guide.density(vertex, ray, leg, smooth) for guide in self.guides)
-        value = self.upright(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
-        value = scattering(value, turn_out(si, path.ray.d), turn_in(si, wo, step.out))
+        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        value = rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, step.out))
         step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
         step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, si, wo), step.eta)
@@ -114,19 +121,19 @@ class Surface(Scattering):
     # ---------------------------------------------------------------------------------------- scene contents
 
     @staticmethod
-    def upright(world, bsdf, si, wo, value):
+    def correct_two_sided(world, bsdf, si, wo, value):
         """``value`` of a BSDF towards ``wo``, put right where Mitsuba's two-sided BSDFs mirror it."""
         two_sided = world.contents.two_sided
         if two_sided is None:
             return value
-        return from_mirrored(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
+        return from_mirrored_frames(value, si.wi, wo, two_sided.lists(bsdf) & (si.wi.z < 0))
 
     def relative_index(self, bsdf, si, wo):
         """Index on the side of ``wo`` over that on the side of ``si.wi``."""
         return mi.Float(1) if self.refraction is None else self.refraction.relative_index(bsdf, si, wo)
 
     @staticmethod
-    def probability(world, bsdf, bs):
+    def lobe_probability(world, bsdf, bs):
         """One, with the derivative of a delta lobe's probability where the BSDF's weight hides it."""
         hidden = world.contents.hidden_probability
         return 1 if hidden is None else dr.select(hidden.lists(bsdf), dr.relative_grad(bs.pdf), 1)
@@ -151,7 +158,7 @@ class Surface(Scattering):
     def attach(self, world, vertex, wanted):
         """Look up how the attached vertex scatters."""
         v, si = vertex.v, vertex.si
-        vertex.turn = turn_out(si, vertex.carry.w)
+        vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
         vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
         vertex.bsdf = vertex.delay.bsdf
@@ -164,7 +171,7 @@ class Surface(Scattering):
         si = vertex.scattered_si
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
-        value = self.upright(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
@@ -183,16 +190,17 @@ class Surface(Scattering):
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
-        weight = scattering(towards.value, vertex.turn, turn_in(si, towards.wo, out, following.d))
+        weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
         o, d, w = mi.Point3f(0), mi.Vector3f(0), dr.select(ahead, out, 0)
         if world.contents.delta:
             bs, delta_weight = vertex.bsdf.sample(mi.BSDFContext(), si, r["u_lobe"], r["u_dir"], mirrored)
-            delta_weight = self.upright(world, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
+            delta_weight = self.correct_two_sided(world, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
             d_out = si.to_world(bs.wo)
-            delta_weight = scattering(delta_weight, vertex.turn, turn_in(si, bs.wo, d_out, following.d))
-            delta_weight *= self.probability(world, vertex.bsdf, bs) * v.rr
+            from_light = rotation_from_light(si, bs.wo, d_out, following.d)
+            delta_weight = rotate_mueller(delta_weight, vertex.rotation, from_light)
+            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * v.rr
             weight = dr.select(mirrored, delta_weight, weight)
             eta = dr.select(mirrored, bs.eta, eta)
             o, d, w = dr.select(mirrored, si.p, 0), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)

@@ -20,7 +20,7 @@ from torchtransient.plugins.transport.media_contents import is_open
 WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B
 
 
-class Walk:
+class FreeFlight:
     """Where a walk ended; a plain object that only lives within one iteration.
 
     ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
@@ -68,7 +68,7 @@ def channel_probabilities(carried):
     return dr.select(total > 0, carried / total, 1 / len(carried))
 
 
-def pick(spectrum, probabilities, u):
+def value_of_channel(spectrum, probabilities, u):
     """The entry of a channel drawn by ``u``."""
     value, below = spectrum[0], probabilities[0]
     for c in range(1, len(spectrum)):
@@ -92,7 +92,7 @@ def stretch_inside(media, medium, ray, t, t_end, inside):
     return begin, dr.maximum(begin, end)
 
 
-def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
+def tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
     """One tentative flight from distance ``t`` on ``ray`` towards ``t_end``.
 
     Returns (collides, is the collision real, distance of the collision, factor on the weight).
@@ -102,7 +102,7 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
         rate = dr.maximum(rate, media.rate_floor)
     many = len(rate) > 1
     p = channel_probabilities(carried)
-    one = pick(rate, p, rng.next_float32()) if many else rate[0]
+    one = value_of_channel(rate, p, rng.next_float32()) if many else rate[0]
     begin, end = stretch_inside(media, medium, ray, t, t_end, inside)
     flight = dr.select(one > 0, -dr.log(1 - u) / one, dr.inf)
     t_new = begin + flight
@@ -136,7 +136,7 @@ def fly(media, medium, ray, t, t_end, carried, u, rng, inside):
     return collides, real, t_new, mi.UnpolarizedSpectrum(dr.select(inside, factor, 1))
 
 
-def across(scene, ray, pi, medium, passes):
+def cross_boundary(scene, ray, pi, medium, passes):
     """Behind the open boundary at ``pi``: (next surface counted from ``ray.o``, medium)."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, passes)
     changes = passes & si.is_medium_transition()
@@ -156,14 +156,14 @@ def closed_surface(scene, media, ray, active):
     """The next surface along ``ray`` that is not an open boundary."""
     pi = scene.ray_intersect_preliminary(ray, active=active)
     if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
-        passes = active & passable(pi, False)
+        passes = active & lets_through(pi, False)
         while dr.hint(passes, label="open boundaries"):
-            pi, _ = across(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
-            passes &= passable(pi, False)
+            pi, _ = cross_boundary(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
+            passes &= lets_through(pi, False)
     return pi
 
 
-def passable(pi, hide):
+def lets_through(pi, hide):
     """Whether the surface at ``pi`` is an open boundary; with ``hide`` emitting surfaces count as such."""
     opens = pi.is_valid() & is_open(pi.shape)
     if hide:
@@ -172,8 +172,8 @@ def passable(pi, hide):
 
 
 @dr.syntax
-def walk(scene, media, ray, medium, carried, u, lanes, active, first=False):
-    """Walk from ``ray.o`` in ``medium`` to the next event; returns a :class:`Walk`.
+def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, first=False):
+    """Walk from ``ray.o`` in ``medium`` to the next event; returns a :class:`FreeFlight`.
 
     ``carried``: light per channel at the start, which only steers the choice of channels. ``u``: a number of the
     sampler, which chooses the first flight and starts the generator of the others; the same arguments give the same
@@ -191,22 +191,23 @@ def walk(scene, media, ray, medium, carried, u, lanes, active, first=False):
     pi = scene.ray_intersect_preliminary(ray, coherent=first, active=active)
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         inside = active & (medium != None)  # noqa: E711 (a Dr.Jit comparison)
-        scatter, _, t, weight = fly(media, medium, ray, t, pi.t, carried, u, rng, inside)
+        scatter, _, t, weight = tentative_flight(media, medium, ray, t, pi.t, carried, u, rng, inside)
     else:
         going = mi.Bool(active)
         while dr.hint(going, label="walk through media"):
             inside = going & (medium != None)  # noqa: E711
-            collides, real, t_new, factor = fly(media, medium, ray, t, pi.t, carried * weight, u, rng, inside)
+            so_far = carried * weight
+            collides, real, t_new, factor = tentative_flight(media, medium, ray, t, pi.t, so_far, u, rng, inside)
             weight *= factor
             scatter = collides & real
-            passes = going & ~collides & passable(pi, hide)
+            passes = going & ~collides & lets_through(pi, hide)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
             if dr.hint(media.keeps_entry, mode="scalar"):
                 entry = dr.select(passes, pi, entry)
-            pi, medium = across(scene, ray, pi, medium, passes)
+            pi, medium = cross_boundary(scene, ray, pi, medium, passes)
             going = (collides & ~real) | passes
             u = rng.next_float32()
-    return Walk(pi, scatter, t, medium, weight, entry)
+    return FreeFlight(pi, scatter, t, medium, weight, entry)
 
 
 @dr.syntax
@@ -232,18 +233,18 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
         while dr.hint(going, label="transmittance through media"):
             inside = going & (medium != None)  # noqa: E711
             t_end = dr.minimum(pi.t, length)
-            collides, t_new, factor = thin_out(media, medium, ray, t, t_end, rng, inside)
+            collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
-            blocked = pi.is_valid() & ~passable(pi, False)
+            blocked = pi.is_valid() & ~lets_through(pi, False)
             passes = going & ~collides & pi.is_valid() & ~blocked
             visible &= ~(going & ~collides & blocked)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
-            pi, medium = across(scene, ray, pi, medium, passes)
+            pi, medium = cross_boundary(scene, ray, pi, medium, passes)
             going = (collides | passes) & (dr.max(T) > 0)
     return T, visible
 
 
-def thin_out(media, medium, ray, t, t_end, rng, inside):
+def ratio_tracking_step(media, medium, ray, t, t_end, rng, inside):
     """One step of ratio tracking, or the whole stretch where the medium is homogeneous.
 
     Returns (a collision came before the end, its distance, factor on the transmittance).

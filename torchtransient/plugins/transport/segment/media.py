@@ -13,10 +13,15 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.polarized import faded
+from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
 from torchtransient.plugins.transport.media_contents import FlightSettings
-from torchtransient.plugins.transport.segment.free_flight import closed_surface, medium_interaction, transmittance, walk
+from torchtransient.plugins.transport.segment.free_flight import (
+    closed_surface,
+    medium_interaction,
+    sample_free_flight,
+    transmittance,
+)
 from torchtransient.plugins.transport.segment.optical_depth import (
     ARRIVING,
     CONNECTING,
@@ -58,7 +63,7 @@ class Media(Vacuum):
 
     def _leg(self, world, ray, medium, carried, sampler, active, first=False):
         u, lanes = sampler.next_1d(), lane_numbers(sampler)
-        end = walk(world.scene, self.settings, ray, medium, carried, u, lanes, active, first=first)
+        end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first=first)
         leg = {"pi": end.pi, "scatter": end.scatter, "t": end.t, "medium": end.medium, "weight": end.weight}
         if self.settings.recorded:
             leg["begin"] = medium
@@ -72,7 +77,7 @@ class Media(Vacuum):
         si = leg["pi"].compute_surface_interaction(path.ray, mi.RayFlags.All, ~scatter)
         at, valid = reference(si, mei, scatter), si.is_valid() | scatter
         return Vertex(
-            si=si, at=at, valid=valid, surface=~scatter, β=faded(path.β, leg["weight"]), ray=path.ray, leg=leg,
+            si=si, at=at, valid=valid, surface=~scatter, β=attenuated(path.β, leg["weight"]), ray=path.ray, leg=leg,
             scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(world, path, at.p, valid),
         )  # fmt: skip
 
@@ -134,7 +139,7 @@ class Media(Vacuum):
         T = v.weight * with_log_slope(world.scene, self.settings, leg, carry.x, si.p, carry.β[0], v.active)
         if wanted.geometry:
             T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
-        vertex.carry = replace(carry, β=faded(carry.β, T))
+        vertex.carry = replace(carry, β=attenuated(carry.β, T))
         return vertex
 
     def _surface_or_medium(self, v, ray, w, wanted):

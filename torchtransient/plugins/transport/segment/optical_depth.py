@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.segment.free_flight import across, generator, medium_interaction
+from torchtransient.plugins.transport.segment.free_flight import cross_boundary, generator, medium_interaction
 
 # Streams of random numbers, one for each kind of leg.
 ARRIVING, CONNECTING, EMITTING = 0xC2B2AE35, 0x27D4EB2F, 0x165667B1
@@ -100,7 +100,7 @@ def leg_backward(scene, media, leg, g, active):
             going &= pi.is_valid()
             t = dr.select(going, pi.t, t)
             entry = dr.select(going, pi, entry)
-            pi, medium = across(scene, leg.ray, pi, medium, going)
+            pi, medium = cross_boundary(scene, leg.ray, pi, medium, going)
     return a0, a1
 
 
@@ -138,7 +138,7 @@ def leg_forward(scene, media, leg, t0, t1, active):
             going &= pi.is_valid()
             t = dr.select(going, pi.t, t)
             entry = dr.select(going, pi, entry)
-            pi, medium = across(scene, leg.ray, pi, medium, going)
+            pi, medium = cross_boundary(scene, leg.ray, pi, medium, going)
     return d_log
 
 
