@@ -69,9 +69,23 @@ def test_render_writes_phasors(folder):
     assert "out.h5: 3 x 3 x 8 x 8 (C x F x H x W) phasors" in result.stdout
 
 
+def test_render_writes_gates(folder):
+    gates = [tt.Gate.rectangular(6.0, 7.0), tt.Gate.gaussian(8.0, 0.5)]
+    options = ("--gates", "rectangular 6 7; gaussian 8 0.5", "--seed", 3, "--quiet")
+    result = run("render", "box.xml", "-o", "out.h5", *options)
+    assert result.exit_code == 0, result.output
+    stored = read_result(folder / "out.h5")
+    torch.testing.assert_close(stored.gated, tt.render("box.xml", seed=3, gates=gates).gated)
+    assert stored.gates == tuple(gates) and stored.transient is None
+    assert "out.h5: 3 x 2 x 8 x 8 (C x G x H x W) gates" in result.stdout
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
+        (("--gates", "rectangular 1 2", "--overview", "a.png"), "leave it out for gates"),
+        (("--gates", "rectangular 2 1"), "finite start before"),
+        (("--gates", "rectangular 1 2", "--temporal-filter", "tent"), "a gated film has none"),
         (("--frequencies", "1,fast"), "numbers with commas"),
         (("--frequencies", "1,nan"), "numbers with commas"),
         (("--frequencies", "1", "--start-opl", 0, "--bin-width-opl", 1, "--num-bins", 2), "leave out one"),

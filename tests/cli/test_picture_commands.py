@@ -113,6 +113,20 @@ def test_phasors_become_a_wave(folder):
     assert done.exit_code == 2 and "--rainbow shows a histogram over time" in done.stderr
 
 
+def test_gates_become_frames(folder):
+    gates = "gaussian 8 0.5; gaussian 8.5 0.5; gaussian 9 0.5"
+    done = run("render", "box.xml", "-o", "gated.h5", "--gates", gates, "--video", "gates.gif", "--quiet")
+    assert done.exit_code == 0, done.output
+    assert Image.open("gates.gif").n_frames == 3 and "gates.gif: 3 frames, one for each gate" in done.stdout
+    for kind, more in (("frames", ()), ("histogram", ("--pixel", 3, 4))):
+        done = run("picture", "gated.h5", f"{kind}.png", "--kind", kind, *more)
+        assert done.exit_code == 0, done.output
+    for kind in ("overview", "peak-time", "rainbow", "streak"):
+        done = run("picture", "gated.h5", "none.png", "--kind", kind)
+        assert done.exit_code == 2 and "gates" in done.stderr, kind
+    assert not (folder / "none.png").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -10,6 +10,7 @@ import click
 
 from torchtransient.cli.options import load_scene, scene_options
 from torchtransient.render.films.choices import from_options
+from torchtransient.render.plan_choices import known_outputs
 
 
 class Names(click.ParamType):
@@ -29,7 +30,7 @@ class Names(click.ParamType):
     type=Names(),
     default="transient",
     show_default=True,
-    help="Some of transient, steady, phasor, stokes, gates, bands.",
+    help=f"Some of {', '.join(known_outputs())}.",
 )
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")
 @click.option("--tail", type=float, default=1e-3, show_default=True, help="Share of the light left to deeper paths.")

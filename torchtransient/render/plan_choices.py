@@ -33,11 +33,15 @@ def some(findings: Sequence[Finding], most: int = 3) -> str:
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
 
 
+def known_outputs() -> tuple[str, ...]:
+    """What a plan can be asked for."""
+    return (*(kind.output for kind in all_films()), *_OF_ANY_FILM)
+
+
 def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     """The outputs as a tuple. Raises ``SceneError`` for unknown ones, and for two that need different films."""
     asked = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    of_films = tuple(kind.output for kind in all_films())
-    known = (*of_films, *_OF_ANY_FILM)
+    of_films, known = tuple(kind.output for kind in all_films()), known_outputs()
     if not asked or any(name not in known for name in asked):
         raise SceneError(f"tt.plan: outputs are some of {', '.join(known)}; got {list(asked)}.")
     films = [name for name in asked if name in of_films]

@@ -133,7 +133,8 @@ class FilmChoice(abc.ABC):
 
     def tensor(self, output: Any) -> torch.Tensor | None:
         """The film's tensor in an output or a result."""
-        return measured(output, self.measures)
+        tensor: torch.Tensor | None = measured(output, self.measures)
+        return tensor
 
     @classmethod
     def tensor_in(cls, values: Mapping[str, Any]) -> Any:

@@ -37,7 +37,7 @@ def from_options(options: Mapping[str, Any]) -> FilmChoice | None:
     """The film that the options of a command line ask for, None without one. Raises typed errors."""
     found = [choice for choice in (kind.from_options(options) for kind in all_films()) if choice is not None]
     if len(found) > 1:
-        flags = [f"--{kind.options[0].name.replace('_', '-')}" for kind in map(type, found)]
+        flags = [f"--{choice.options[0].name.replace('_', '-')}" for choice in found]
         raise SceneError(f"{' and '.join(flags)} ask for different films: leave out one of them.")
     return found[0] if found else None
 

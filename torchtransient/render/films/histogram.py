@@ -67,12 +67,12 @@ class Histogram(FilmChoice):
 
     @classmethod
     def from_options(cls, options: Mapping[str, Any]) -> Self | None:
-        given = [options.get(option.name) for option in cls.options]
-        if all(value is None for value in given):
+        start, width, bins = (options.get(option.name) for option in cls.options)
+        if start is None and width is None and bins is None:
             return None
-        if any(value is None for value in given):
+        if start is None or width is None or bins is None:
             raise SceneError("--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all.")
-        return cls(TimeAxis(*given))
+        return cls(TimeAxis(start, width, bins))
 
     @property
     def count(self) -> int:

@@ -27,4 +27,7 @@ def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], componen
 
 
 def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:
-    return tensor if components == 1 else tensor.unflatten(channel_dim, (components, -1))
+    if components == 1:
+        return tensor
+    split: torch.Tensor = tensor.unflatten(channel_dim, (components, -1))  # type: ignore[no-untyped-call]
+    return split
