@@ -9,5 +9,7 @@ from torchtransient.plugins._registry import plugin_errors as plugin_errors
 from torchtransient.plugins._registry import register as register
 from torchtransient.plugins._registry import register_module as register_module
 from torchtransient.plugins._registry import sync as sync
+from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
+from torchtransient.plugins.parameter_effect import declare_effects as declare_effects
 
 _attach()

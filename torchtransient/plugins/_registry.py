@@ -14,14 +14,17 @@ changes. Mitsuba tells us of a change through a callback. Three of its habits sh
 How to write a plugin module::
 
     import mitsuba as mi
-    from torchtransient.plugins import register
+    from torchtransient.plugins import ParameterEffect, declare_effects, register
 
-    class MyFilm(mi.Film):
+    class MyGlass(mi.BSDF):
         ...
 
-    register("film", "my_film", MyFilm)
+    register("bsdf", "my_glass", MyGlass)
+    declare_effects(MyGlass, {"eta": ParameterEffect(moves_length=True, role="index")})
 
-It looks up variant types when it uses them (`mi.Float`) and never keeps one at module level. To add a module of this
+The last line says what its parameters move; without it they count as values such as colours, and an `eta` as an index
+whose derivative is not known to be right. A module looks up variant types when it uses them (`mi.Float`) and never
+keeps one at module level. To add a module of this
 library, add a line to `PLUGIN_MODULES`; a module of someone else's is added with `register_module("their.module")`.
 """
 
