@@ -294,3 +294,41 @@ def test_circles_are_found(tmp_path, first, second, closed):
     for name, text in texts.items():
         (folder / f"{name}.py").write_text(text + "\n", encoding="utf-8")
     assert bool(import_circles(tmp_path)) == closed
+
+
+def old_names():
+    """(identifiers, folder) of every row of the table of old names in docs/design.md."""
+    page = (PACKAGE.parent / "docs" / "design.md").read_text(encoding="utf-8")
+    rows = [line for line in page.split("## Old names")[1].splitlines() if line.startswith("| `")]
+    for row in rows:
+        old, _, where = (cell.strip() for cell in row.strip("|").split("|"))
+        yield {name.strip("`") for name in old.split()}, where
+
+
+def identifiers(path):
+    """Every name in a file: variables, attributes, arguments, definitions, keywords, imported modules."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for field in ("id", "attr", "arg", "name", "module", "asname"):
+            value = getattr(node, field, None)
+            if isinstance(value, str):
+                yield from value.split(".")
+
+
+def test_no_old_name_is_left():
+    rows = list(old_names())
+    assert len(rows) > 15
+    for old, where in rows:
+        for path in (PACKAGE / where).rglob("*.py"):
+            left = old & {path.stem, *identifiers(path)}
+            assert not left, f"{path.relative_to(PACKAGE)}: {', '.join(sorted(left))}"
+
+
+def test_files_of_the_structure_page_exist():
+    """Every file that docs/design.md names by its place in the package."""
+    page = (PACKAGE.parent / "docs" / "design.md").read_text(encoding="utf-8")
+    rooms = "plugins|render|transport|films|bsdfs|sinks|segment|connection|scattering|derivative"
+    named = set(re.findall(rf"`((?:{rooms})/[\w/]+\.py)`", page))
+    assert len(named) > 20
+    known = {path.relative_to(PACKAGE).as_posix() for path in FILES}
+    missing = [name for name in named if not any(path == name or path.endswith(f"/{name}") for path in known)]
+    assert missing == []

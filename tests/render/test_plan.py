@@ -10,7 +10,7 @@ import pytest
 import torchtransient as tt
 from support import plan_scenes
 from torchtransient.errors import GradientError, SceneError, UnitError, VariantError
-from torchtransient.render.plan import census_of
+from torchtransient.render.plan import inventory_of
 
 VARIANT = "llvm_ad_rgb"
 
@@ -359,6 +359,6 @@ def test_reading_a_scene_is_quick():
     seconds = []
     for _ in range(7):
         begin = time.perf_counter()
-        census_of(scene)
+        inventory_of(scene)
         seconds.append(time.perf_counter() - begin)
     assert min(seconds) < 0.05

@@ -17,10 +17,10 @@ from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.arguments import film_asked_for
-from torchtransient.render.census import Census, take_census
 from torchtransient.render.effects import Effects
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, planned
+from torchtransient.render.inventory import SceneInventory, take_inventory
 from torchtransient.render.plan_finder import Draft, Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
@@ -147,7 +147,7 @@ def plan(
             raise UnitError(f"tt.plan: {name} is a share of the light between 0 and 1, got {share!r}.")
     loaded = load(scene)
     asked = choices.checked_outputs(outputs)
-    census = census_of(loaded)
+    inventory = inventory_of(loaded)
     device = loaded.variant.split("_")[0]
     given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
     if given is not None and given.has_axis:
@@ -155,28 +155,28 @@ def plan(
             raise SceneError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
         time_axis = given.argument_value()
     kind = planned(asked)
-    best, notes = choices.choose_variant(census, asked, device, strict)
-    tracer, more = choices.choose_integrator(census)
+    best, notes = choices.choose_variant(inventory, asked, device, strict)
+    tracer, more = choices.choose_integrator(inventory)
     reasons = (_taken("variant", variant, best), *notes, _taken("integrator", integrator, tracer), *more, kind.reason)
     draft = Draft(
         scene=load(loaded, variant=variant or best.value),
         variant=variant or best.value,
         integrator=integrator or tracer.value,
         film=kind,
-        film_choice=choices.film_settings(kind, given, census.film),
+        film_choice=choices.film_settings(kind, given, inventory.film),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=tuple(parameters),
         sensor=sensor,
     )
     _check_known(draft, reasons)
-    finder = Finder(draft, reasons, census, tail, missed, seed)
+    finder = Finder(draft, reasons, inventory, tail, missed, seed)
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
     return Plan(outputs=asked, film=kind.name, **kept, **vars(found))
 
 
-def census_of(scene: Scene) -> Census:
+def inventory_of(scene: Scene) -> SceneInventory:
     """What the description of a scene contains. Raises ``SceneError`` for one that Mitsuba cannot parse."""
     import mitsuba as mi
 
@@ -187,7 +187,7 @@ def census_of(scene: Scene) -> Census:
             with description.resolved_files(), plugins.plugin_errors():
                 state = description.parse(config)
                 mi.parser.transform_upgrade(config, state)
-                return take_census(state, _lookup)
+                return take_inventory(state, _lookup)
         except TorchTransientError as error:
             raise type(error)(f"{description.name}: {error}") from error
         except (RuntimeError, ValueError, TypeError) as error:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchtransient.errors import SceneError
-from torchtransient.render.census import Census, Finding
 from torchtransient.render.films.choice import FilmChoice, PlannedFilm
 from torchtransient.render.films.choices import all_films
+from torchtransient.render.inventory import Finding, SceneInventory
 
 # What every film can show beside its own measurement.
 _OF_ANY_FILM = ("steady", "stokes", "bands")
@@ -65,77 +65,79 @@ def film_settings(film: PlannedFilm, given: FilmChoice | None, plugin: str | Non
     return given
 
 
-def choose_variant(census: Census, outputs: Sequence[str], device: str, strict: bool) -> tuple[Choice, list[str]]:
+def choose_variant(
+    inventory: SceneInventory, outputs: Sequence[str], device: str, strict: bool
+) -> tuple[Choice, list[str]]:
     """The cheapest variant in which nothing of the scene that was asked for is lost, and what is approximated."""
-    spectral = bool(census.measured or census.bands or "bands" in outputs)
-    if "bands" in outputs and not census.bands:
+    spectral = bool(inventory.measured or inventory.bands or "bands" in outputs)
+    if "bands" in outputs and not inventory.bands:
         raise SceneError(
             "tt.plan: bands are asked for, and no film has response curves. Give the film spectra as children, such as "
             "'red': {'type': 'spectrum', 'value': [(600, 0.0), (650, 1.0), (700, 0.0)]}."
         )
-    colour, colour_why = _colour(census, spectral)
-    polarized, polarization_why, notes = _polarization(census, outputs, strict)
+    colour, colour_why = _colour(inventory, spectral)
+    polarized, polarization_why, notes = _polarization(inventory, outputs, strict)
     if polarized and colour == "rgb":
         colour, colour_why = "spectral", f"{colour_why}, and Mitsuba has no polarized RGB variant"
     name = f"{device}_ad_{colour}" + ("_polarized" if polarized else "")
     return Choice(name, f"variant: {name}; {colour_why}; {polarization_why}"), notes
 
 
-def _colour(census: Census, spectral: bool) -> tuple[str, str]:
-    if census.bands:
-        return "spectral", f"wavelengths, since the film has bands: {some(census.bands)}"
+def _colour(inventory: SceneInventory, spectral: bool) -> tuple[str, str]:
+    if inventory.bands:
+        return "spectral", f"wavelengths, since the film has bands: {some(inventory.bands)}"
     if spectral:
-        return "spectral", f"wavelengths, which three numbers cannot stand in for: {some(census.measured)}"
-    if census.colours:
-        return "rgb", f"colour: {some(census.colours)}"
+        return "spectral", f"wavelengths, which three numbers cannot stand in for: {some(inventory.measured)}"
+    if inventory.colours:
+        return "rgb", f"colour: {some(inventory.colours)}"
     return "mono", "every spectrum is grey, so that one channel carries all of it"
 
 
-def _polarization(census: Census, outputs: Sequence[str], strict: bool) -> tuple[bool, str, list[str]]:
+def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: bool) -> tuple[bool, str, list[str]]:
     if "stokes" in outputs:
         return True, "polarized, since Stokes vectors are asked for", []
-    if census.integrator == "stokes":
+    if inventory.integrator == "stokes":
         return True, "polarized, since the scene's own integrator is stokes", []
-    if census.elements:
-        return True, f"polarized, since it changes the intensity: {some(census.elements)}", []
-    if not census.interfaces:
+    if inventory.elements:
+        return True, f"polarized, since it changes the intensity: {some(inventory.elements)}", []
+    if not inventory.interfaces:
         return False, "unpolarized, since nothing polarizes light", []
-    if not census.interfaces_in_a_row:
-        return False, f"unpolarized, which is exact: a single flat surface polarizes, {some(census.interfaces)}", []
+    if not inventory.interfaces_in_a_row:
+        return False, f"unpolarized, which is exact: a single flat surface polarizes, {some(inventory.interfaces)}", []
     if strict:
-        return True, f"polarized (strict), since light can meet several of these: {some(census.interfaces)}", []
+        return True, f"polarized (strict), since light can meet several of these: {some(inventory.interfaces)}", []
     note = (
         "approximation: the light between polarizing surfaces is taken as unpolarized, as unpolarized renderers do; "
-        f"strict=True carries it. Found: {some(census.interfaces)}"
+        f"strict=True carries it. Found: {some(inventory.interfaces)}"
     )
     return False, "unpolarized, see the approximation", [note]
 
 
-def choose_integrator(census: Census) -> tuple[Choice, list[str]]:
+def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
     """Surface or volume; a transient integrator of the scene that is neither is kept."""
     notes = [
-        f"not used: {some(census.declared_only)}, declared and referred to by nothing"
-    ] if census.declared_only else []  # fmt: skip
-    own = census.integrator or ""
+        f"not used: {some(inventory.declared_only)}, declared and referred to by nothing"
+    ] if inventory.declared_only else []  # fmt: skip
+    own = inventory.integrator or ""
     if own.startswith("transient_") and _ALIASES.get(own, own) not in (SURFACES, VOLUMES):
         return Choice(own, f"integrator: {own}, the scene's own"), notes
-    if census.media:
-        return Choice(VOLUMES, f"integrator: {VOLUMES}, since the scene has {some(census.media)}"), notes
+    if inventory.media:
+        return Choice(VOLUMES, f"integrator: {VOLUMES}, since the scene has {some(inventory.media)}"), notes
     return Choice(SURFACES, f"integrator: {SURFACES}, since no medium can be reached from the scene"), notes
 
 
-def depth_by_albedo(census: Census, tail: float) -> tuple[int | None, str]:
+def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
     """The depth at which at most ``tail`` of the emitted power is still on its way, if the albedos bound it."""
-    if census.albedo >= 1:
-        kept = PLUGIN_DEPTH if census.max_depth is None else census.max_depth
+    if inventory.albedo >= 1:
+        kept = PLUGIN_DEPTH if inventory.max_depth is None else inventory.max_depth
         return None, (
-            f"max_depth: {kept}, kept; not bounded, since {census.brightest} may reflect everything and no pilot run "
-            "was asked for"
+            f"max_depth: {kept}, kept; not bounded, since {inventory.brightest} may reflect everything and no pilot "
+            "run was asked for"
         )
-    bounces = 1 if census.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(census.albedo)))
+    bounces = 1 if inventory.albedo == 0 else max(1, math.ceil(math.log(tail) / math.log(inventory.albedo)))
     depth = bounces + 1
-    left = census.albedo**bounces
+    left = inventory.albedo**bounces
     return depth, (
-        f"max_depth: {depth}; no albedo exceeds {census.albedo:.4g} ({census.brightest}), so that after {bounces} "
-        f"bounces at most {left:.2g} of the emitted power is left"
+        f"max_depth: {depth}; no albedo exceeds {inventory.albedo:.4g} ({inventory.brightest}), so that after "
+        f"{bounces} bounces at most {left:.2g} of the emitted power is left"
     )

@@ -10,8 +10,8 @@ from torchtransient.errors import SceneError
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
-from torchtransient.render.census import Census
 from torchtransient.render.films.choice import FilmChoice, PlannedFilm
+from torchtransient.render.inventory import SceneInventory
 from torchtransient.render.parameters import needing_slope
 from torchtransient.render.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
 from torchtransient.render.scene_handle import Scene, load, unknown_key
@@ -60,9 +60,9 @@ class Finder:
     """The decisions that may need a render: depth, window, temporal filter."""
 
     def __init__(
-        self, draft: Draft, reasons: tuple[str, ...], census: Census, tail: float, missed: float, seed: int
+        self, draft: Draft, reasons: tuple[str, ...], inventory: SceneInventory, tail: float, missed: float, seed: int
     ):
-        self.draft, self.census, self.tail, self.missed = draft, census, tail, missed
+        self.draft, self.inventory, self.tail, self.missed = draft, inventory, tail, missed
         self.seed = seed
         self.arrivals: Arrivals | None = None
         self.report: PilotReport | None = None
@@ -148,7 +148,7 @@ class Finder:
     # ------------------------------------------------------------------------------------------------------ depth
 
     def _depth(self, given: int | str | None) -> int | None:
-        own = choices.PLUGIN_DEPTH if self.census.max_depth is None else self.census.max_depth
+        own = choices.PLUGIN_DEPTH if self.inventory.max_depth is None else self.inventory.max_depth
         if isinstance(given, str) and given != "scene":
             raise SceneError(f"max_depth: expected a number, 'scene' or None, got {given!r}.")
         if given is not None:
@@ -157,7 +157,7 @@ class Finder:
             self.reasons.append(f"max_depth: {depth}, as asked for{self._beyond(depth)}")
             return depth
         if self.arrivals is None:
-            depth, reason = choices.depth_by_albedo(self.census, self.tail)
+            depth, reason = choices.depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(reason)
             return depth
         if self.arrivals.dark:
@@ -216,12 +216,12 @@ class Finder:
             raise SceneError(
                 f"tt.plan: num_bins and bin_width_opl have no effect on the scene's own axis, taken {why}."
             )
-        if self.census.film_axis is None:
+        if self.inventory.film_axis is None:
             raise SceneError(
                 f"tt.plan: the scene's film has no time axis, which would be taken {why}. Give "
                 "time_axis=tt.TimeAxis(start_opl=..., bin_width_opl=..., num_bins=...), or let a pilot run find one."
             )
-        axis = self.census.film_axis
+        axis = self.inventory.film_axis
         self.reasons.append(f"time axis: {axis}, the scene's own, {why}")
         return axis
 
@@ -229,8 +229,8 @@ class Finder:
         num_bins, width = bins
         first, last = arrivals.window(depth or -1, self.missed)
         how = ""
-        if width is None and num_bins is None and self.census.film_axis is not None:
-            width, how = self.census.film_axis.bin_width_opl, ", bin width of the scene's film"
+        if width is None and num_bins is None and self.inventory.film_axis is not None:
+            width, how = self.inventory.film_axis.bin_width_opl, ", bin width of the scene's film"
             if (last - first) / width > MOST_BINS:
                 width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
         if self.spread != (0.0, 0.0):
@@ -258,8 +258,8 @@ class Finder:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
         moving = needing_slope(table, self.draft.parameters)
-        pulsed = bool(self.draft.pulse or self.draft.irf or self.census.pulsed)
-        own = self.census.temporal_filter or "box"
+        pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
+        own = self.inventory.temporal_filter or "box"
         if given is not None:
             check_filter(moving, given, pulsed)
             self.reasons.append(f"temporal filter: {given}, as asked for")
@@ -270,6 +270,6 @@ class Finder:
                 f"temporal filter: {chosen}, since {moving[0]} changes path lengths and a {own} has no slope"
             )
         elif not self.draft.film.all_times:
-            why = "the scene's own" if self.census.temporal_filter else "since no parameter changes a path length"
+            why = "the scene's own" if self.inventory.temporal_filter else "since no parameter changes a path length"
             self.reasons.append(f"temporal filter: {own}, {why}")
         return chosen

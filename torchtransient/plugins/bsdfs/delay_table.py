@@ -98,9 +98,9 @@ class DelayedBSDFs:
     def __init__(self, bsdfs):
         self.bsdfs = bsdfs
         self.rows = PointerTable(bsdfs, range(1, len(bsdfs) + 1))
-        self.late = mi.UInt32([registry_number(bsdf.nested) for bsdf in bsdfs])
+        self.delayed = mi.UInt32([registry_number(bsdf.nested) for bsdf in bsdfs])
         self.at_once = mi.UInt32([registry_number(bsdf.at_once or bsdf.nested) for bsdf in bsdfs])
-        self.only_late = mi.UInt32([int(bsdf.at_once is None) for bsdf in bsdfs])
+        self.only_delayed = mi.UInt32([int(bsdf.at_once is None) for bsdf in bsdfs])
         decays = []
         for bsdf in bsdfs:
             decays.append(0 if bsdf.decay is None else 1 + sum(d > 0 for d in decays) * DECAY_NODES)
@@ -108,7 +108,7 @@ class DelayedBSDFs:
         self.decay_start = mi.UInt32(decays) if tables else None
         self.decay = mi.Float(np.concatenate(tables).astype(np.float32)) if tables else None
         self.spectral_shifts = [(row, bsdf.shift) for row, bsdf in enumerate(bsdfs) if bsdf.shift is not None]
-        dr.make_opaque(self.late, self.at_once, self.only_late, self.decay_start, self.decay)
+        dr.make_opaque(self.delayed, self.at_once, self.only_delayed, self.decay_start, self.decay)
 
     @property
     def shifts(self) -> bool:
@@ -126,40 +126,42 @@ class DelayTable:
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
-    def __init__(self, delayed: DelayedBSDFs):
-        self._of = delayed
+    def __init__(self, bsdfs: DelayedBSDFs):
+        self._of = bsdfs
         with dr.resume_grad():
-            self.lifetimes = _gathered([bsdf.lifetime for bsdf in delayed.bsdfs])
-            self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in delayed.bsdfs])
-            self.late_weights = _gathered([bsdf.weights()[1] for bsdf in delayed.bsdfs])
-        elastic, late = dr.detach(self.elastic_weights), dr.detach(self.late_weights)
-        p = dr.select(elastic + late > 0, late / (elastic + late), 0.5)
+            self.lifetimes = _gathered([bsdf.lifetime for bsdf in bsdfs.bsdfs])
+            self.elastic_weights = _gathered([bsdf.weights()[0] for bsdf in bsdfs.bsdfs])
+            self.delayed_weights = _gathered([bsdf.weights()[1] for bsdf in bsdfs.bsdfs])
+        elastic, delayed = dr.detach(self.elastic_weights), dr.detach(self.delayed_weights)
+        p = dr.select(elastic + delayed > 0, delayed / (elastic + delayed), 0.5)
         p = dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
-        self._probability = dr.select(delayed.only_late == 1, 1, p)
+        self._probability = dr.select(bsdfs.only_delayed == 1, 1, p)
 
     def attached(self) -> list:
         """The tables that carry derivatives."""
-        return [t for t in (self.lifetimes, self.elastic_weights, self.late_weights) if dr.grad_enabled(t)]
+        return [t for t in (self.lifetimes, self.elastic_weights, self.delayed_weights) if dr.grad_enabled(t)]
 
     def sample(self, bsdf, u, wavelengths) -> DelaySample:
-        """How surfaces with BSDFs ``bsdf`` answer, for two uniform numbers ``u``."""
+        """How surfaces with BSDFs ``bsdf`` scatter, for two uniform numbers ``u``."""
         row = self._of.rows.look_up(bsdf)
         there = row > 0
         row = dr.select(there, row - 1, 0)
         p = dr.gather(mi.Float, self._probability, row, there)
-        late = there & (u.x < p)
-        pointer = dr.select(late, dr.gather(mi.UInt32, self._of.late, row, late), dr.reinterpret_array(mi.UInt32, bsdf))
-        pointer = dr.select(there & ~late, dr.gather(mi.UInt32, self._of.at_once, row, there), pointer)
-        late_weight = dr.gather(mi.Float, self.late_weights, row, late) * dr.rcp(dr.select(late, p, 1))
-        once_weight = dr.gather(mi.Float, self.elastic_weights, row, there) * dr.rcp(dr.select(late | ~there, 1, 1 - p))
-        weight = dr.select(late, late_weight, dr.select(there, once_weight, 1))
-        lifetime = dr.gather(mi.Float, self.lifetimes, row, late)
-        delay = dr.select(late, lifetime * self._delay(u.x / dr.select(late, p, 1), row, late), 0)
+        delayed = there & (u.x < p)
+        own = dr.reinterpret_array(mi.UInt32, bsdf)
+        pointer = dr.select(delayed, dr.gather(mi.UInt32, self._of.delayed, row, delayed), own)
+        pointer = dr.select(there & ~delayed, dr.gather(mi.UInt32, self._of.at_once, row, there), pointer)
+        delayed_weight = dr.gather(mi.Float, self.delayed_weights, row, delayed) * dr.rcp(dr.select(delayed, p, 1))
+        once_weight = dr.gather(mi.Float, self.elastic_weights, row, there)
+        once_weight *= dr.rcp(dr.select(delayed | ~there, 1, 1 - p))
+        weight = dr.select(delayed, delayed_weight, dr.select(there, once_weight, 1))
+        lifetime = dr.gather(mi.Float, self.lifetimes, row, delayed)
+        delay = dr.select(delayed, lifetime * self._delay(u.x / dr.select(delayed, p, 1), row, delayed), 0)
         beyond = None
         if self._of.shifts:
             weight, beyond = mi.UnpolarizedSpectrum(weight), mi.UnpolarizedSpectrum(wavelengths)
             for number, shift in self._of.spectral_shifts:
-                chosen = late & (row == number)
+                chosen = delayed & (row == number)
                 absorbed, factor = shift.draw(u.y, wavelengths)
                 weight = dr.select(chosen, weight * factor, weight)
                 beyond = dr.select(chosen, absorbed, beyond)

@@ -21,7 +21,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 
 
 class DelayedBSDF(mi.BSDF):
-    """A nested BSDF whose light comes back late, beside one that answers at once (:monosp:`delayed`).
+    """A nested BSDF whose light comes back late, beside one that scatters at once (:monosp:`delayed`).
 
     The light that the nested BSDF scatters is held for a random time and multiplied by the quantum yield:
     ``f(t) = f_elastic delta(t) + quantum_yield f_nested p(t)`` with the density ``p`` of the delay.
@@ -89,7 +89,7 @@ class DelayedBSDF(mi.BSDF):
 
     @property
     def at_once(self) -> Any:
-        """The BSDF that answers at once, None without one."""
+        """The BSDF that scatters at once, None without one."""
         return self.nested if self.elastic_fraction is not None else self.elastic
 
     def weights(self) -> tuple[Any, Any]:
@@ -101,9 +101,9 @@ class DelayedBSDF(mi.BSDF):
     # --------------------------------------------------------------------- the sum, for integrators without time
 
     def _sum(self) -> list[tuple[Any, Any]]:
-        elastic, late = self.weights()
+        elastic, delayed = self.weights()
         parts = [] if self.at_once is None else [(self.at_once, elastic)]
-        return parts if self.shift is not None else [*parts, (self.nested, late)]
+        return parts if self.shift is not None else [*parts, (self.nested, delayed)]
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         value, pdf = mi.Spectrum(0), mi.Float(0)

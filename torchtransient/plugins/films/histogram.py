@@ -154,8 +154,8 @@ class TransientHDRFilm(TimeResolvedFilm):
     def arrivals(self):
         if self.keeps_steady:
             return None
-        early, late = self.filter.reach
-        return ArrivalWindow(-late * self.bin_width_opl, (self.temporal_bins - early) * self.bin_width_opl)
+        first, last = self.filter.reach
+        return ArrivalWindow(-last * self.bin_width_opl, (self.temporal_bins - first) * self.bin_width_opl)
 
     def end_opl(self) -> float:
         """End of the last bin in metres."""

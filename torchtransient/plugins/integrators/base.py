@@ -318,8 +318,8 @@ class TransientIntegrator(mi.CppADIntegrator):
                 if not self.camera_unwarp:
                     objective += adjoint.slope * length_to_sensor_origin(rays.seen, rays.ray)
                 if mi.is_polarized:
-                    turning = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-                    objective += turning * sensor_rotation(rays.seen, rays.ray).angle()
+                    d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
+                    objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
                 dr.backward_from(objective)
 
     @no_collection()

@@ -7,8 +7,8 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins._registry import PLUGIN_MODULES
-from torchtransient.render.census import POLARIZING_ELEMENTS, POLARIZING_INTERFACES, like_mitsuba
-from torchtransient.render.census_colour import _TRANSPARENT
+from torchtransient.render.inventory import POLARIZING_ELEMENTS, POLARIZING_INTERFACES, like_mitsuba
+from torchtransient.render.inventory_colour import _TRANSPARENT
 
 VARIANT = "llvm_ad_mono_polarized"
 # Every BSDF of Mitsuba 3.9 that stands alone. `hair` needs wavelengths, the measured ones need files.

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.axes import TimeAxis
-from torchtransient.render.census_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
 from torchtransient.render.films.choices import of_plugin
+from torchtransient.render.inventory_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
 
 # Optical elements whose only purpose is polarization: without it even a single one is drawn wrongly.
@@ -38,7 +38,7 @@ class Finding:
 
 
 @dataclass
-class Census:
+class SceneInventory:
     """What was found. Lists are in the order of the description.
 
     ``albedo``: no surface or medium scatters more than this share of the light, 1 when that is not known, with the
@@ -65,24 +65,24 @@ class Census:
     plugins: set[str] = field(default_factory=set)
 
 
-def take_census(state: Any, folder_lookup: Any) -> Census:
+def take_inventory(state: Any, folder_lookup: Any) -> SceneInventory:
     """Read a parser state. ``folder_lookup`` finds a file by the name that a scene uses, as Mitsuba would."""
-    census = Census()
+    inventory = SceneInventory()
     order = reachable(state, roots(state))
-    _note_unused(census, state, set(order))
+    _note_unused(inventory, state, set(order))
     surfaces_of_interfaces: list[int] = []
     for index in order:
         node = state.nodes[index]
         plugin = node.props.plugin_name()
-        census.plugins.add(plugin)
-        _note_physics(census, state, index, surfaces_of_interfaces)
+        inventory.plugins.add(plugin)
+        _note_physics(inventory, state, index, surfaces_of_interfaces)
         if index != 0 and not is_film(node):
-            _note_colours(census, state, index, folder_lookup)
-        _note_film(census, state, node)
-    _note_integrator(census, state)
-    _note_albedo(census, state, order)
-    census.interfaces_in_a_row = _in_a_row(state, order, surfaces_of_interfaces)
-    return census
+            _note_colours(inventory, state, index, folder_lookup)
+        _note_film(inventory, state, node)
+    _note_integrator(inventory, state)
+    _note_albedo(inventory, state, order)
+    inventory.interfaces_in_a_row = _in_a_row(state, order, surfaces_of_interfaces)
+    return inventory
 
 
 def like_mitsuba(plugin: str) -> str:
@@ -104,43 +104,43 @@ def name_of(state: Any, index: int) -> str:
     return f"{label}, {where}" if where else label
 
 
-def _note_unused(census: Census, state: Any, used: set[int]) -> None:
+def _note_unused(inventory: SceneInventory, state: Any, used: set[int]) -> None:
     for _, index in children(state, state.root):
         node = state.nodes[index]
         if index not in used and (
             kind_of_node(node) == "Medium" or like_mitsuba(node.props.plugin_name()) in POLARIZING_ELEMENTS
         ):
-            census.declared_only.append(Finding(node.props.plugin_name(), name_of(state, index)))
+            inventory.declared_only.append(Finding(node.props.plugin_name(), name_of(state, index)))
 
 
 # --------------------------------------------------------------------------------------------------------- findings
 
 
-def _note_physics(census: Census, state: Any, index: int, interfaces: list[int]) -> None:
+def _note_physics(inventory: SceneInventory, state: Any, index: int, interfaces: list[int]) -> None:
     node = state.nodes[index]
     plugin = node.props.plugin_name()
     if kind_of_node(node) == "Medium":
-        census.media.append(Finding("participating medium", name_of(state, index)))
+        inventory.media.append(Finding("participating medium", name_of(state, index)))
     if like_mitsuba(plugin) in POLARIZING_ELEMENTS:
-        census.elements.append(Finding(plugin, name_of(state, index)))
+        inventory.elements.append(Finding(plugin, name_of(state, index)))
     elif like_mitsuba(plugin) in POLARIZING_INTERFACES:
-        census.interfaces.append(Finding(plugin, name_of(state, index)))
+        inventory.interfaces.append(Finding(plugin, name_of(state, index)))
         interfaces.append(index)
 
 
-def _note_colours(census: Census, state: Any, index: int, folder_lookup: Any) -> None:
+def _note_colours(inventory: SceneInventory, state: Any, index: int, folder_lookup: Any) -> None:
     node = state.nodes[index]
     where = name_of(state, index)
     found = [colour_of_node(node, folder_lookup)]
     found += [colour_of_value(node, key, value) for key, value in node.props.items()]
     for verdict in found:
         if verdict is not None and verdict.kind == COLOUR:
-            census.colours.append(Finding(verdict.why, where))
+            inventory.colours.append(Finding(verdict.why, where))
         elif verdict is not None and verdict.kind == MEASURED:
-            census.measured.append(Finding(verdict.why, where))
+            inventory.measured.append(Finding(verdict.why, where))
 
 
-def _note_film(census: Census, state: Any, node: Any) -> None:
+def _note_film(inventory: SceneInventory, state: Any, node: Any) -> None:
     """The first sensor's film counts, as it does in a render."""
     import mitsuba as mi
 
@@ -151,35 +151,35 @@ def _note_film(census: Census, state: Any, node: Any) -> None:
         nested = isinstance(value, mi.Properties.ResolvedReference)
         curve = nested and kind_of_node(state.nodes[value.index()]) == "Texture"
         if curve or props.type(key) == mi.Properties.Type.Spectrum:
-            census.bands.append(Finding(f"response curve {key!r}", props.plugin_name()))
-    if census.film is not None:
+            inventory.bands.append(Finding(f"response curve {key!r}", props.plugin_name()))
+    if inventory.film is not None:
         return
-    census.film = props.plugin_name()
-    census.pulsed = any(name in props for name in ("pulse", "irf"))
+    inventory.film = props.plugin_name()
+    inventory.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:
-        census.temporal_filter = str(props["temporal_filter"])
-    kind = of_plugin(census.film)
-    census.film_axis = None if kind is None else kind.axis_in(props)
+        inventory.temporal_filter = str(props["temporal_filter"])
+    kind = of_plugin(inventory.film)
+    inventory.film_axis = None if kind is None else kind.axis_in(props)
 
 
-def _note_integrator(census: Census, state: Any) -> None:
+def _note_integrator(inventory: SceneInventory, state: Any) -> None:
     for _, index in children(state, state.root):
         props = state.nodes[index].props
         if is_integrator(state.nodes[index]):
-            census.integrator = props.plugin_name()
+            inventory.integrator = props.plugin_name()
             # Mitsuba's `stokes`, `aov` and `moment` measure what a nested integrator traces.
             nested = find_child(state, state.nodes[index], is_integrator)
             for inner in (props, *([] if nested is None else [state.nodes[nested].props])):
                 if "max_depth" in inner:
-                    census.max_depth = int(inner["max_depth"])
+                    inventory.max_depth = int(inner["max_depth"])
             if props.get("temporal_filter", ""):
-                census.temporal_filter = str(props["temporal_filter"])
+                inventory.temporal_filter = str(props["temporal_filter"])
 
 
 # ------------------------------------------------------------------------------------------------------------ albedo
 
 
-def _note_albedo(census: Census, state: Any, order: list[int]) -> None:
+def _note_albedo(inventory: SceneInventory, state: Any, order: list[int]) -> None:
     import mitsuba as mi
 
     for index in order:
@@ -192,8 +192,8 @@ def _note_albedo(census: Census, state: Any, order: list[int]) -> None:
             bound = max((_reflectance(state, child) for child in surface), default=0.5)
         elif kind_of_node(node) == "Medium":
             bound = _largest(state, node, "albedo", 0.75)
-        if bound is not None and bound > census.albedo:
-            census.albedo, census.brightest = bound, name_of(state, index)
+        if bound is not None and bound > inventory.albedo:
+            inventory.albedo, inventory.brightest = bound, name_of(state, index)
 
 
 def _reflectance(state: Any, index: int) -> float:
