@@ -18,7 +18,7 @@ from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sampl
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.forward import forward, tangents_of
+from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents, tangents_of
 from torchtransient.plugins.transport.derivative.reverse import reverse
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.film import FilmSink
@@ -387,16 +387,3 @@ class TransientIntegrator(mi.CppADIntegrator):
             f"{type(self).__name__}[\n  max_depth = {self.max_depth},\n  rr_depth = {self.rr_depth},\n"
             f"  camera_unwarp = {self.camera_unwarp},\n  discard_direct_light = {self.discard_direct_light}\n]"
         )
-
-
-def propagate_tangents(world):
-    """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
-    attached = world.contents.parameters(world.scene).attached_values()
-    attached += [table for table in world.tables() if dr.grad_enabled(table)]
-    if not attached:
-        return
-    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
-    # On to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so already.
-    for value in attached:
-        dr.enqueue(dr.ADMode.Forward, value)
-    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)

@@ -15,6 +15,19 @@ from torchtransient.plugins.transport.derivative.vertex import attached_carry, v
 from torchtransient.plugins.transport.sinks.record import RecordedVertex
 
 
+def propagate_tangents(world):
+    """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
+    attached = world.contents.parameters(world.scene).attached_values()
+    attached += [table for table in world.tables() if dr.grad_enabled(table)]
+    if not attached:
+        return
+    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
+    # On to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so already.
+    for value in attached:
+        dr.enqueue(dr.ADMode.Forward, value)
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+
+
 def tangents_of(values):
     """Tangents of attached values; zero for those that carry none."""
     attached = [v for v in values if dr.grad_enabled(v)]
