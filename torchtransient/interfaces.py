@@ -205,12 +205,85 @@ class FilmInterface(abc.ABC):
         """Light that arrived after the window: sum over pixels, mean over channels (of S0)."""
 
 
+class IntegratorInterface(abc.ABC):
+    """A transient integrator: what ``render/`` and the pilot run ask of it beyond ``mi.Integrator``.
+
+    Beside the members below an instance has ``max_depth``, ``rr_depth``, ``camera_unwarp``, ``temporal_filter`` (empty:
+    the film's own) and ``gaussian_stddev`` (None: the film's own).
+    """
+
+    max_depth: int
+    rr_depth: int
+    camera_unwarp: bool
+    temporal_filter: str
+    gaussian_stddev: float | None
+
+    @property
+    @abc.abstractmethod
+    def walks_through_media(self) -> bool:
+        """Whether paths scatter in participating media; others refuse scenes that have them."""
+
+    @abc.abstractmethod
+    def strategies(self, contents: Any) -> tuple[Any, Any, list[Any]]:
+        """(segment, scattering, list of connections) for a scene with these contents: new objects for every job."""
+
+    @abc.abstractmethod
+    def resolve(self, scene: Any, sensor: Any) -> tuple[Any, Any]:
+        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film."""
+
+    @abc.abstractmethod
+    def contents(self, scene: Any, sensor: Any) -> Any:
+        """What the scene contains (``SceneContents``), looked up when it is first seen by this sensor."""
+
+    @abc.abstractmethod
+    def world(self, scene: Any, sensor: Any, contents: Any, wanted: Any = None, window: Any = None) -> Any:
+        """What the walks of one job are told (``World``)."""
+
+    @abc.abstractmethod
+    def reference(self, scene: Any) -> Any:
+        """The sphere around the scene that light from and to infinity is timed by."""
+
+    @abc.abstractmethod
+    def frozen_state(self, scene: Any, sensor: Any = 0) -> list[Any]:
+        """The arrays that kernels of this scene read beside its parameters."""
+
+    @abc.abstractmethod
+    def passes(self, sensor: Any, film: Any, seed: Any, spp: int) -> tuple[list[Any], int]:
+        """The launches of a job, and the largest number of samples per pixel."""
+
+    @abc.abstractmethod
+    def start(self, scene: Any, sensor: Any, film: Any, job: Any) -> Any:
+        """The primary rays of one launch (``PrimaryRays``)."""
+
+    @abc.abstractmethod
+    def first_opl(self, film: Any, rays: Any) -> Any:
+        """Optical path before the first ray starts, counted from the film's ``start_opl``."""
+
+    @abc.abstractmethod
+    def render(
+        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+    ) -> Any:
+        """Render steady ``(H, W, C)`` and the film's array."""
+
+    @abc.abstractmethod
+    def render_backward(
+        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> None:
+        """Accumulate the gradient of ``<grad_in, render()>`` into the attached parameters of the scene."""
+
+    @abc.abstractmethod
+    def render_forward(
+        self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True
+    ) -> Any:
+        """Derivatives of a render along the tangents of the scene's attached parameters."""
+
+
 def is_time_resolved(film: object) -> TypeGuard[FilmInterface]:
     """Whether a film is one that transient integrators can write to, of whichever variant it was made."""
     return isinstance(film, FilmInterface)
 
 
-INTERFACES: tuple[type, ...] = (FilmInterface,)
+INTERFACES: tuple[type, ...] = (FilmInterface, IntegratorInterface)
 
 
 def missing_members(plugin: type) -> list[str]:

@@ -42,8 +42,7 @@ def test_built_once_a_scene(scene, monkeypatch):
             built.append(args)
             super().__init__(*args)
 
-    module = type(scene.integrator()).__mro__[1].__module__
-    monkeypatch.setattr(f"{module}.SceneContents", Counted)
+    monkeypatch.setattr("torchtransient.plugins.integrators.seen_scene.SceneContents", Counted)
     monkeypatch.setattr("torchtransient.plugins.integrators.launch.MAX_LANES", 8)
     integrator, params = scene.integrator(), mi.traverse(scene)
     shape = scene.sensors()[0].film().cube_shape()
@@ -60,6 +59,16 @@ def test_built_once_a_scene(scene, monkeypatch):
     assert len(built) == 1
 
 
+def test_sensors_take_turns():
+    """Views that are rendered in turn, as by a renderer with several sensors, keep what was looked up for each."""
+    description = room(depth=3)
+    description["second"] = description["sensor"]
+    scene = mi.load_dict(description, optimize=False)
+    integrator, (first, second) = scene.integrator(), scene.sensors()
+    found = [integrator.contents(scene, sensor) for sensor in (first, second, first, second)]
+    assert found[0] is found[2] and found[1] is found[3]
+
+
 def test_of_another_scene_is_looked_up_anew():
     first, second = (mi.load_dict(room(bsdf=bsdf, depth=3), optimize=False) for bsdf in (None, {"type": "conductor"}))
     integrator = mi.load_dict({"type": "transient_path", "max_depth": 3})
@@ -70,7 +79,8 @@ def test_of_another_scene_is_looked_up_anew():
 def test_keeps_no_scene_alive():
     """The scene owns the integrator: one that kept the scene would never be freed."""
     scene = mi.load_dict(room(depth=3), optimize=False)
-    contents_of(scene).parameters(scene)
+    contents_of(scene)
+    scene.integrator().parameters(scene)
     integrator = weakref.ref(scene.integrator())
     gc.disable()
     try:
@@ -89,7 +99,7 @@ def test_wanted_follows_what_parameters_move(scene):
             dr.enable_grad(params[key])
             params.set_dirty(key)
         params.update()
-        found = Wanted(contents.parameters(scene).attached(), sensor, contents)
+        found = Wanted(scene.integrator().parameters(scene).attached(), sensor, contents)
         for key in keys:
             dr.disable_grad(params[key])
         params.update()

@@ -7,13 +7,14 @@ import mitsuba as mi
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
+from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
-from torchtransient.plugins.parameters import check_slope, moving_names
+from torchtransient.plugins.integrators.seen_scene import SeenScene
+from torchtransient.plugins.parameters import ParameterTracker, check_slope, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
-from torchtransient.plugins.sampling.distant import distant_reference
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry
@@ -40,6 +41,7 @@ class PrimaryRays:
         self.row, self.column, self.seen = row, column, seen
 
 
+@IntegratorInterface.register
 class TransientIntegrator(mi.CppADIntegrator):
     """Abstract base of the transient integrators.
 
@@ -70,7 +72,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         if "gaussian_stddev" in props:
             self.gaussian_stddev = float(props["gaussian_stddev"])
             check_stddev(self.gaussian_stddev)
-        self._reference = self._contents = None
+        self._seen = None
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
@@ -90,7 +92,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 raise SceneError(f"sensor index: the scene has {len(sensors)} sensors, got index {sensor}.")
             sensor = sensors[sensor]
         film = sensor.film()
-        if not hasattr(film, "transient_bands"):
+        if not is_time_resolved(film):
             raise SceneError(
                 "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
                 f"sensor has {film.class_name()}; change the film's type in the scene."
@@ -109,21 +111,22 @@ class TransientIntegrator(mi.CppADIntegrator):
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
 
-    def strategies(self, contents):
-        """(segment, scattering, list of connections) for a scene with these contents: new objects for every job."""
-        raise NotImplementedError
-
     def contents(self, scene, sensor) -> SceneContents:
-        """What the scene contains, looked up when it is first seen by this sensor.
+        """What the scene contains, looked up when it is first seen by this sensor."""
+        return self._seen_scene(scene).contents_for(scene, sensor)
 
-        The scene itself is not kept, since it owns the integrator and would never be freed; one of its shapes is, so
-        that no later scene can be taken for this one because it got the same addresses.
-        """
-        shapes = scene.shapes()
-        key = (scene.ptr, sensor.ptr, *(shape.ptr for shape in shapes))
-        if self._contents is None or self._contents[0] != key:
-            self._contents = (key, SceneContents(scene, sensor, self.reference(scene)), shapes[:1])
-        return self._contents[1]
+    def parameters(self, scene) -> ParameterTracker:
+        """The parameters of the scene, to be asked which of them carry gradients."""
+        return self._seen_scene(scene).tracker(scene)
+
+    def reference(self, scene):
+        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
+        return self._seen_scene(scene).reference
+
+    def _seen_scene(self, scene) -> SeenScene:
+        if self._seen is None or not self._seen.is_of(scene):
+            self._seen = SeenScene(scene)
+        return self._seen
 
     def world(self, scene, sensor, contents, wanted=None, window=None) -> World:
         """What the walks of one job are told."""
@@ -138,16 +141,6 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         sensor, film = self.resolve(scene, sensor)
         return arrays_below([self.contents(scene, sensor), vars(film)])
-
-    def reference(self, scene):
-        """The sphere around the scene as it was first seen, which light from and to infinity is timed by: moving a
-        shape must not shift the clock.
-        """
-        shapes = scene.shapes()
-        key = (scene.ptr, *(shape.ptr for shape in shapes))
-        if self._reference is None or self._reference[0] != key:
-            self._reference = (key, distant_reference(scene), shapes[:1])
-        return self._reference[1]
 
     def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel."""
@@ -238,19 +231,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, self.max_depth)
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), FilmSink(block))
-        self._add_steady(film, match.to_channels(kept["L"]), pixel)
-        if film.outside is not None:
-            for side, name in enumerate(("before", "after")):
-                dr.scatter_reduce(dr.ReduceOp.Add, film.outside, type(film.outside)(kept[name]), pixel * 2 + side)
+        film.add_steady(pixel, match.to_channels(kept["L"]))
+        film.add_outside(pixel, kept["before"], kept["after"])
         block.finish()
-
-    @staticmethod
-    def _add_steady(film, channels, pixel):
-        """Add to the steady image, unless the film makes it of its array."""
-        if film.keeps_steady:
-            for c, value in enumerate(channels):
-                index = pixel * film.channel_count() + c
-                dr.scatter_reduce(dr.ReduceOp.Add, film.steady, type(film.steady)(value), index)
 
     @no_collection()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -282,8 +265,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-            effects = contents.parameters(scene).attached()
-        check_slope(moving_names(effects), film.has_slope, film.temporal_filter, film.slope_remedy)
+            effects = self.parameters(scene).attached()
+        check_slope(moving_names(effects), film.has_slope, film.response_name, film.slope_remedy)
         if self.max_depth == UNLIMITED:
             raise GradientError(
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
@@ -334,7 +317,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             contents, wanted = self._wanted(scene, sensor, film)
             world = self.world(scene, sensor, contents, wanted, film.arrivals())
             with dr.resume_grad():
-                propagate_tangents(world)
+                propagate_tangents(self.parameters(scene), world)
             jobs, samples = self.passes(sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for job in jobs:
@@ -350,7 +333,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         block = film.create_block(job, base, match, self.max_depth, tangents=True)
         tangent = self._tangent_of(world, rays)
         dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
-        self._add_steady(film, match.to_channels(dL), pixel)
+        film.add_steady(pixel, match.to_channels(dL))
         block.finish()
 
     def _tangent_of(self, world, rays) -> Carry:

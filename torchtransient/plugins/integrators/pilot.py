@@ -51,7 +51,7 @@ class _PilotFilm:
 
     def __init__(self, film, size: tuple[int, int]):
         self._size = mi.ScalarVector2u(*size)
-        self.curves = getattr(film, "curves", None)
+        self.curves = film.curves
 
     def crop_size(self):
         return self._size

@@ -1,4 +1,4 @@
-"""What a scene contains, looked up once a scene, so that the loops hold only what the scene calls for."""
+"""What a scene contains, looked up once a scene and sensor, so that the loops hold only what the scene calls for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
-from torchtransient.plugins.parameters import ParameterTracker
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.media_contents import media_of
@@ -42,15 +41,6 @@ class SceneContents:
         self.media = media_of(scene, sensor)
         self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
         self._built = True
-
-    def parameters(self, scene: Any) -> ParameterTracker:
-        """The parameters of ``scene``, whose contents these are, to be asked which of them carry gradients.
-
-        Walked over when first asked for: a render has no use for it.
-        """
-        if "_tracker" not in vars(self):
-            vars(self)["_tracker"] = ParameterTracker(scene)
-        return vars(self)["_tracker"]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if getattr(self, "_built", False):

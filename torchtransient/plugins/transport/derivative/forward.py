@@ -15,9 +15,9 @@ from torchtransient.plugins.transport.derivative.vertex import attached_carry, v
 from torchtransient.plugins.transport.sinks.record import RecordedVertex
 
 
-def propagate_tangents(world):
-    """Bring the tangents of the scene's parameters to where the loop meets them, outside of its isolated scope."""
-    attached = world.contents.parameters(world.scene).attached_values()
+def propagate_tangents(parameters, world):
+    """Bring the tangents of the scene's ``parameters`` to where the loop meets them, outside of its isolated scope."""
+    attached = parameters.attached_values()
     attached += [table for table in world.tables() if dr.grad_enabled(table)]
     if not attached:
         return

@@ -1,0 +1,47 @@
+"""What an integrator remembers of the scene that it has seen last."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchtransient.plugins.parameters import ParameterTracker
+from torchtransient.plugins.sampling.distant import DistantReference, distant_reference
+from torchtransient.plugins.transport.contents import SceneContents
+
+
+class SeenScene:
+    """Look-ups that need to be made once a scene: the ``reference`` sphere of distant light, the contents by sensor,
+    the parameters.
+
+    The reference is that of the scene as it was first seen: moving a shape must not shift the clock. The scene itself
+    is not kept, since it owns the integrator and would never be freed; one of its shapes is, so that no later scene can
+    be taken for this one because it got the same addresses.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self.reference: DistantReference = distant_reference(scene)
+        self._key = _key_of(scene)
+        self._kept = scene.shapes()[:1]
+        self._contents: dict[int, tuple[Any, SceneContents]] = {}
+        self._tracker: ParameterTracker | None = None
+
+    def is_of(self, scene: Any) -> bool:
+        """Whether it is this scene."""
+        return self._key == _key_of(scene)
+
+    def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
+        """What the scene contains for a sensor, which may stand in a medium."""
+        if sensor.ptr not in self._contents:
+            # With the sensor, so that no later one can be taken for it.
+            self._contents[sensor.ptr] = sensor, SceneContents(scene, sensor, self.reference)
+        return self._contents[sensor.ptr][1]
+
+    def tracker(self, scene: Any) -> ParameterTracker:
+        """The scene's parameters. Walked over when first asked for: a render has no use for it."""
+        if self._tracker is None:
+            self._tracker = ParameterTracker(scene)
+        return self._tracker
+
+
+def _key_of(scene: Any) -> tuple[int, ...]:
+    return (scene.ptr, *(shape.ptr for shape in scene.shapes()))
