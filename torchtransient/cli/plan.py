@@ -48,7 +48,6 @@ def command(scene: Path, **options: Any) -> None:
     # Without a start, bins and their width are wishes for the axis that the plan finds.
     wishes = ("num_bins", "bin_width_opl") if options["start_opl"] is None else ()
     film = from_options({name: value for name, value in options.items() if name not in wishes})
-    asked = {} if film is None else {film.argument: film.argument_value()}
     found = tt.plan(
         load_scene(scene, None, options["params"]),
         options["outputs"],
@@ -60,7 +59,7 @@ def command(scene: Path, **options: Any) -> None:
         strict=options["strict"],
         pilot=not options["no_pilot"],
         seed=options["seed"],
+        film=film,
         **{name: options[name] for name in wishes},
-        **asked,
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if options["as_json"] else str(found))

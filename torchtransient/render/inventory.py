@@ -65,8 +65,10 @@ class SceneInventory:
     plugins: set[str] = field(default_factory=set)
 
 
-def take_inventory(state: Any, folder_lookup: Any) -> SceneInventory:
-    """Read a parser state. ``folder_lookup`` finds a file by the name that a scene uses, as Mitsuba would."""
+def take_inventory(state: Any, folder_lookup: Any, sensor: int = 0) -> SceneInventory:
+    """Read a parser state. ``folder_lookup`` finds a file by the name that a scene uses, as Mitsuba would; the film of
+    ``sensor`` counts.
+    """
     inventory = SceneInventory()
     order = reachable(state, roots(state))
     _note_unused(inventory, state, set(order))
@@ -78,7 +80,8 @@ def take_inventory(state: Any, folder_lookup: Any) -> SceneInventory:
         _note_physics(inventory, state, index, surfaces_of_interfaces)
         if index != 0 and not is_film(node):
             _note_colours(inventory, state, index, folder_lookup)
-        _note_film(inventory, state, node)
+        _note_bands(inventory, state, node)
+    _note_film(inventory, state, order, sensor)
     _note_integrator(inventory, state)
     _note_albedo(inventory, state, order)
     inventory.interfaces_in_a_row = _in_a_row(state, order, surfaces_of_interfaces)
@@ -140,8 +143,7 @@ def _note_colours(inventory: SceneInventory, state: Any, index: int, folder_look
             inventory.measured.append(Finding(verdict.why, where))
 
 
-def _note_film(inventory: SceneInventory, state: Any, node: Any) -> None:
-    """The first sensor's film counts, as it does in a render."""
+def _note_bands(inventory: SceneInventory, state: Any, node: Any) -> None:
     import mitsuba as mi
 
     if not is_film(node):
@@ -152,8 +154,16 @@ def _note_film(inventory: SceneInventory, state: Any, node: Any) -> None:
         curve = nested and kind_of_node(state.nodes[value.index()]) == "Texture"
         if curve or props.type(key) == mi.Properties.Type.Spectrum:
             inventory.bands.append(Finding(f"response curve {key!r}", props.plugin_name()))
-    if inventory.film is not None:
+
+
+def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: int) -> None:
+    sensors = [state.nodes[index] for index in roots(state) if kind_of_node(state.nodes[index]) == "Sensor"]
+    films = [find_child(state, node, is_film) for node in sensors[sensor : sensor + 1]]
+    # A sensor whose kind is not known here, or that is not there, which the render will say.
+    films = films or [index for index in order if is_film(state.nodes[index])][:1]
+    if not films or films[0] is None:
         return
+    props = state.nodes[films[0]].props
     inventory.film = props.plugin_name()
     inventory.pulsed = any(name in props for name in ("pulse", "irf"))
     if "temporal_filter" in props:

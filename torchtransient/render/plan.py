@@ -147,7 +147,7 @@ def plan(
             raise UnitError(f"tt.plan: {name} is a share of the light between 0 and 1, got {share!r}.")
     loaded = load(scene)
     asked = choices.checked_outputs(outputs)
-    inventory = inventory_of(loaded)
+    inventory = inventory_of(loaded, sensor)
     device = loaded.variant.split("_")[0]
     given = film_asked_for(film, {"frequencies": frequencies, "gates": gates})
     if given is not None and given.has_axis:
@@ -176,8 +176,10 @@ def plan(
     return Plan(outputs=asked, film=kind.name, **kept, **vars(found))
 
 
-def inventory_of(scene: Scene) -> SceneInventory:
-    """What the description of a scene contains. Raises ``SceneError`` for one that Mitsuba cannot parse."""
+def inventory_of(scene: Scene, sensor: int = 0) -> SceneInventory:
+    """What the description of a scene contains, and the film of one of its sensors. Raises ``SceneError`` for one that
+    Mitsuba cannot parse.
+    """
     import mitsuba as mi
 
     description = scene._description
@@ -187,7 +189,7 @@ def inventory_of(scene: Scene) -> SceneInventory:
             with description.resolved_files(), plugins.plugin_errors():
                 state = description.parse(config)
                 mi.parser.transform_upgrade(config, state)
-                return take_inventory(state, _lookup)
+                return take_inventory(state, _lookup, sensor)
         except TorchTransientError as error:
             raise type(error)(f"{description.name}: {error}") from error
         except (RuntimeError, ValueError, TypeError) as error:

@@ -35,7 +35,7 @@ class Moments(FilmChoice):
     plugin: ClassVar[str] = "moments_hdr_film"
     letter: ClassVar[str] = "K"
     argument: ClassVar[str] = "moments"
-    example: ClassVar[str] = "moments=3"
+    example: ClassVar[str] = "film=Moments(3)"
     output: ClassVar[str] = "moments"
     plan_name: ClassVar[str] = "moments"
     noun: ClassVar[str] = "moments film"
@@ -147,7 +147,7 @@ def test_plan():
     assert plan.film == "moments" and plan.temporal_filter == "" and plan.time_axis is None
     assert plan.to_dict()["moments"] == 2 and plan.to_dict()["time_axis"] is None
     assert plan.renderer(spp=1)(seed=0).others["moments"].shape[1] == 2
-    with pytest.raises(SceneError, match="Give moments=3"):
+    with pytest.raises(SceneError, match=r"Give film=Moments\(3\)"):
         tt.plan(make_room(), "moments")
     with pytest.raises(SceneError, match="add 'moments' to the outputs"):
         tt.plan(make_room(), film=Moments(2))

@@ -82,6 +82,16 @@ def test_steady_gates_beside_a_window_that_cuts():
         tt.TransientRenderer(scene, steady=False)
 
 
+def test_a_plan_is_about_the_film_of_its_sensor():
+    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"], {**HISTOGRAM, "bin_width_opl": 0.5}), variant=VARIANT)
+    gated = tt.plan(scene, "gates", sensor=1)
+    assert gated.renderer(spp=1)(seed=0).gated.shape == (3, 2, 3, 4)
+    with pytest.raises(SceneError, match="neither the film nor the call has gates"):
+        tt.plan(scene, "gates")
+    plans = [tt.plan(scene, sensor=sensor, time_axis="scene", pilot=False) for sensor in (0, 2)]
+    assert [plan.time_axis.bin_width_opl for plan in plans] == [0.25, 0.5]
+
+
 # ---------------------------------------------------------------------------------------- changed and put back
 
 
