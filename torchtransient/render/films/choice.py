@@ -41,8 +41,8 @@ class FilmChoice(abc.ABC):
     plugin: ClassVar[str]
     # Letter of the dimension between channels and rows.
     letter: ClassVar[str]
-    # What the settings are called, which is the keyword of TransientRenderer and tt.plan for the films that have one;
-    # how a call asks for this film, written out for messages ("film=..." for films without a keyword).
+    # What the settings are called: the keyword of TransientRenderer and tt.plan for films that have one. How a call
+    # asks for this film, written out for messages ("film=..." for films without a keyword).
     argument: ClassVar[str]
     example: ClassVar[str]
     # What tt.plan(outputs=...) calls it, and what the plan calls the film.
