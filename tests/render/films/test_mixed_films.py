@@ -145,7 +145,7 @@ def test_a_render_that_fails_leaves_no_filter_behind(monkeypatch):
     before = filters_of(renderer)
     integrator = type(renderer.scene.built(renderer._options).scene.integrator())
     with monkeypatch.context() as patch:
-        patch.setattr(integrator, "trace", lambda *_a, **_k: 1 / 0)
+        patch.setattr(integrator, "start", lambda *_a, **_k: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             renderer(seed=0)
     assert filters_of(renderer) == before

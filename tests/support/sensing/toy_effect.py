@@ -1,0 +1,25 @@
+"""A sensor effect that the library does not have, written as an author of a new one would."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.layout import check_transient
+from torchtransient.sensing.sensor import Sensor
+
+
+class StrayLight(Sensor):
+    """A share of the light of every pixel is spread over all of them by reflections inside the lens."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        if not 0 <= share <= 1:
+            raise UnitError(f"StrayLight: expected a share between 0 and 1, got {share!r}.")
+        self.share = nn.Parameter(torch.tensor(float(share)))
+
+    def expected(self, x: Tensor) -> Tensor:
+        check_transient(x, "StrayLight")
+        share = self.share.to(x.dtype)
+        return (1 - share) * x + share * x.mean((-2, -1), keepdim=True)
