@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.bsdfs.refraction_table import RefractionTable
+from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 
 VARIANT = "llvm_ad_mono"
 DIFFUSE = {"type": "diffuse"}
@@ -35,8 +35,8 @@ def test_none_where_nothing_refracts_through_a_lobe():
         {"type": "diff_dielectric"},
         {"type": "hair"},
     ):
-        assert RefractionTable.of(scene_of(bsdf)) is None
-    assert RefractionTable.of(scene_of({"type": "principled", "roughness": 0.5})) is None
+        assert RefractiveBSDFs.of(scene_of(bsdf)) is None
+    assert RefractiveBSDFs.of(scene_of({"type": "principled", "roughness": 0.5})) is None
 
 
 @pytest.mark.parametrize(
@@ -63,14 +63,14 @@ def test_none_where_nothing_refracts_through_a_lobe():
 )
 def test_index(bsdf, index):
     scene = scene_of(DIFFUSE, bsdf, {"type": "dielectric", "int_ior": 2.0})
-    table = RefractionTable.of(scene)
+    table = RefractiveBSDFs.of(scene).read()
     np.testing.assert_allclose(across(table, scene), [1, index, 1], rtol=1e-6)
     np.testing.assert_allclose(across(table, scene, outside=False), [1, 1 / index, 1], rtol=1e-6)
 
 
 def test_same_side_is_the_same_medium():
     scene = scene_of(GLASS)
-    table = RefractionTable.of(scene)
+    table = RefractiveBSDFs.of(scene).read()
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
     si.wi.z = mi.Float(1, -1)
     pointers = mi.BSDFPtr([scene.shapes()[0].bsdf()] * 2)
@@ -84,24 +84,24 @@ def test_shapes_of_groups_are_found():
         "instance": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
     })  # fmt: skip
     si = scene.ray_intersect(mi.Ray3f([0, 0, 5], [0, 0, -1]))
-    table = RefractionTable.of(scene)
+    table = RefractiveBSDFs.of(scene).read()
     assert table.relative_index(si.bsdf(), si, mi.Vector3f(0, 0, -1))[0] == pytest.approx(1.7)
 
 
 def test_parts_with_different_indices_are_refused():
     blend = {"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": {**GLASS, "int_ior": 1.3}}
     with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
-        RefractionTable.of(scene_of(blend))
+        RefractiveBSDFs.of(scene_of(blend))
 
 
-def test_refresh_reads_new_values():
+def test_reading_again_finds_new_values():
     scene = scene_of(OURS)
-    table = RefractionTable.of(scene)
+    found = RefractiveBSDFs.of(scene)
+    np.testing.assert_allclose(across(found.read(), scene), [1.5])
     params = mi.traverse(scene)
     params["s0.bsdf.eta"] = mi.Float(1.25)
     params.update()
-    table.refresh()
-    np.testing.assert_allclose(across(table, scene), [1.25])
+    np.testing.assert_allclose(across(found.read(), scene), [1.25])
 
 
 @dr.syntax
@@ -129,7 +129,7 @@ def test_derivative_inside_a_suspended_loop(glass):
     si.wi = mi.Vector3f(0, 0, mi.Float(1, 1, -1, -1, 1))
     wo = mi.Vector3f(0, 0, mi.Float(1, -1, 1, -1, -1))
     with dr.suspend_grad():
-        table = RefractionTable.of(scene)
+        table = RefractiveBSDFs.of(scene).read()
         total = _sum_of_slopes(table, mi.BSDFPtr([scene.shapes()[0].bsdf()] * 5), si, wo)
     np.testing.assert_allclose(total.numpy(), [3, 4.5, 2, 3, 4.5], rtol=1e-6)
     assert dr.grad(params[key])[0] == pytest.approx(3 * (1 - 1 / 1.5**2 + 1), rel=1e-5)

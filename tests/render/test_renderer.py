@@ -318,9 +318,9 @@ def small_bands(monkeypatch):
 
 def small_launches(monkeypatch):
     """At most 64 samples per pixel in one kernel launch. Holds while the scene's variant stays active."""
-    from torchtransient.plugins.integrators import base
+    from torchtransient.plugins.integrators import launch
 
-    monkeypatch.setattr(base, "MAX_LANES", 64 * 12)
+    monkeypatch.setattr(launch, "MAX_LANES", 64 * 12)
 
 
 @pytest.mark.parametrize("split", [small_bands, small_launches])
