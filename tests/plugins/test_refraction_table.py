@@ -94,9 +94,10 @@ def test_parts_with_different_indices_are_refused():
         RefractiveBSDFs.of(scene_of(blend))
 
 
-def test_values_are_read_as_they_are_now():
+def test_reading_again_finds_new_values():
     scene = scene_of(OURS)
     found = RefractiveBSDFs.of(scene)
+    np.testing.assert_allclose(across(found.read(), scene), [1.5])
     params = mi.traverse(scene)
     params["s0.bsdf.eta"] = mi.Float(1.25)
     params.update()

@@ -208,8 +208,16 @@ def test_indices_that_bend_nothing_keep_the_box(plugin):
 def test_table_of_a_scene_with_a_parameter_that_is_not_set():
     room = make_room()
     room["box"]["bsdf"] = {"type": "hair"}
-    absorption = tt.load(room, variant=VARIANT).parameters()["box.bsdf.sigma_a"]
+    scene = tt.load(room, variant=VARIANT)
+    absorption = scene.parameters()["box.bsdf.sigma_a"]
     assert absorption.value is None and absorption.shape is None and not absorption.differentiable
+    renderer = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=4, grad_seed="same")
+    out = renderer(seed=0).transient
+    out.sum().backward()
+    intensity = renderer.values["light.intensity.value"]
+    # The image is proportional to the intensity.
+    slope = (intensity.grad * intensity.detach()).sum()
+    torch.testing.assert_close(slope, out.detach().sum(), rtol=1e-4, atol=0)
 
 
 def test_extinction_is_told_from_albedo():
