@@ -109,14 +109,14 @@ class FilmInterface(abc.ABC):
         """Offset from the pixel's centre drawn from the spatial filter, and the sample's weight (None for one)."""
 
     @abc.abstractmethod
-    def lanes_at_most(self, depth: int) -> int | None:
-        """Largest number of paths of ``depth`` segments in one kernel launch, None for no limit."""
+    def lanes_at_most(self, most_events: int) -> int | None:
+        """Largest number of paths with up to ``most_events`` events in one kernel launch, None for no limit."""
 
     @abc.abstractmethod
-    def create_block(self, job: Any, base: Any, match: Any, depth: int, tangents: bool = False) -> Any:
+    def create_block(self, job: Any, base: Any, match: Any, most_events: int, tangents: bool = False) -> Any:
         """How the samples of one pass write (``FilmBlock``). ``job``: the pass, with the number of its band; ``base``:
-        index of each sample's first entry in it; ``match``: from spectra to channels; ``depth``: longest path in
-        segments; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        index of each sample's first entry in it; ``match``: from spectra to channels; ``most_events`` of
+        a path; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
         """
 
     @abc.abstractmethod
@@ -229,15 +229,17 @@ class IntegratorInterface(abc.ABC):
 
     @abc.abstractmethod
     def resolve(self, scene: Any, sensor: Any) -> tuple[Any, Any]:
-        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film."""
+        """The sensor and its film, checked; temporal filter settings of the integrator are handed to the film, which
+        keeps them.
+        """
 
     @abc.abstractmethod
     def contents(self, scene: Any, sensor: Any) -> Any:
         """What the scene contains (``SceneContents``), looked up when it is first seen by this sensor."""
 
     @abc.abstractmethod
-    def world(self, scene: Any, sensor: Any, contents: Any, wanted: Any = None, window: Any = None) -> Any:
-        """What the walks of one job are told (``World``)."""
+    def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+        """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
 
     @abc.abstractmethod
     def reference(self, scene: Any) -> Any:
@@ -248,7 +250,7 @@ class IntegratorInterface(abc.ABC):
         """The arrays that kernels of this scene read beside its parameters."""
 
     @abc.abstractmethod
-    def passes(self, sensor: Any, film: Any, seed: Any, spp: int) -> tuple[list[Any], int]:
+    def passes(self, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> tuple[list[Any], int]:
         """The launches of a job, and the largest number of samples per pixel."""
 
     @abc.abstractmethod

@@ -175,7 +175,9 @@ def test_several_launches_and_bands(monkeypatch):
     for limit in (24 * 10 * per_path, 7 * 16 * per_path):
         monkeypatch.setattr(f"{FILMS}.phasor.MAX_EVENT_BYTES", limit)
         film = scene.sensors()[0].film()
-        assert len(scene.integrator().passes(scene.sensors()[0], film, 0, 16)[0]) > 1
+        integrator, sensor = scene.integrator(), scene.sensors()[0]
+        world = integrator.world(scene, integrator.contents(scene, sensor))
+        assert len(integrator.passes(world, sensor, film, 0, 16)[0]) > 1
         several = np.array([render(scene, 30 + seed)[1] for seed in range(12)])
         for part in (np.real, np.imag):
             result = two_sample_z_test(part(one), part(several), rounding=1e-6)

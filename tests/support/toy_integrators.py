@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from support.toy_strategies import AreaOfShape, OwnPointLight, SecondEmitterSample
+from support.toy_strategies import AreaOfShape, OwnPointLight, SecondEmitterSample, ThirdEmitterSample
 from torchtransient.plugins import register
-from torchtransient.plugins.integrators import path, volpath
+from torchtransient.plugins.integrators import volpath
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
 from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 
 
@@ -16,7 +18,7 @@ class TwoEmitterSamples(volpath.TransientVolpath):
 
     def strategies(self, contents):
         segment, scattering, _ = super().strategies(contents)
-        return segment, scattering, [EmitterFound(), EmitterSampled(0.5), SecondEmitterSample(0.5)]
+        return segment, scattering, [EmitterFound(), EmitterSampled(), SecondEmitterSample()]
 
 
 class WithPointLight(volpath.TransientVolpath):
@@ -27,13 +29,25 @@ class WithPointLight(volpath.TransientVolpath):
         return segment, scattering, [*connections, OwnPointLight([0.5, 0.0, 4.0], 10.0)]
 
 
-class Guided(path.TransientPath):
-    """Half of the next vertices are drawn over the area of the shape ``side``."""
+class Guided(volpath.TransientVolpath):
+    """Half of the next vertices are drawn over the area of the shapes ``side`` and ``wall``."""
 
     def strategies(self, contents):
-        return Vacuum(), Surface([AreaOfShape("side", 0.5)]), [EmitterFound(), EmitterSampled()]
+        guides = [AreaOfShape("side", 0.3, "first"), AreaOfShape("wall", 0.2, "second")]
+        if contents.media is None:
+            return Vacuum(), Surface(guides), [EmitterFound(), EmitterSampled()]
+        return Media(), SurfaceOrMedium(guides), [EmitterFound(), EmitterSampled()]
 
 
+class ThreeEmitterSamples(volpath.TransientVolpath):
+    """Every vertex is connected to three points on lights."""
+
+    def strategies(self, contents):
+        segment, scattering, _ = super().strategies(contents)
+        return segment, scattering, [EmitterFound(), EmitterSampled(), SecondEmitterSample(), ThirdEmitterSample()]
+
+
+register("integrator", "transient_three_emitter_samples", ThreeEmitterSamples)
 register("integrator", "transient_two_emitter_samples", TwoEmitterSamples)
 register("integrator", "transient_with_point_light", WithPointLight)
 register("integrator", "transient_guided", Guided)

@@ -12,13 +12,19 @@ from torchtransient.plugins.polarized import product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, distance, solid_angle_over_area
-from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Guide, Local, Proposal
 
 
 class SecondEmitterSample(EmitterSampled):
     """A second point on a light, with random numbers of its own."""
 
     name = "second_emitter_sample"
+
+
+class ThirdEmitterSample(EmitterSampled):
+    """A third one."""
+
+    name = "third_emitter_sample"
 
 
 class OwnPointLight(Connection):
@@ -32,15 +38,17 @@ class OwnPointLight(Connection):
     def propose(self, world, path, vertex, sampler):
         p = mi.Point3f(self.position)
         to = p - vertex.at.p
-        ds = Local(p=p, d=dr.normalize(to), dist=dr.norm(to))
-        return Proposal(d=ds.d, active=vertex.goes_on & vertex.connectable, ds=ds, u=mi.Point2f(0.5), sampler=sampler)
+        ds = Local(p=p, n=mi.Normal3f(0), d=dr.normalize(to), dist=dr.norm(to), delta=mi.Bool(True), emitter=None)
+        active, u = vertex.goes_on & vertex.connectable, sampler.next_2d()
+        return Proposal(d=ds.d, active=active, ds=ds, u=u, sampler=sampler)
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds = proposal.ds
-        value = product(path.β, answer.value) * (self.intensity / dr.square(ds.dist))
-        opl = vertex.delay.after(path.τ) + mi.Float64(ds.dist * path.η * answer.eta)
-        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, proposal.active)
-        return Event(value=dr.select(active, value * T, 0), opl=opl, active=active, depth=path.depth + 2, T=T)
+        value = product(vertex.β, answer.value) * (self.intensity / dr.square(ds.dist))
+        opl = vertex.scattered_τ + mi.Float64(ds.dist * vertex.η * answer.eta)
+        active = world.counted(proposal.active, opl)
+        active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
+        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
     def fields(self, world):
         return {"lit": mi.Bool} | ({"T": mi.UnpolarizedSpectrum} if world.contents.media is not None else {})
@@ -66,22 +74,20 @@ class OwnPointLight(Connection):
         return [EventTerm(value=product(vertex.carry.β, dr.select(lit, value, 0)), slope=slope, opl=opl, active=lit)]
 
 
-class AreaOfShape:
-    """A guide: some of the next vertices are drawn uniformly over the area of the shape called ``shape_id``."""
+class AreaOfShape(Guide):
+    """Some of the next vertices are drawn uniformly over the area of the shape called ``shape_id``."""
 
-    def __init__(self, shape_id, share):
-        self.shape_id, self.share = shape_id, share
+    def __init__(self, shape_id, share, name="area_of_shape"):
+        self.shape_id, self.share, self.name = shape_id, share, name
 
     def prepare(self, world):
         self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
         self.per_area = 1 / self.shape.surface_area()
 
-    def draw(self, vertex, sampler):
-        chosen = sampler.next_1d() < self.share
-        return self.shape.sample_position(0.0, sampler.next_2d()).p, chosen
+    def draw(self, world, vertex, sampler):
+        return self.shape.sample_position(0.0, sampler.next_2d()).p
 
-    def density(self, vertex, ray, leg, active):
-        on_it = active & leg.is_valid() & (leg.shape == mi.ShapePtr(self.shape))
-        si = leg.compute_surface_interaction(ray, mi.RayFlags.Minimal, on_it)
-        per_area = solid_angle_over_area(vertex.at.p, si.p, si.n, on_it)
+    def density(self, world, p, q, n, shape, active):
+        on_it = active & (shape == mi.ShapePtr(self.shape))
+        per_area = solid_angle_over_area(p, q, n, on_it)
         return dr.select(on_it & (per_area > 0), self.per_area / per_area, 0)

@@ -35,10 +35,10 @@ def traced(scene, sink_of):
     integrator = scene.integrator()
     with dr.suspend_grad():
         sensor, film = integrator.resolve(scene, 0)
-        job = integrator.passes(sensor, film, SEED, SPP)[0][0]
+        world = integrator.world(scene, integrator.contents(scene, sensor))
+        job = integrator.passes(world, sensor, film, SEED, SPP)[0][0]
         rays = integrator.start(scene, sensor, film, job)
         sink = sink_of(integrator, film, rays, job)
-        world = integrator.world(scene, sensor, integrator.contents(scene, sensor))
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), integrator.first_opl(film, rays), sink)
         dr.eval(kept)
         return sink, kept

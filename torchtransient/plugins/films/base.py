@@ -76,10 +76,10 @@ class TimeResolvedFilm(mi.Film):
     def arrivals(self):
         return None
 
-    def lanes_at_most(self, depth: int) -> int | None:
+    def lanes_at_most(self, most_events: int) -> int | None:
         return None
 
-    def create_block(self, job, base, match, depth: int, tangents: bool = False) -> FilmBlock:
+    def create_block(self, job, base, match, most_events: int, tangents: bool = False) -> FilmBlock:
         return FilmBlock(self, job.band, base, match)
 
     def create_adjoint_block(self, response, base, steady, match) -> AdjointBlock:

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, events_at_most, rotation
+from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, rotation, slots_for
 from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 
 # The events of one kernel launch wait in memory until the next kernel sums them up; larger jobs take several launches.
@@ -141,14 +141,14 @@ class PhasorHDRFilm(TimeResolvedFilm):
         """Floats behind one pixel."""
         return self.frequency_count() * 2 * self.channel_count()
 
-    def lanes_at_most(self, depth: int) -> int | None:
-        per_path = events_at_most(depth, tangents=False) * (EVENT_BYTES + 4 * self.channel_count())
+    def lanes_at_most(self, most_events: int) -> int | None:
+        per_path = slots_for(most_events) * (EVENT_BYTES + 4 * self.channel_count())
         return max(1, MAX_EVENT_BYTES // per_path)
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def create_block(self, job, base, match, depth, tangents=False):
-        return EventBlock(self, job, base, match, depth, tangents)
+    def create_block(self, job, base, match, most_events, tangents=False):
+        return EventBlock(self, job, base, match, most_events, tangents)
 
     def _table(self, flat):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count())

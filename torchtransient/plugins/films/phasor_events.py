@@ -27,9 +27,9 @@ GROUP = 64
 BLOCK = 16
 
 
-def events_at_most(depth: int, tangents: bool) -> int:
-    """Events kept for a path of ``depth`` segments: emission found, next-event estimation, emission ahead."""
-    return min((3 if tangents else 2) * max(depth, 1), MAX_EVENTS)
+def slots_for(most_events: int) -> int:
+    """Events kept for a path that has ``most_events`` at most."""
+    return min(max(most_events, 1), MAX_EVENTS)
 
 
 def rotation(turns):
@@ -42,12 +42,12 @@ def rotation(turns):
 class EventBlock(FilmBlock):
     """Keeps the events of each path of one pass and sums them up in ``finish``."""
 
-    def __init__(self, film, job, base, match, depth, tangents):
+    def __init__(self, film, job, base, match, most_events, tangents):
         super().__init__(film, job.band, base, match)
         self.first_row, _, self.cube = film.bands[job.band]
         self.job, self.tangents = job, tangents
-        self.slots = events_at_most(depth, tangents)
-        self.overflows = (3 if tangents else 2) * depth > self.slots
+        self.slots = slots_for(most_events)
+        self.overflows = most_events > self.slots
         self.width = int(film.crop_size()[0])
         self.paths = self.width * job.rows * job.spp
         numbers = film.channel_count() * (2 if tangents else 1)

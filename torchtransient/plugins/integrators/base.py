@@ -31,9 +31,9 @@ UNLIMITED = 0xFFFFFFFF
 
 
 class PrimaryRays:
-    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``row`` and ``column``
-    of the pixel, the :class:`~..sensors.origin.View` of every sensor (``seen``), and ``match`` (ChannelMatch). A plain
-    object, which Dr.Jit loops leave alone.
+    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``scale`` (of a sample
+    in its pixel), ``row`` and ``column`` of the pixel, and the :class:`~..sensors.origin.View` of every sensor
+    (``seen``). A plain object, which Dr.Jit loops leave alone.
     """
 
     def __init__(self, sampler, ray, weight, scale, row, column, seen):
@@ -128,12 +128,15 @@ class TransientIntegrator(mi.CppADIntegrator):
             self._seen = SeenScene(scene)
         return self._seen
 
-    def world(self, scene, sensor, contents, wanted=None, window=None) -> World:
-        """What the walks of one job are told."""
-        settings = PathSettings(
+    def settings(self) -> PathSettings:
+        """The integrator's parameters for a walk."""
+        return PathSettings(
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
-        return World(scene, contents, settings, self.strategies(contents), wanted, window)
+
+    def world(self, scene, contents, wanted=None, window=None, settings=None) -> World:
+        """What the walks of one job are told; ``settings``: other than the integrator's own."""
+        return World(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
 
     def frozen_state(self, scene, sensor=0) -> list:
         """The arrays that kernels of this scene read beside its parameters, for ``dr.freeze(..., state_fn=...)``: see
@@ -142,9 +145,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         sensor, film = self.resolve(scene, sensor)
         return arrays_below([self.contents(scene, sensor), vars(film)])
 
-    def passes(self, sensor, film, seed, spp) -> tuple[list[Pass], int]:
+    def passes(self, world, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel."""
-        return passes_of(sensor.sampler().clone(), film, seed_array(seed), spp, self.max_depth)
+        return passes_of(sensor.sampler().clone(), film, seed_array(seed), spp, world.most_events())
 
     def start(self, scene, sensor, film, job: Pass) -> PrimaryRays:
         """The primary rays of one pass."""
@@ -212,8 +215,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             if develop:
                 film.check_one_band()
-            world = self.world(scene, sensor, self.contents(scene, sensor), window=film.arrivals())
-            jobs, samples = self.passes(sensor, film, seed, int(spp))
+            world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
+            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for i, job in enumerate(jobs):
                 self._render_pass(world, sensor, film, job)
@@ -229,7 +232,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         rays = self.start(world.scene, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
-        block = film.create_block(job, base, match, self.max_depth)
+        block = film.create_block(job, base, match, world.most_events())
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), FilmSink(block))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
@@ -252,8 +255,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             g_steady, g_transient = grad_in
             if g_steady is None and g_transient is None:
                 return
-            world = self.world(scene, sensor, contents, wanted, film.arrivals())
-            jobs, _ = self.passes(sensor, film, seed, int(spp))
+            world = self.world(scene, contents, wanted, film.arrivals())
+            jobs, _ = self.passes(world, sensor, film, seed, int(spp))
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad():
@@ -315,10 +318,10 @@ class TransientIntegrator(mi.CppADIntegrator):
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             contents, wanted = self._wanted(scene, sensor, film)
-            world = self.world(scene, sensor, contents, wanted, film.arrivals())
+            world = self.world(scene, contents, wanted, film.arrivals())
             with dr.resume_grad():
                 propagate_tangents(self.parameters(scene), world)
-            jobs, samples = self.passes(sensor, film, seed, int(spp))
+            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
             for job in jobs:
                 self._forward_pass(world, sensor, film, job)
@@ -330,7 +333,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         rays = self.start(world.scene, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
-        block = film.create_block(job, base, match, self.max_depth, tangents=True)
+        block = film.create_block(job, base, match, world.most_events(), tangents=True)
         tangent = self._tangent_of(world, rays)
         dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
         film.add_steady(pixel, match.to_channels(dL))

@@ -27,9 +27,9 @@ class Pass:
     seed: Any
 
 
-def passes_of(sampler: Any, film: Any, seed: Any, spp: int, depth: int) -> tuple[list[Pass], int]:
+def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) -> tuple[list[Pass], int]:
     """The launches of a job of ``spp`` samples per pixel (0: the sampler's own number), and the largest number of
-    samples of a pixel. ``sampler`` is changed.
+    samples of a pixel. ``sampler`` is changed. ``most_events``: of one path.
 
     Some samplers round the number of samples of a launch, so that storage bands of different heights may get different
     totals.
@@ -38,7 +38,7 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, depth: int) -> tuple
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
     width = int(film.crop_size()[0])
-    most = min(MAX_LANES, film.lanes_at_most(depth) or MAX_LANES)
+    most = min(MAX_LANES, film.lanes_at_most(most_events) or MAX_LANES)
     result = []
     for band, (first_row, rows) in enumerate(film.band_layout()):
         counts = _launch_counts(sampler, spp, max(1, most // (width * rows)))

@@ -6,13 +6,14 @@ depth. What a plan wants to know (how deep, from when until when) is then a ques
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from torchtransient._collection import no_collection
+from torchtransient.errors import VariantError
 from torchtransient.plugins.films.colour import ChannelMatch, mean_of
 from torchtransient.plugins.integrators.launch import Pass, seed_array
 from torchtransient.plugins.transport.sinks.event_list import EventListSink
@@ -74,20 +75,20 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
     the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the latest. Raises what the integrator raises
     for scenes that it cannot render.
     """
+    if mi.is_polarized:
+        raise VariantError(
+            f"pilot_events: expected a variant without polarization, which changes neither depths nor times, got "
+            f"{mi.variant()!r}; load the scene in {mi.variant().removesuffix('_polarized')!r}."
+        )
     sensor, film = integrator.resolve(scene, sensor)
     size = pilot_size(film, pixels)
-    before = integrator.max_depth, integrator.rr_depth
-    integrator.max_depth, integrator.rr_depth = PILOT_DEPTH, min(before[1], PILOT_RR_DEPTH)
-    try:
-        slots = _EVENTS_PER_PATH
-        while True:
-            spp = max(1, min(paths, _MAX_EVENTS // slots) // (size[0] * size[1]))
-            events, spp, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots)
-            if most <= slots:
-                break
-            slots = most + most // 8
-    finally:
-        integrator.max_depth, integrator.rr_depth = before
+    slots = _EVENTS_PER_PATH
+    while True:
+        spp = max(1, min(paths, _MAX_EVENTS // slots) // (size[0] * size[1]))
+        events, spp, most = _trace(scene, integrator, sensor, _PilotFilm(film, size), size, spp, seed, slots)
+        if most <= slots:
+            break
+        slots = most + most // 8
     depth = np.array(events.depth, dtype=np.int64)
     filled = np.flatnonzero(depth)
     path = filled // slots
@@ -117,7 +118,9 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         match = ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves)
         sink = EventListSink(size[0] * size[1] * spp, slots, lambda value: _energy(match, value, film.curves))
         # Without a window: what the sensor's film would not count is asked for, too.
-        world = integrator.world(scene, sensor, integrator.contents(scene, sensor))
+        settings = integrator.settings()
+        settings = replace(settings, max_depth=PILOT_DEPTH, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
+        world = integrator.world(scene, integrator.contents(scene, sensor), settings=settings)
         walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink)
         most = dr.max(sink.used)
         dr.eval(most, sink.opl, sink.energy, sink.depth)

@@ -17,7 +17,6 @@ from __future__ import annotations
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 
 
 class Local:
@@ -31,59 +30,71 @@ class Local:
 
 
 class Vertex(Local):
-    """The end of a segment in the primal walk.
+    """The end of a segment in the primal walk. Connections read it; ``path`` still belongs to the segment before.
 
-    ``si`` (SurfaceInteraction3f, valid at surfaces), ``at`` (Interaction3f that rays and emitter samples start from),
-    ``valid`` (something was hit), ``surface`` (it is not a point in a medium), ``opl`` (Float64, optical length of the
-    segment), ``β`` (throughput at its end), ``ray`` and ``leg`` (how it was reached). The scattering adds ``bsdf``,
-    ``delay`` (DelaySample), ``connectable``; the loop adds ``goes_on``.
+    From the segment: ``si`` (SurfaceInteraction3f, valid at surfaces), ``at`` (Interaction3f that rays and emitter
+    samples start from), ``valid`` (something was hit), ``surface`` (it is not a point in a medium), ``opl`` (Float64,
+    optical length of the segment), ``β`` (throughput at its end), ``ray`` and ``leg`` (how it was reached); in media
+    also ``scatter, mei, medium``. From the loop: ``τ`` (Float64, optical path length up to it), ``η`` (index along the
+    segment), ``goes_on`` (the path may have a further vertex). From the scattering: ``bsdf``, ``delay``
+    (DelaySample), ``scattered_si`` and ``at`` with the wavelengths beyond the surface, ``connectable`` (light can be
+    found by connecting to it), ``scattered_τ`` (``τ`` and the delay: where connections start to count).
     """
 
 
 class Proposal(Local):
-    """Where a connection wants to connect to: ``d`` (unit Vector3f in the world), ``active``, and what is its own."""
+    """Where a connection wants to connect to: ``d`` (unit Vector3f in the world), ``active`` (a subset of
+    ``vertex.goes_on``, which keeps to ``max_depth``), ``ds`` (what lies there: ``p, n, d, dist, delta, emitter`` of a
+    DirectionSample3f, as far as guides are used), and what is the connection's own.
+    """
 
 
 class Answer(Local):
     """Scattering towards a proposal: ``value`` (what it makes of unpolarized light, in the frame of the segment towards
-    the sensor), ``pdf`` (per solid angle, of the scattering's own sampling), ``eta`` (relative index on that side).
+    the sensor), ``pdf`` (per solid angle, with which the walk would have gone there), ``eta`` (relative index on that
+    side). Not defined where the proposal is not active.
     """
 
 
 class Step(Local):
-    """The next direction ``out``: ``weight`` (value over pdf), ``pdf``, ``eta`` (relative index), ``delta`` (Bool),
-    ``unconnected`` (no connection could have found what lies there), ``u_lobe`` and ``u_dir`` (its random numbers).
+    """The next direction ``out`` (``wo`` in the local frame): ``weight`` (value over pdf), ``pdf``, ``eta`` (relative
+    index), ``delta`` (Bool), ``unconnected`` (no connection could have found what lies there), the random numbers
+    ``u_lobe, u_dir, u_delay``.
     """
 
 
 class Event(Local):
     """Light that arrives: ``value`` (throughput included), ``opl`` (Float64, minus the film's start), ``active``,
-    ``depth`` (UInt32, the smallest ``max_depth`` of a render that contains it).
+    ``depth`` (UInt32, the smallest ``max_depth`` of a render that contains it), and what the strategy records of it.
+    The loop makes ``value`` zero where it is not active.
     """
 
 
 class EventTerm(Local):
     """An event with derivatives: ``value`` (attached, times the attached throughput), ``slope`` (Float: zero with the
     derivative of the arrival), ``opl`` (Float64, detached), ``active``.
+
+    ``value`` has to be zero where it is not active, selected before it is multiplied with the throughput: what an idle
+    lane holds must not reach the adjoint.
     """
 
 
 class Strategy:
-    """A part of the walk. ``name`` is unique within a world and names its part of the record."""
+    """A part of the walk. ``name`` is unique within a world and names its part of the record. Integrators make new
+    strategies for every job, so that ``prepare`` may keep what it likes.
+    """
 
     name = ""
 
     def prepare(self, world: Any) -> None:
-        """Once a job, outside of traced code: what all lanes share."""
+        """Once a job, outside of traced code, with gradients enabled: what all lanes share."""
 
     def tables(self) -> list[Any]:
         """What ``prepare`` has computed of parameters: attached where they are."""
         return []
 
     def fields(self, world: Any) -> dict[str, Any]:
-        """Types of the numbers that ``attached`` cannot recompute, by name. Random numbers of its own are called
-        ``u`` (Point2f).
-        """
+        """Types of the numbers that ``attached`` cannot recompute, by name."""
         return {}
 
     def record(self, sample: Any) -> dict[str, Any]:
@@ -108,11 +119,17 @@ class Segment(Strategy):
         raise NotImplementedError
 
     def arrive(self, world: Any, path: Any) -> Vertex:
-        """The vertex at the end of the current leg."""
+        """The vertex at the end of the current leg. Sensors do not see lights where ``world.hide_emitters``."""
+        raise NotImplementedError
+
+    def surface_of(self, leg: Any) -> tuple[Any, Any]:
+        """(PreliminaryIntersection3f of the next surface, whether the leg ends there)."""
         raise NotImplementedError
 
     def transmittance(self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
-        """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: numbers to draw with."""
+        """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
+        numbers that were drawn for this vertex and serve as the start of a generator.
+        """
         raise NotImplementedError
 
     def restore(self, v: Any, ray: Any) -> tuple[Any, Any]:
@@ -136,7 +153,9 @@ class Segment(Strategy):
         return 1
 
     def attached(self, world: Any, v: Any, carry: Any, wanted: Any) -> Any:
-        """The :class:`.vertex.AttachedVertex` of a recorded one: slope and throughput of ``carry`` move to it."""
+        """The :class:`.vertex.AttachedVertex` of a recorded one: slope and throughput of ``carry`` move to it, and its
+        ``end`` is what :meth:`end` says.
+        """
         raise NotImplementedError
 
     def attached_transmittance(self, world: Any, vertex: Any, connected: Any, active: Any) -> Any:
@@ -147,24 +166,57 @@ class Segment(Strategy):
 
 
 class Connection(Strategy):
-    """Light that is found at a vertex, or that a vertex is connected to."""
+    """Light that is found at a vertex, or that a vertex is connected to.
+
+    What a connection owes: it keeps to ``vertex.goes_on`` and ``vertex.connectable``, asks ``world.counted`` before it
+    traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
+    ``vertex.η * answer.eta``.
+    """
+
+    # Whether all of its light is that of the scene's emitters, so that their box bounds where it can come from.
+    light_of_scene_alone = False
+
+    def events(self, wanted: Any) -> int:
+        """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
+        return 1
 
     def propose(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> Proposal | None:
         """A direction in which scattering is asked for, None where none is."""
         return None
 
     def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
-        """The event. ``zeros`` (static): events of value zero matter, too."""
+        """The event. ``zeros`` (static): events of value zero matter for a derivative, so that the visible ones of
+        them are active, too.
+        """
         raise NotImplementedError
 
     def density(self, world: Any, ref: Any, ds: Any, active: Any) -> Any:
-        """Density per solid angle at ``ref`` with which this strategy finds the light's point ``ds``; the others ask
-        for it to weigh their own samples. Zero where it never does.
+        """Density with which this strategy samples the light's point ``ds`` from ``ref``: per solid angle, and for a
+        light without extent the probability of choosing it. None where it samples none.
         """
-        return mi.Float(0)
+        return None
+
+    def weight(self, world: Any, ref: Any, ds: Any, density: Any, pdf: Any, active: Any) -> Any:
+        """Weight of a sample ``ds`` of this strategy, which has the density ``density`` for it; ``pdf``: that with
+        which scattering finds it, 0 where it cannot.
+
+        All connections count as one technique of density ``B = sum b_i`` beside scattering with density ``A`` (power
+        heuristic), and share its weight by their densities: ``b_i / B * B^2 / (A^2 + B^2)``. A strategy of another file
+        that samples lights changes the weights of all by its ``density`` alone.
+        """
+        others = [c.density(world, ref, ds, active) for c in world.connections if c is not self]
+        others = [other for other in others if other is not None]
+        if not others:
+            return mis_weight(density, pdf)
+        total = density + sum(others)
+        return dr.select(total > 0, density / total, 0) * mis_weight(total, pdf)
 
     def claims(self, world: Any, emitter: Any, wanted: Any) -> Any:
-        """Mask of the emitters that derivatives reach by this strategy alone; None for none."""
+        """Mask of the emitters that derivatives reach by connections alone; None for none."""
+        return None
+
+    def numbers(self, recorded: dict[str, Any]) -> list[Any] | None:
+        """Two uniform numbers out of the record that were drawn at the vertex, None where there are none."""
         return None
 
     def attached(self, world: Any, vertex: Any, step: Any, wanted: Any) -> list[EventTerm]:
@@ -172,10 +224,31 @@ class Connection(Strategy):
         raise NotImplementedError
 
 
+class Guide(Strategy):
+    """Draws some of the next vertices in place of the scattering: a point, which counts only if the ray arrives there.
+
+    ``share`` of all samples are its own; the scattering weighs them by the densities of guides and scattering together.
+    It needs no attached form: the vertex is differentiated as every other one.
+    """
+
+    share = 0.5
+
+    def draw(self, world: Any, vertex: Vertex, sampler: Any) -> Any:
+        """A Point3f on a surface."""
+        raise NotImplementedError
+
+    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any) -> Any:
+        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``."""
+        raise NotImplementedError
+
+
 class Scattering(Strategy):
-    """What happens to light at a vertex."""
+    """What happens to light at a vertex. Which indices of refraction and delta lobes there are follows from the scene's
+    contents.
+    """
 
     name = "scattering"
+    guides: Any = ()
 
     def arrive(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
         """Look up how the vertex scatters, before any connection is proposed."""
@@ -187,15 +260,23 @@ class Scattering(Strategy):
         """
         raise NotImplementedError
 
-    def evaluate(self, world: Any, vertex: Any, out: Any, active: Any, sampled: bool = False) -> Any:
+    def weigh(self, world: Any, path: Any, vertex: Vertex, step: Step, ray: Any, leg: Any) -> None:
+        """With guides: weight and density of ``step``, once it is known how its segment ends."""
+
+    def look_up_attached(self, world: Any, vertex: Any, wanted: Any) -> None:
+        """Look up how an attached vertex scatters, before :meth:`attached` and the connections'."""
+        raise NotImplementedError
+
+    def evaluate(self, world: Any, vertex: Any, out: Any, active: Any, sampled: bool = False, ds: Any = None) -> Any:
         """A :class:`Local` with attached ``value``, ``pdf``, ``wo`` (local direction) and ``eta`` towards the attached
-        world direction ``out``. ``sampled``: the direction was drawn by the scattering itself.
+        world direction ``out``. ``sampled``: the direction was drawn by the scattering itself. ``ds``: what lies there,
+        if it is a light's point.
         """
         raise NotImplementedError
 
     def attached(self, world: Any, vertex: Any, wanted: Any) -> Any:
         """The next step with derivatives: Local with ``carry`` behind the vertex, ``inv_pdf`` of the recorded
-        direction, ``ahead`` (the next vertex was found by a smooth lobe).
+        direction, ``ahead`` (the next vertex was found by a smooth lobe). Its record has the mask ``delta``.
         """
         raise NotImplementedError
 

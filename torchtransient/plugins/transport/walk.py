@@ -47,17 +47,17 @@ def start(world, ray, first_opl) -> Path:
 
 
 def bounce(world, path, kept, sampler, sink):
-    """One turn of the loop: changes ``path`` and ``kept``.
+    """One turn of the loop: changes ``path`` (at its end) and ``kept``.
 
     Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
     """
     # ------------------------------------------------------------------------- vertex
     vertex = world.segment.arrive(world, path)
-    path.τ = path.τ + vertex.opl
-    β_before, path.β = path.β, vertex.β
+    vertex.τ, vertex.η = path.τ + vertex.opl, path.η
     vertex.goes_on = path.active & (path.depth + 1 < world.max_depth) & vertex.valid
-    vertex.goes_on = world.in_time(vertex.goes_on, path.τ, vertex.at.p)
+    vertex.goes_on = world.in_time(vertex.goes_on, vertex.τ, vertex.at.p)
     world.scattering.arrive(world, path, vertex, sampler)
+    vertex.scattered_τ = vertex.delay.after(vertex.τ)
 
     # ------------------------------------------------------------------------- events
     proposals = [c.propose(world, path, vertex, sampler) for c in world.connections]
@@ -65,35 +65,36 @@ def bounce(world, path, kept, sampler, sink):
     samples = {}
     for c, proposal, answer in zip(world.connections, proposals, answers, strict=True):
         event = c.connect(world, path, vertex, proposal, answer, sink.zeros)
+        event.value = dr.select(event.active, event.value, 0)
         sink.event(kept, event)
         samples[c.name] = Local(proposal=proposal, event=event)
 
     # ------------------------------------------------------------- to the next vertex
     ray, leg = vertex.at.spawn_ray(step.out), None
     if world.scattering.guides:  # the density of what a guide drew is known once the segment has ended
-        leg = world.segment.depart(world, ray, vertex, path.β, sampler, vertex.goes_on)
+        leg = world.segment.depart(world, ray, vertex, vertex.β, sampler, vertex.goes_on)
         world.scattering.weigh(world, path, vertex, step, ray, leg)
     β, goes_on, rr = roulette(world, path, vertex, step, sampler, sink.zeros)
     samples[world.segment.name], samples[world.scattering.name] = vertex, step
-    samples["walk"] = Local(β=β_before, τ=path.τ, η=path.η, rr=rr, goes_on=goes_on)
+    samples["walk"] = Local(β=path.β, τ=vertex.τ, η=path.η, rr=rr, goes_on=goes_on)
     sink.vertex(kept, path, samples)
 
     path.ray, path.depth, path.active = ray, path.depth + 1, goes_on
     path.prev_p, path.prev_n = vertex.at.p, vertex.at.n
     path.prev_pdf, path.prev_unconnected = step.pdf, step.unconnected
-    path.β, path.η, path.τ = β, path.η * step.eta, vertex.delay.after(path.τ)
+    path.β, path.η, path.τ = β, path.η * step.eta, vertex.scattered_τ
     path.leg = leg if leg is not None else world.segment.depart(world, ray, vertex, β, sampler, goes_on)
 
 
 def roulette(world, path, vertex, step, sampler, zeros):
     """(throughput behind the vertex, whether the path goes on, factor of the throughput)."""
-    β, goes_on = product(path.β, step.weight), vertex.goes_on
+    β, goes_on = product(vertex.β, step.weight), vertex.goes_on
     β_max = dr.max(mi.unpolarized_spectrum(β))
     if zeros:
         # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black
         # surface.
         weight_max = dr.max(mi.unpolarized_spectrum(step.weight))
-        first_black = (weight_max == 0) & (dr.max(mi.unpolarized_spectrum(path.β)) > 0) & (step.pdf > 0)
+        first_black = (weight_max == 0) & (dr.max(mi.unpolarized_spectrum(vertex.β)) > 0) & (step.pdf > 0)
         goes_on &= (weight_max > 0) | first_black
         β_max = dr.select(β_max == 0, 1, β_max)
     else:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.light_box import LightBox
 
 
@@ -37,14 +39,36 @@ class World:
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
-        self._light_box = None if window is None else LightBox.of(scene, contents.bsdfs)
         self.segment, self.scattering, self.connections = strategies
-        for strategy in self.strategies():
-            strategy.prepare(self)
+        self._check_names()
+        # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
+        bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
+        self._light_box = LightBox.of(scene, contents.bsdfs) if bounded else None
+        with dr.resume_grad():  # tables are attached where the parameters are
+            for strategy in self.strategies():
+                strategy.prepare(self)
+        self._built = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if getattr(self, "_built", False):
+            raise AttributeError(f"World does not change once built; tried to set {name!r}.")
+        super().__setattr__(name, value)
+
+    def _check_names(self) -> None:
+        names = [strategy.name for strategy in self.strategies()]
+        wrong = [name for name in names if not name or name == "walk" or names.count(name) > 1]
+        if wrong:
+            raise SceneError(
+                f"strategies of an integrator: expected a name of its own for each, not 'walk', got {', '.join(names)}."
+            )
 
     def strategies(self) -> list[Any]:
         """All strategies, each once."""
         return [self.segment, *self.connections, self.scattering]
+
+    def most_events(self) -> int:
+        """How many events a path can have; in a derivative, how many terms."""
+        return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
         """What the strategies have computed of the scene's parameters."""

@@ -26,6 +26,10 @@ class EmitterFound(Connection):
     """Emission where a path arrives, weighed against the strategies that could have connected to it."""
 
     name = "emitter_found"
+    light_of_scene_alone = True
+
+    def events(self, wanted):
+        return 2 if wanted is not None and wanted.emitter_shape else 1
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -42,10 +46,11 @@ class EmitterFound(Connection):
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(world.scene, si=vertex.si, ref=prev)
         connected = hit & ~path.prev_unconnected
-        others = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
-        mis = dr.select(hit, mis_weight(path.prev_pdf, sum(others)), 0)
-        value = first_column(path.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
-        return Event(value=value, opl=path.τ, active=hit, depth=path.depth + 1, mis=mis)
+        sampled = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
+        sampled = sum(density for density in sampled if density is not None)
+        mis = dr.select(hit, mis_weight(path.prev_pdf, sampled), 0)
+        value = first_column(vertex.β) * mis * mi.unpolarized_spectrum(emitter.eval(vertex.si, hit))
+        return Event(value=value, opl=vertex.τ, active=hit, depth=path.depth + 1, mis=mis)
 
     # ------------------------------------------------------------------------------------------------- record
 
@@ -83,10 +88,10 @@ class EmitterFound(Connection):
         si, following = vertex.scattered_si, vertex.v.after()
         mis = following.of(self.name)["mis"]
         lit = step.ahead & (mis > 0)
-        if wanted.sphere_lights:
-            with dr.suspend_grad():
-                hit = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
-                lit &= ~self._claimed(world, hit.emitter(world.scene), wanted)
+        with dr.suspend_grad():
+            hit = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
+            if (claimed := self._claimed(world, hit.emitter(world.scene), wanted)) is not None:
+                lit &= ~claimed
         light, area = material_point(following.pi, following.ray, lit)
         out = direction_to(si.p, light.p, lit, mi.Vector3f(following.ray.d))
         light.wi = dr.select(lit, light.to_local(-out), dr.detach(light.wi))

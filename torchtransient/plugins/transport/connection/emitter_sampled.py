@@ -14,16 +14,14 @@ from torchtransient.plugins.transport.scattering.geometry_terms import (
     solid_angle_over_area,
 )
 from torchtransient.plugins.transport.segment.vacuum import length_to
-from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal, mis_weight
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
 
 class EmitterSampled(Connection):
-    """``share``: part of the light that this strategy brings, where several sample lights with the same density."""
+    """A point of an emitter, drawn by Mitsuba's sampling of emitters."""
 
     name = "emitter_sampled"
-
-    def __init__(self, share: float = 1.0):
-        self.share = share
+    light_of_scene_alone = True
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -35,28 +33,20 @@ class EmitterSampled(Connection):
         return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
     def density(self, world, ref, ds, active):
-        pdf = world.scene.pdf_emitter_direction(ref, ds, active)
-        return pdf if self.share == 1 else pdf * self.share
-
-    def mis(self, ds, pdf, alone):
-        """Weight of a sample towards which scattering has the density ``pdf``; ``alone``: nothing else finds it."""
-        mis = dr.select(alone, 1, mis_weight(ds.pdf, pdf))
-        return mis if self.share == 1 else mis * self.share
+        return dr.select(ds.delta, ds.pdf, world.scene.pdf_emitter_direction(ref, ds, active & ~ds.delta))
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
-        value = product(path.β, answer.value) * self.mis(ds, answer.pdf, ds.delta)
+        pdf = dr.select(ds.delta, 0, answer.pdf)
+        value = product(vertex.β, answer.value) * self.weight(world, vertex.at, ds, ds.pdf, pdf, active)
         value *= mi.unpolarized_spectrum(proposal.weight)
         if not zeros:  # shadow rays only where they can matter; the derivative of a zero may matter
             active = active & (dr.max(dr.abs(intensity(value))) > 0)
-        length = self._length(world, vertex.at.p, ds) * (path.η * answer.eta)
-        opl = vertex.delay.after(path.τ) + mi.Float64(length)
+        length = self._length(world, vertex.at.p, ds) * (vertex.η * answer.eta)
+        opl = vertex.scattered_τ + mi.Float64(length)
         active = world.counted(active, opl)
         active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
-        value *= T
-        if not zeros:
-            value = dr.select(active, value, 0)
-        return Event(value=value, opl=opl, active=active, depth=path.depth + 2, T=T)
+        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
     @staticmethod
     def _length(world, p, ds):
@@ -85,6 +75,9 @@ class EmitterSampled(Connection):
         on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
         return on_surface & (emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere))
 
+    def numbers(self, recorded):
+        return [recorded["u"].x, recorded["u"].y]
+
     def attached(self, world, vertex, step, wanted):
         v, si = vertex.v, vertex.scattered_si
         r = v.of(self.name)
@@ -94,8 +87,10 @@ class EmitterSampled(Connection):
         if wanted.geometry:
             d = direction_to(si.p, light.p, light.near, d)
         Le = self._emission(world, si, light, d, lit, wanted)
-        towards = world.scattering.evaluate(world, vertex, d, lit)
-        mis = self.mis(light.ds, dr.detach(towards.pdf), light.ds.delta | light.cone)
+        towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
+        pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
+        with dr.suspend_grad():
+            mis = self.weight(world, dr.detach(si), light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
         if "T" in r:
             value *= r["T"]

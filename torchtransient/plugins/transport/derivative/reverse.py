@@ -35,8 +35,7 @@ def step_back(world, layout, store, block, ray, k, live, adjoint, following):
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
         dr.backward_from(dr.select(live, objective, 0))
         before = adjoint_of(carry, wanted.carried)
-    end = VertexEnd(vertex.sid.p, vertex.sid.n, v.ray.d, vertex.sid.is_valid())
-    return choose(live, before, adjoint, wanted.carried), end
+    return choose(live, before, adjoint, wanted.carried), vertex.end
 
 
 @dr.syntax

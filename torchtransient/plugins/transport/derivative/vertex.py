@@ -36,10 +36,10 @@ class VertexEnd:
 class AttachedVertex(Local):
     """A recorded vertex with derivatives.
 
-    ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``carry`` (with the throughput at the vertex),
-    ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``, ``delay``,
-    ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind
-    its delay) and ``rotation``.
+    ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
+    at the vertex), ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``,
+    ``delay``, ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and
+    ``scattered_opl`` (behind its delay) and ``rotation``.
     """
 
 
@@ -55,7 +55,7 @@ def attached_carry(v, wanted, tangents=None):
 def vertex_terms(world, v, carry, wanted):
     """(events with derivatives, the Carry to the next vertex, the attached vertex)."""
     vertex = world.segment.attached(world, v, carry, wanted)
-    world.scattering.attach(world, vertex, wanted)
+    world.scattering.look_up_attached(world, vertex, wanted)
     step = world.scattering.attached(world, vertex, wanted)
     terms = [term for c in world.connections for term in c.attached(world, vertex, step, wanted)]
     return terms, step.carry, vertex

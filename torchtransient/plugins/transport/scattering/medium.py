@@ -61,10 +61,18 @@ class SurfaceOrMedium(Surface):
         if not world.contents.media.emitter_sampling:
             step.unconnected = step.delta | (scatter & ~vertex.medium.use_emitter_sampling())
 
+    def value_towards(self, world, path, vertex, out, active):
+        value, pdf = super().value_towards(world, path, vertex, out, active)
+        scatter, mei = vertex.scatter, vertex.mei
+        phase, σ_s = phase_and_scattering(mei, active & scatter)
+        f, f_pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active & scatter)
+        f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
+        return dr.select(scatter, f, value), dr.select(scatter, finite(f_pdf), pdf)
+
     # ----------------------------------------------------------------------------------------------- attached
 
-    def attach(self, world, vertex, wanted):
-        super().attach(world, vertex, wanted)
+    def look_up_attached(self, world, vertex, wanted):
+        super().look_up_attached(world, vertex, wanted)
         vertex.phase, vertex.σ_s = phase_and_scattering(vertex.mei, vertex.v.active & vertex.scatter)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.delay_table import DelaySample
 from torchtransient.plugins.polarized import (
     from_mirrored_frames,
@@ -23,13 +24,15 @@ from torchtransient.plugins.transport.strategy import Answer, Local, Scattering,
 class Surface(Scattering):
     """What all vertices do in vacuum; those in media are told apart in :class:`.medium.SurfaceOrMedium`.
 
-    ``guides`` draw some of the next vertices in the BSDF's place: each has a ``share`` of the samples,
-    ``prepare(world)``, ``draw(vertex, sampler) -> (point, whether it is chosen)`` and ``density(vertex, ray, leg,
-    active)``, the density per solid angle with which it draws what ``ray`` has found.
+    ``guides``: a list of :class:`~..strategy.Guide`, whose shares sum to less than one.
     """
 
     def __init__(self, guides=()):
         self.guides = list(guides)
+        self.own_share = 1 - sum(guide.share for guide in self.guides)
+        if self.own_share <= 0 or any(guide.share <= 0 for guide in self.guides):
+            shares = ", ".join(str(guide.share) for guide in self.guides)
+            raise SceneError(f"guides: expected positive shares that sum to less than one, got {shares}.")
 
     def prepare(self, world):
         contents = world.contents
@@ -37,6 +40,11 @@ class Surface(Scattering):
         self.delays = None if contents.delays is None else contents.delays.read()
         for guide in self.guides:
             guide.prepare(world)
+
+    def tables(self):
+        tables = [] if self.delays is None else self.delays.attached()
+        tables += [] if self.refraction is None else [self.refraction.table]
+        return tables + [table for guide in self.guides for table in guide.tables()]
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -93,30 +101,65 @@ class Surface(Scattering):
             if answer is not None:
                 answer.value = scatter_unpolarized(answer.value, rotation)
         step.weight = rotate_mueller(step.weight, rotation, rotation_from_light(si, step.wo, step.out))
-        for guide in self.guides:
-            point, chosen = guide.draw(vertex, sampler)
-            step.out = dr.select(chosen & ~step.delta, dr.normalize(point - vertex.at.p), step.out)
+        if self.guides:
+            self._follow_guides(world, vertex, step, sampler)
+            for p, answer in zip(proposals, answers, strict=True):
+                if p is not None:
+                    answer.pdf = self.mixture(world, vertex.at.p, p.ds, answer.pdf, p.active)
         return answers, step
 
     def elsewhere(self, world, vertex, proposals, answers, step):
         """Change answers and step where the vertex is not on a surface."""
 
+    # ------------------------------------------------------------------------------------------------- guides
+
+    def _follow_guides(self, world, vertex, step, sampler):
+        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``."""
+        u, below = sampler.next_1d(), 0.0
+        step.guided, step.point = u < 1 - self.own_share, mi.Point3f(vertex.at.p)
+        for guide in self.guides:
+            point = guide.draw(world, vertex, sampler)
+            chosen = (u >= below) & (u < below + guide.share)
+            step.point = dr.select(chosen, point, step.point)
+            below += guide.share
+        to = dr.select(step.guided, step.point - vertex.at.p, step.out)
+        step.out = dr.select(step.guided, dr.normalize(to), step.out)
+        step.delta, step.unconnected = step.delta & ~step.guided, step.unconnected & ~step.guided
+        step.weight = dr.select(step.delta, step.weight / self.own_share, step.weight)
+
+    def mixture(self, world, p, ds, pdf, active):
+        """Density with which the walk goes from ``p`` to the light's point ``ds``; ``pdf``: that of the scattering."""
+        if not self.guides:
+            return pdf
+        shape = ds.emitter.get_shape()
+        active = active & ~ds.delta
+        guided = sum(g.share * g.density(world, p, ds.p, ds.n, shape, active) for g in self.guides)
+        return self.own_share * pdf + dr.select(active, guided, 0)
+
     def weigh(self, world, path, vertex, step, ray, leg):
-        """With guides: weight and density of the mixture, once it is known what the next segment has found."""
-        si, smooth = vertex.scattered_si, vertex.goes_on & ~step.delta
-        own = 1 - sum(guide.share for guide in self.guides)
-        wo = si.to_local(step.out)
-        value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, smooth)
-        pdf = own * pdf + sum(guide.share * guide.density(vertex, ray, leg, smooth) for guide in self.guides)
-        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
-        value = rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, step.out))
+        smooth = vertex.goes_on & ~step.delta
+        pi, reached = world.segment.surface_of(leg)
+        reached = smooth & reached & pi.is_valid()
+        found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, reached)
+        value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
+        guided = sum(g.share * g.density(world, vertex.at.p, found.p, found.n, pi.shape, reached) for g in self.guides)
+        pdf = self.own_share * pdf + dr.select(reached, guided, 0)
+        # A guided sample stands for the point that was drawn, and for no other that its ray runs into before.
+        way = dr.norm(step.point - vertex.at.p)
+        arrived = reached & (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
+        pdf = dr.select(step.guided & ~arrived, 0, pdf)
         step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
-        step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, si, wo), step.eta)
+        wo = vertex.scattered_si.to_local(step.out)
+        step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, vertex.scattered_si, wo), step.eta)
 
-    def tables(self):
-        delays = [] if self.delays is None else self.delays.attached()
-        return delays if self.refraction is None else [self.refraction.table, *delays]
+    def value_towards(self, world, path, vertex, out, active):
+        """(value between the frames of the segments, density) of the scattering towards the world direction ``out``."""
+        si = vertex.scattered_si
+        wo = si.to_local(out)
+        value, pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+        value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
+        return rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, out)), pdf
 
     # ---------------------------------------------------------------------------------------- scene contents
 
@@ -146,17 +189,14 @@ class Surface(Scattering):
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
             fields["u_delay"] = mi.Point2f
-        if self.guides:
-            fields["pdf"] = mi.Float
-        return fields
+        return fields | ({"pdf": mi.Float} if self.guides else {})
 
     def record(self, step):
         return vars(step)
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def attach(self, world, vertex, wanted):
-        """Look up how the attached vertex scatters."""
+    def look_up_attached(self, world, vertex, wanted):
         v, si = vertex.v, vertex.si
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
@@ -167,10 +207,12 @@ class Surface(Scattering):
         if wanted.geometry and vertex.delay.delay is not None:
             vertex.scattered_slope = vertex.slope + slope_only(vertex.delay.delay)
 
-    def evaluate(self, world, vertex, out, active, sampled=False):
+    def evaluate(self, world, vertex, out, active, sampled=False, ds=None):
         si = vertex.scattered_si
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
+        if ds is not None:
+            pdf = self.mixture(world, dr.detach(si.p), ds, pdf, active)
         value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
@@ -200,7 +242,7 @@ class Surface(Scattering):
             d_out = si.to_world(bs.wo)
             from_light = rotation_from_light(si, bs.wo, d_out, following.d)
             delta_weight = rotate_mueller(delta_weight, vertex.rotation, from_light)
-            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * v.rr
+            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * (v.rr / self.own_share)
             weight = dr.select(mirrored, delta_weight, weight)
             eta = dr.select(mirrored, bs.eta, eta)
             o, d, w = dr.select(mirrored, si.p, 0), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)

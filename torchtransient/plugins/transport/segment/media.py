@@ -81,6 +81,9 @@ class Media(Vacuum):
             scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(world, path, at.p, valid),
         )  # fmt: skip
 
+    def surface_of(self, leg):
+        return leg["pi"], ~leg["scatter"]
+
     def transmittance(self, world, vertex, ds, u, sampler, active):
         ray = vertex.at.spawn_ray_to(ds.p)
         medium = medium_behind(vertex.si, ds.d, vertex.medium, vertex.surface)
@@ -180,8 +183,7 @@ class Media(Vacuum):
             stream, medium = EMITTING, v.after().begin
         else:
             stream, medium = CONNECTING, medium_behind(vertex.sid, connected.d, v.end, ~v.scatter)
-        d = v.ray.d if connected.ahead else connected.d
-        leg = Leg(v, vertex.sid.p, dr.detach(connected.p), d, connected.far, medium, stream)
+        leg = Leg(v, vertex.sid.p, dr.detach(connected.p), connected.d, connected.far, medium, stream)
         hook = vertex.carry.β[0]
         return with_log_slope(world.scene, self.settings, leg, vertex.si.p, connected.p, hook, active)
 

@@ -76,6 +76,9 @@ class Vacuum(Segment):
             length = dr.select(path.depth == 0, 0, length)
         return mi.Float64(length * path.η)
 
+    def surface_of(self, leg):
+        return leg, mi.Bool(True)
+
     def transmittance(self, world, vertex, ds, u, sampler, active):
         return active & ~world.scene.ray_test(vertex.at.spawn_ray_to(ds.p), active), 1
 
@@ -113,8 +116,9 @@ class Vacuum(Segment):
     def arrived(self, world, v, carry, ray, si, wanted):
         """The attached vertex at ``si``, behind the optical length of its segment."""
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
+        valid = vertex.sid.is_valid()
+        vertex.end = VertexEnd(vertex.sid.p, vertex.sid.n, v.ray.d, valid)
         if wanted.geometry:
-            valid = vertex.sid.is_valid()
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
             length = length_to(world.contents, ray.o, si.p, valid, ray.d)
             if world.camera_unwarp:

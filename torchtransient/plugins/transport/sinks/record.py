@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import SceneError
 from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Local
 
@@ -38,6 +39,8 @@ class RecordLayout:
         for s in world.strategies():
             types |= {(s.name, name): kind for name, kind in s.fields(world).items()}
         masks = [key for key, kind in types.items() if kind is mi.Bool]
+        if len(masks) > 32:
+            raise SceneError(f"record of a path: expected at most 32 masks of all strategies, got {len(masks)}.")
         self.bits = {key: 1 << bit for bit, key in enumerate(masks)}
         self.types = {key: kind for key, kind in types.items() if key not in self.bits}
 
@@ -63,11 +66,9 @@ class RecordLayout:
             flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
         store["flags"].write(flags, k, active)
 
-    def read(self, store, s, name, k, active):
-        """One field of vertex ``k``."""
-        if (s, name) in self.bits:
-            return active & ((store["flags"].read(k, active) & self.bits[s, name]) != 0)
-        return store[f"{s}.{name}"].read(k, active)
+    def mask(self, flags, s, name):
+        """One mask out of the word ``flags`` of a vertex."""
+        return (flags & self.bits[s, name]) != 0
 
 
 class RecordedVertex(Local):
@@ -77,6 +78,8 @@ class RecordedVertex(Local):
 
     def __init__(self, layout, store, k, active, primary_ray):
         super().__init__(layout=layout, store=store, k=k, active=active, primary_ray=primary_ray, next=None)
+        # Dr.Jit does not merge equal reads of thread-local memory: each array is read once a vertex.
+        self._read = {}
         self.η = mi.Float(1)
         vars(self).update(self.of("walk"))
         self.ray, self.pi = layout.world.segment.restore(self, primary_ray)
@@ -84,23 +87,29 @@ class RecordedVertex(Local):
     def of(self, name):
         """The record of the strategy called ``name``, as a dictionary."""
         layout = self.layout
-        keys = [key for key in (*layout.types, *layout.bits) if key[0] == name]
-        return {field: layout.read(self.store, s, field, self.k, self.active) for s, field in keys}
+        found = {field: self._array(f"{s}.{field}") for s, field in layout.types if s == name}
+        masks = [key for key in layout.bits if key[0] == name]
+        return found | {field: self.active & layout.mask(self._array("flags"), s, field) for s, field in masks}
+
+    def _array(self, name):
+        if name not in self._read:
+            self._read[name] = self.store[name].read(self.k, self.active)
+        return self._read[name]
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
-        for s, field in self.layout.types:
-            if field == "u":
-                u = self.layout.read(self.store, s, field, self.k, self.active)
-                return [u.x, u.y]
+        for c in self.layout.world.connections:
+            numbers = c.numbers(self.of(c.name))
+            if numbers is not None:
+                return numbers
         # Nothing was drawn: the bits of the ray's direction are as good, since they are hashed.
         return [self.ray.d.x, self.ray.d.y]
 
     def before(self, name, field, at_sensor):
         """A mask of the vertex before, ``at_sensor`` where there is none."""
-        k = dr.maximum(self.k, 1) - 1
         there = self.active & (self.k > 0)
-        return ((self.k == 0) & mi.Bool(at_sensor)) | self.layout.read(self.store, name, field, k, there)
+        flags = self.store["flags"].read(dr.maximum(self.k, 1) - 1, there)
+        return ((self.k == 0) & mi.Bool(at_sensor)) | (there & self.layout.mask(flags, name, field))
 
     def after(self):
         """The next vertex, where the path goes on."""
