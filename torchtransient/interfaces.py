@@ -152,7 +152,9 @@ class FilmInterface(abc.ABC):
 
     @abc.abstractmethod
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the array, (H, W, ..., channels), of the crop window."""
+        """Shape of the array, (H, W, entries, channels), of the crop window; channels last, (H, W, Lh, Lw, T, C) in an
+        exhaustive scan.
+        """
 
     @abc.abstractmethod
     def entries_per_pixel(self) -> int:

@@ -33,6 +33,23 @@ def test_does_not_change(scene):
         contents.something = 1
 
 
+def test_a_world_does_not_change(scene):
+    world = scene.integrator().world(scene, contents_of(scene))
+    with pytest.raises(AttributeError, match="does not change once built"):
+        world.max_depth = 3
+
+
+@pytest.mark.parametrize("names", [("emitter_found", ""), ("emitter_found", "emitter_found"), ("walk", "other")])
+def test_strategies_need_names_of_their_own(scene, monkeypatch, names):
+    integrator = scene.integrator()
+    segment, scattering, connections = integrator.strategies(contents_of(scene))
+    for connection, name in zip(connections, names, strict=True):
+        connection.name = name
+    monkeypatch.setattr(type(integrator), "strategies", lambda *_: (segment, scattering, connections))
+    with pytest.raises(ValueError, match="expected a name of its own for each"):
+        integrator.world(scene, contents_of(scene))
+
+
 def test_built_once_a_scene(scene, monkeypatch):
     """Renders, backward and forward passes, in several launches and for several seeds, share one look-up."""
     built = []
@@ -67,6 +84,14 @@ def test_sensors_take_turns():
     integrator, (first, second) = scene.integrator(), scene.sensors()
     found = [integrator.contents(scene, sensor) for sensor in (first, second, first, second)]
     assert found[0] is found[2] and found[1] is found[3]
+
+
+def test_another_bsdf_is_seen():
+    scene = mi.load_dict(room(depth=3), optimize=False)
+    assert contents_of(scene).delta is False
+    wall = next(shape for shape in scene.shapes() if shape.id() == "wall")
+    wall.set_bsdf(mi.load_dict({"type": "conductor"}))
+    assert contents_of(scene).delta is True
 
 
 def test_of_another_scene_is_looked_up_anew():

@@ -11,11 +11,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-_PACKAGE = __name__.split(".")[0]
+# Objects of these look after themselves, or hold no arrays.
+_OTHERS = ("builtins", "drjit", "mitsuba", "numpy", "torch")
 
 
 def arrays_below(value: Any) -> list[Any]:
-    """The Dr.Jit arrays in plain objects of this library and in the containers they hold, each once and in order."""
+    """The Dr.Jit arrays in plain objects and in the containers they hold, each once and in order."""
     found: list[Any] = []
     seen: set[int] = set()
     waiting = [value]
@@ -31,6 +32,6 @@ def arrays_below(value: Any) -> list[Any]:
             waiting += current.values()
         elif isinstance(current, (list, tuple)):
             waiting += current
-        elif type(current).__module__.split(".")[0] == _PACKAGE and not isinstance(current, mi.Object):
+        elif type(current).__module__.split(".")[0] not in _OTHERS and not isinstance(current, mi.Object):
             waiting += getattr(current, "__dict__", {}).values()
     return found

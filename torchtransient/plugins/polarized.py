@@ -119,7 +119,7 @@ def rotation_from_light(si, wo, out=None, d=None):
 
 
 def rotate_stokes(light, rotation):
-    """A Stokes vector in the rotate_stokes frame."""
+    """A Stokes vector in the rotated frame."""
     if not mi.is_polarized:
         return light
     c, s = rotation.c, rotation.s
@@ -156,8 +156,8 @@ def from_mirrored_frames(value, wi, wo, mirrored):
     m = [[value[i, j] if (i < 2) == (j < 2) else -value[i, j] for j in range(4)] for i in range(4)]
     out = rotation_between(wi, _mirror(mi.coordinate_system(_mirror(wi))[0]), mi.coordinate_system(wi)[0])
     into = rotation_between(-wo, _mirror(mi.coordinate_system(_mirror(-wo))[0]), mi.coordinate_system(-wo)[0])
-    correct_two_sided = rotate_mueller(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
-    return dr.select(mirrored, correct_two_sided, value)
+    right_way = rotate_mueller(mi.Spectrum(*[entry for row in m for entry in row]), out, into)
+    return dr.select(mirrored, right_way, value)
 
 
 def _mirror(v):

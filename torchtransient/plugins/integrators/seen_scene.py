@@ -22,6 +22,7 @@ class SeenScene:
         self.reference: DistantReference = distant_reference(scene)
         self._key = _key_of(scene)
         self._kept = scene.shapes()[:1]
+        self._plugins: tuple[int, ...] = ()
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
 
@@ -31,6 +32,7 @@ class SeenScene:
 
     def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
         """What the scene contains for a sensor, which may stand in a medium."""
+        self._forget_replaced(scene)
         if sensor.ptr not in self._contents:
             # With the sensor, so that no later one can be taken for it.
             self._contents[sensor.ptr] = sensor, SceneContents(scene, sensor, self.reference)
@@ -38,9 +40,24 @@ class SeenScene:
 
     def tracker(self, scene: Any) -> ParameterTracker:
         """The scene's parameters. Walked over when first asked for: a render has no use for it."""
+        self._forget_replaced(scene)
         if self._tracker is None:
             self._tracker = ParameterTracker(scene)
         return self._tracker
+
+
+    def _forget_replaced(self, scene: Any) -> None:
+        """Look up anew when a shape was given another BSDF (``shape.set_bsdf``)."""
+        plugins = _plugins_of(scene)
+        if plugins != self._plugins:
+            self._plugins, self._tracker = plugins, None
+            self._contents.clear()
+
+
+def _plugins_of(scene: Any) -> tuple[int, ...]:
+    """What surfaces and lights are made of, by address: those in use are kept by the scene."""
+    bsdfs = (shape.bsdf() for shape in scene.shapes())
+    return (*(0 if bsdf is None else bsdf.ptr for bsdf in bsdfs), *(emitter.ptr for emitter in scene.emitters()))
 
 
 def _key_of(scene: Any) -> tuple[int, ...]:

@@ -22,8 +22,8 @@ class SceneContents:
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
     which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Each is
-    None where the scene has no such thing.
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables and
+    media are None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """

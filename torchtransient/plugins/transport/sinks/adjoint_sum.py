@@ -12,7 +12,8 @@ from torchtransient.plugins.transport.sinks.sink import Sink
 class AdjointSumSink(Sink):
     """Keeps ``sum``: that of ``A(opl) value`` over the events of a path, with the adjoint ``A`` of the film.
 
-    What the light behind a point contributes to a loss: the paths are traced from there.
+    What the light behind a point contributes to a loss: paths are traced from there, as a boundary term asks on both
+    sides of an edge.
     """
 
     def __init__(self, block):
