@@ -352,3 +352,15 @@ def test_progress_bar(room_scene, capsys):
     assert "100%" in capsys.readouterr().err
     tt.TransientRenderer(room_scene, spp=4)(seed=0)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("seed", [np.int64(5), np.uint32(5), torch.tensor(5), 5 + 2**32, 5 - 2**32])
+def test_whole_numbers_of_any_type_are_seeds(room_scene, seed):
+    renderer = tt.TransientRenderer(room_scene, parameters=[], spp=2)
+    torch.testing.assert_close(renderer(seed=seed).transient, renderer(seed=5).transient)
+
+
+@pytest.mark.parametrize("seed", [1.5, "5", torch.tensor(1.5)])
+def test_other_seeds_are_refused(room_scene, seed):
+    with pytest.raises(ValueError, match="seed: expected a whole number"):
+        tt.TransientRenderer(room_scene, parameters=[], spp=2)(seed=seed)

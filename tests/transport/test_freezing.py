@@ -121,3 +121,12 @@ def test_numbers_of_a_call_are_no_literals(monkeypatch):
     parts = hashes(scene, seed=0, spp=16)
     walks = [h for h in parts if h == max(parts, key=parts.count)]
     assert len(walks) >= 2
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), 3 + 2**32, 3 - 2**32])
+def test_any_whole_number_is_a_seed(seed):
+    scene = mi.load_dict(scene_of("surfaces"), optimize=False)
+    expected, got = (arrays(scene.integrator().render(scene, seed=s, spp=2)) for s in (3, seed))
+    np.testing.assert_allclose(got[0], expected[0], rtol=1e-5)
+    with pytest.raises(ValueError, match="seed: expected a whole number"):
+        scene.integrator().render(scene, seed=1.5, spp=2)

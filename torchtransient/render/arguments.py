@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,16 @@ from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import chosen
 
 SEED_RANGE = 2**32
+
+
+def whole_number(seed: Any) -> int | None:
+    """A seed as one number; None for a sequence of them. Raises ``UnitError`` for what is neither."""
+    try:
+        return operator.index(seed)
+    except TypeError:
+        if isinstance(seed, str) or not hasattr(seed, "__len__"):
+            raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.") from None
+    return None
 
 
 def mix_seed(seed: int, number: int) -> int:

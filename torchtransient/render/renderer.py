@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from torchtransient.render.arguments import (
     mix_seed,
     samples,
     sensor_list,
+    whole_number,
 )
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
@@ -349,14 +350,15 @@ class TransientRenderer(nn.Module):
         per_entry = len(self._sensors)
         if seed is None:
             seed = int(torch.randint(0, SEED_RANGE, (), dtype=torch.int64))
-        if isinstance(seed, int):
-            seeds = [mix_seed(seed, n) for n in range(entries * per_entry)]
+        if (number := whole_number(seed)) is not None:
+            seeds = [mix_seed(number, n) for n in range(entries * per_entry)]
         else:
-            if len(seed) != entries:
+            given = list(seed) if isinstance(seed, Iterable) else []
+            if len(given) != entries:
                 raise ShapeError(
-                    f"seed: expected one integer, or one for each of {entries} batch entries, got {len(seed)}."
+                    f"seed: expected one integer, or one for each of {entries} batch entries, got {len(given)}."
                 )
-            seeds = [mix_seed(int(s), n) for s in seed for n in range(per_entry)]
+            seeds = [mix_seed(int(s), n) for s in given for n in range(per_entry)]
         items = []
         for n, value in enumerate(seeds):
             items.append(Item(n // per_entry, self._sensors[n % per_entry], value, self._seed_of_gradient(value, n)))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from torchtransient.errors import UnitError
 
 # Lanes of one kernel launch. Larger jobs run in several passes, which keeps a progress bar moving and indices in 32
 # bits.
@@ -53,8 +56,16 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) ->
 
 
 def seed_array(seed: Any) -> Any:
-    """A seed, a number or an array of one, as an array in memory."""
-    return mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed))
+    """A seed as an array in memory: an array of one, or a whole number, of which the lowest 32 bits count. Raises
+    UnitError.
+    """
+    if dr.is_array_v(seed):
+        return mi.UInt32(seed)
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        raise UnitError(f"seed: expected a whole number, got {seed!r}.") from None
+    return dr.opaque(mi.UInt32, number % 2**32)
 
 
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
