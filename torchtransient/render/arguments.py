@@ -21,8 +21,13 @@ def whole_number(seed: Any) -> int | None:
     try:
         return operator.index(seed)
     except TypeError:
-        if isinstance(seed, str) or not hasattr(seed, "__len__"):
-            raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.") from None
+        pass
+    try:
+        several = len(seed) >= 0 and not isinstance(seed, str)
+    except TypeError:
+        several = False
+    if not several:
+        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.")
     return None
 
 
