@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gates(FilmChoice):
-    """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates."""
+    """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates.
+
+    One :class:`~torchtransient.gates.Gate` or several. Raises ``SceneError`` for anything else.
+    """
 
     measures: ClassVar[str] = "gated"
     plugin: ClassVar[str] = "gated_hdr_film"
@@ -38,15 +41,19 @@ class Gates(FilmChoice):
 
     gates: tuple[Gate, ...]
 
-    @classmethod
-    def from_argument(cls, value: Any) -> Self:
-        gates = (value,) if isinstance(value, Gate) else tuple(value)
+    def __post_init__(self) -> None:
+        given: Any = self.gates
+        gates = tuple(given) if isinstance(given, Iterable) else (given,)
         if not gates or not all(isinstance(gate, Gate) for gate in gates):
             raise SceneError(
                 "gates: expected one or more tt.Gate objects, for instance [tt.Gate.gaussian(6.0, 0.2)], got "
-                f"{gates!r}."
+                f"{given!r}."
             )
-        return cls(gates)
+        object.__setattr__(self, "gates", gates)
+
+    @classmethod
+    def from_argument(cls, value: Any) -> Self:
+        return cls(value)
 
     @classmethod
     def from_film(cls, film: Any) -> Self:
