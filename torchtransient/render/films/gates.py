@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 
-from torchtransient.errors import SceneError
-from torchtransient.gates import Gate, gates_from_text, gates_to_text
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
 from torchtransient.render.films.choice import CommandOption, FilmChoice, measured
 from torchtransient.render.films.layout import cube_channels_first
 
@@ -38,6 +38,7 @@ class Gates(FilmChoice):
     )
     pictures: ClassVar[tuple[str, ...]] = ("video",)
     takes_pulse: ClassVar[bool] = True
+    slope_remedy: ClassVar[str] = SLOPE_REMEDY
 
     gates: tuple[Gate, ...]
 
@@ -94,6 +95,9 @@ class Gates(FilmChoice):
     def describe(self, temporal_filter: str) -> str:
         return f"gates={self.count}"
 
+    def jump(self) -> str:
+        return jump_in(self.gates)
+
     def write(self, props: Any) -> None:
         props["gates"] = gates_to_text(self.gates)
 
@@ -108,6 +112,13 @@ class Gates(FilmChoice):
 
         video(output, path, progress=progress)
         return f"{self.count} frames, one for each gate"
+
+    @classmethod
+    def settings_in(cls, props: Any) -> Self | None:
+        try:
+            return cls(gates_from_text(str(props["gates"]))) if "gates" in props else None
+        except TorchTransientError as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
 
     @classmethod
     def film_of_pilot(cls, planned: FilmChoice | None) -> FilmChoice | None:
