@@ -162,7 +162,7 @@ def plan(
         variant=variant or best.value,
         integrator=integrator or tracer.value,
         film=kind,
-        film_choice=choices.film_settings(kind, given, inventory.film),
+        film_choice=choices.film_settings(kind, given, inventory.film, asked),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=tuple(parameters),
