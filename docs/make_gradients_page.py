@@ -29,8 +29,14 @@ def state_of(effect: Any) -> str:
 
 def why(effect: Any, condition: str = "") -> str:
     """What the state does not say by itself."""
-    plain = effect.reason in ("correct", "correct except where silhouettes move (no boundary term)")
-    return "; ".join(part for part in (condition, "" if plain else effect.reason) if part)
+    from torchtransient.plugins.parameter_effect import CORRECT, SILHOUETTES
+
+    # A biased derivative keeps the words on silhouettes: the state names the bias alone.
+    said = () if effect.biased else (SILHOUETTES, CORRECT)
+    reason = effect.reason
+    for words in said:
+        reason = reason.removeprefix(words).removeprefix("; ")
+    return "; ".join(part for part in (condition, reason) if part)
 
 
 def seen_parameters() -> dict[str, dict[tuple[str, str], Any]]:

@@ -22,6 +22,11 @@ Array = NDArray[np.float64]
 KINDS = ("rectangular", "gaussian", "tabulated")
 # A profile that is not straight is handed to a film as straight lines between this many points.
 NODES = 2049
+# What to do where a derivative in time meets a gate with a jump.
+SLOPE_REMEDY = (
+    "Use gates that rise from zero and fall to zero (gaussian, or tabulated with zeros at both ends), or give the film "
+    "a pulse."
+)
 
 
 @dataclass(frozen=True)
@@ -164,6 +169,11 @@ class Gate:
         if self.kind == "gaussian":
             return f"gaussian {self.opl[0]!r} {self.opl[1]!r}"
         return f"rectangular {self.start_opl!r} {self.end_opl!r}"
+
+
+def jump_in(gates: Sequence[Gate]) -> str:
+    """What messages call the first gate that opens or closes at once and so has no slope; empty without one."""
+    return next((f"{gate.kind} gate" for gate in gates if not gate.is_continuous), "")
 
 
 def gates_to_text(gates: Sequence[Gate]) -> str:

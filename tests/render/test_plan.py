@@ -10,6 +10,7 @@ import pytest
 import torchtransient as tt
 from support import plan_scenes
 from torchtransient.errors import GradientError, SceneError, UnitError, VariantError
+from torchtransient.render.films import Gates
 from torchtransient.render.plan import inventory_of
 
 VARIANT = "llvm_ad_rgb"
@@ -319,11 +320,14 @@ def test_a_plan_can_be_pickled_and_printed():
     assert plan.to_dict()["time_axis"] == {"start_opl": 0.0, "bin_width_opl": 0.1, "num_bins": 100}
 
 
+GATE = tt.Gate.gaussian(8.0, 0.5)
 BAD = {
     "unknown output": ({"outputs": ("video",)}, "video"),
     "two films": ({"outputs": ("transient", "phasor")}, "a plan for"),
     "no frequencies": ({"outputs": ("phasor",)}, "frequencies"),
-    "frequencies without phasors": ({"frequencies": [1.0]}, "phasor"),
+    "frequencies without phasors": ({"frequencies": [1.0]}, r"outputs=\('phasor',\)\.$"),
+    "gates of others": ({"outputs": ["steady", "stokes"], "gates": GATE}, r"\('gates', 'steady', 'stokes'\)"),
+    "another film": ({"outputs": ("phasor", "steady"), "film": Gates(GATE)}, r"outputs=\('gates', 'steady'\)"),
     "unknown integrator": ({"integrator": "transient_teleport"}, "transient_teleport"),
     "unknown depth": ({"max_depth": "deep"}, "scene"),
     "unknown parameter": ({"parameters": ["wall.colour"]}, "wall.colour"),

@@ -7,10 +7,12 @@ import pickle
 
 import numpy as np
 import pytest
+import torch
 
 import torchtransient as tt
-from torchtransient.errors import SceneError
-from torchtransient.testing.small_room import make_room
+from torchtransient.errors import GradientError, SceneError
+from torchtransient.gates import gates_to_text
+from torchtransient.testing.small_room import WALL_POSE, make_room
 
 VARIANT = "llvm_ad_rgb"
 XML = """<scene version="3.0.0"><default name="fov" value="20"/>
@@ -69,6 +71,94 @@ def test_the_same_scene_loaded_again(same):
         renderer = tt.TransientRenderer(same(), effects=each)
         assert renderer.scene.variant == plan.variant == VARIANT
         assert renderer.axis == plan.time_axis
+
+
+# ------------------------------------------------------------------------------------- the sensor of a plan
+
+
+def seen_twice():
+    """The room, and as its second sensor the same one from further away with another window."""
+    room = make_room()
+    far = copy.deepcopy(room["sensor"])
+    far["film"] |= {"start_opl": 1.0, "temporal_bins": 12}
+    return room | {"far": far}
+
+
+def test_a_renderer_takes_the_sensor_of_its_plan():
+    scene = tt.load(seen_twice(), variant=VARIANT)
+    plan = tt.plan(scene, sensor=1, pilot=False, time_axis="scene")
+    for renderer in (
+        tt.TransientRenderer(scene, effects=plan, spp=1),
+        tt.TransientRenderer(scene, effects=plan, spp=1, sensors=1),
+        plan.renderer(spp=1),
+    ):
+        expected = tt.render(scene, sensors=1, spp=1, seed=0, max_depth=plan.max_depth)
+        assert torch.equal(renderer(seed=0).transient, expected.transient) and renderer.axis.num_bins == 12
+    assert plan.renderer(spp=1, sensors=[1])(seed=0).transient.shape[0] == 1
+    assert plan.to_dict()["sensor"] == 1
+
+
+@pytest.mark.parametrize("sensors", [0, [0, 1], "all", [0]])
+def test_another_sensor_than_that_of_the_plan(sensors):
+    scene = tt.load(seen_twice(), variant=VARIANT)
+    plan = tt.plan(scene, sensor=1, pilot=False, time_axis="scene")
+    with pytest.raises(SceneError, match=r"made for sensor 1.*sensor=0"):
+        tt.TransientRenderer(scene, effects=plan, sensors=sensors)
+    with pytest.raises(SceneError, match=r"made for sensor 1.*sensor=0"):
+        plan.renderer(sensors=sensors)
+
+
+# ------------------------------------------------------------------- choices that a caller makes for a plan are kept
+
+GATES = {
+    "rectangular gate": [tt.Gate.gaussian(8.0, 0.5), tt.Gate.rectangular(7.0, 9.0)],
+    "tabulated gate": [tt.Gate.tabulated([7.0, 9.0], [1.0, 1.0])],
+}
+
+
+def test_a_box_that_was_asked_for_stays_one():
+    """As with an explicit box of the renderer: no tent takes its place without a word."""
+    own = tt.plan(make_room(), pilot=False, time_axis="scene")
+    assert own.renderer(parameters=[WALL_POSE]).effective_filter == "tent"
+    asked = tt.plan(make_room(), pilot=False, time_axis="scene", temporal_filter="box")
+    for plan in (asked, pickle.loads(pickle.dumps(asked))):
+        renderer = plan.renderer(parameters=[WALL_POSE], spp=1)
+        assert renderer.effective_filter == "box"
+        with pytest.raises(GradientError, match="'box' has no slope"):
+            renderer(seed=0)
+        assert plan.renderer(parameters=[WALL_POSE], temporal_filter="tent").effective_filter == "tent"
+        assert plan.renderer(gates=GATES["rectangular gate"]).gates is not None
+
+
+@pytest.mark.parametrize("kind", GATES)
+@pytest.mark.parametrize("of_scene", [False, True])
+def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
+    room, gates = make_room(), GATES[kind]
+    settings = {"pilot": False, "gates": None if of_scene else gates}
+    if of_scene:
+        room["sensor"]["film"] = {"type": "gated_hdr_film", "width": 4, "height": 3, "gates": gates_to_text(gates)}
+    message = rf"{WALL_POSE}.*'{kind}' has no slope.*rise from zero"
+    with pytest.raises(GradientError, match=message):
+        tt.plan(room, "gates", parameters=[WALL_POSE], **settings)
+    renderer = tt.plan(room, "gates", **settings).renderer(parameters=[WALL_POSE], spp=1)
+    assert not renderer.has_slope_for([WALL_POSE]) and renderer.has_slope_for([])
+    with pytest.raises(GradientError, match=message):
+        renderer(seed=0)
+    with torch.no_grad():
+        assert renderer(seed=0).gated.shape[1] == len(gates)
+    pulse = tt.Pulse.gaussian(0.2)
+    pulsed = tt.plan(room, "gates", parameters=[WALL_POSE], pulse=pulse, **settings).renderer(spp=1)
+    assert pulsed.has_slope_for([WALL_POSE])
+    pulsed(seed=0).gated.sum().backward()
+
+
+def test_keys_of_a_film_without_a_filter_are_looked_up():
+    for output, setting in (("gates", {"gates": GATES["rectangular gate"]}), ("phasor", {"frequencies": [0.5]})):
+        with pytest.raises(SceneError, match=r"no parameter 'wall\.colour'"):
+            tt.plan(make_room(), output, pilot=False, parameters=["wall.colour"], **setting)
+
+
+# ----------------------------------------------------------------------------------------------------- descriptions
 
 
 def test_a_dictionary_does_not_depend_on_the_folder(tmp_path, monkeypatch):

@@ -357,6 +357,9 @@ def test_command(tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads(result.output)
     assert (found["variant"], found["film"], found["pilot"]) == ("llvm_ad_mono_polarized", "steady", None)
+    assert found["sensor"] == 0
+    result = CliRunner().invoke(main, ["plan", str(file), "--sensor", "1", "--missed", "0.01"])
+    assert result.exit_code == 2 and "the scene has 1" in result.output
     result = CliRunner().invoke(main, ["plan", str(file), "--outputs", "video"])
     assert result.exit_code == 2
 

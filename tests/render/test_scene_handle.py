@@ -328,3 +328,50 @@ def test_camera_of_the_room_is_mitsubas_look_at():
 
         look_at = mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
         np.testing.assert_allclose(np.array(look_at.matrix), CAMERA, atol=1e-6)
+
+
+# ----------------------------------------------------------------------------- lists of numbers of our own plugins
+
+
+def phasor_room(frequencies):
+    room = make_room()
+    room["sensor"]["film"] = {"type": "phasor_hdr_film", "width": 4, "height": 3, "frequencies": frequencies}
+    return room
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 16])
+@pytest.mark.parametrize("kind", [list, tuple, np.array, torch.tensor, lambda row: np.array(row, dtype=np.float32)])
+def test_frequencies_as_a_list_of_any_length(count, kind):
+    """Mitsuba takes lists of three only."""
+    row = [0.1 * k for k in range(count)]
+    scene = tt.load(phasor_room(kind(row)), variant=VARIANT)
+    renderer = tt.TransientRenderer(pickle.loads(pickle.dumps(scene)), spp=1)
+    assert renderer.frequencies.frequencies == pytest.approx(row, abs=1e-6)
+    if kind in (list, np.array):
+        assert renderer.frequencies.frequencies == tuple(row)
+        assert scene.same_description(tt.load(phasor_room(", ".join(map(repr, row)))))
+    assert tt.plan(scene, "phasor", pilot=False).renderer(spp=1).frequencies == renderer.frequencies
+
+
+def test_pulses_and_decays_as_lists():
+    room = make_room()
+    opl, values = [0.0, 0.1, 0.4, 2.0], [0, 1, 0.3, 0]
+    room["sensor"]["film"] |= {"irf": "tabulated", "irf_opl": opl, "irf_values": np.array(values)}
+    decay = {"decay_opl": tuple(opl), "decay_values": values}
+    room["wall"]["bsdf"] = {"type": "delayed", "nested": {"type": "diffuse"}, **decay}
+    written = copy.deepcopy(room)
+    written["sensor"]["film"] |= {"irf_opl": "0 0.1 0.4 2", "irf_values": "0 1 0.3 0"}
+    written["wall"]["bsdf"] |= {"decay_opl": "0 0.1 0.4 2", "decay_values": "0, 1, 0.3, 0"}
+    a, b = (tt.render(tt.load(each, variant=VARIANT), spp=2, seed=0).transient for each in (room, written))
+    assert torch.equal(a, b) and a.sum() > 0
+
+
+@pytest.mark.parametrize("wrong", [[[0.5, 1.0], [1.0, 2.0]], np.ones((2, 2)), np.array([1j]), np.array([True])])
+def test_lists_that_are_no_row_of_numbers(wrong):
+    with pytest.raises(tt.errors.SceneError, match=r"list of numbers at sensor\.film\.frequencies.*commas"):
+        tt.load(phasor_room(wrong))
+
+
+def test_lists_of_other_plugins_stay_lists():
+    node = {"type": "someone_elses_film", "frequencies": [1.0, 2.0, 3.0]}
+    assert tt.load({"type": "scene", "film": node})._description.tree["film"]["frequencies"] == [1.0, 2.0, 3.0]

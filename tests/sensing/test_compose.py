@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import pickle
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -116,7 +117,7 @@ def test_takes_a_phasor_image():
     z = torch.tensor([[[[0.3 - 0.4j]]]], dtype=torch.complex64)
     y = sensor(Rendered(phasor=z, steady=torch.full((1, 1, 1), 2.0), frequencies=frequencies))
     torch.testing.assert_close(y.flatten(), (2 + torch.tensor([0.3, 0.4, -0.3, -0.4])) / 4)
-    with pytest.raises(ShapeError, match="ItofCorrelation"):
+    with pytest.raises(ShapeError, match=r"phasor image, which ItofCorrelation alone takes.*time_axis="):
         chain()(Rendered(phasor=z, steady=torch.ones(1, 1, 1), frequencies=frequencies))
     with pytest.raises(ShapeError, match="not in a chain"):
         Compose([sensor])(Rendered(phasor=z, steady=torch.ones(1, 1, 1), frequencies=frequencies))
@@ -205,6 +206,26 @@ def test_gates_are_no_bins(stages):
     # what follows a gate takes the tensor
     after = Compose([PixelElectronics(read_noise_e=2.0)])
     assert after.expected(images).shape == images.shape
+
+
+@pytest.mark.parametrize("held", [["gated"], ["phasor"], ["moments"], []])
+def test_outputs_without_a_transient_say_what_they_hold(held):
+    """Not "give out.transient", which is None."""
+    tensors = {name: torch.ones(1, 2, 1, 1) for name in held}
+    others = {"moments": tensors.pop("moments"), "number": 2} if "moments" in held else {}
+    output = SimpleNamespace(**{"transient": None, "phasor": None, "gated": None, "others": others, **tensors})
+    expected = rf"holds {', '.join(held)} and no transient" if held else "holds no transient"
+    for sensor in (SynchronousSPAD(10), ShotNoise(), *chain().stages):
+        with pytest.raises(ShapeError, match=rf"{expected}\. Render with time_axis=") as error:
+            sensor(output)
+        assert "Give its tensor" not in str(error.value)
+    with pytest.raises(ShapeError, match=r"Give its tensor, out\.transient"):
+        ShotNoise()(Rendered(transient=light(), axis=AXIS))
+
+
+def test_phasors_are_no_transient():
+    with pytest.raises(UnitError, match=r"phasor.*time_axis="):
+        ShotNoise()(torch.ones(1, 2, 1, 1, dtype=torch.complex64))
 
 
 def test_an_output_without_an_axis():

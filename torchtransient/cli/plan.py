@@ -35,6 +35,7 @@ class Names(click.ParamType):
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")
 @click.option("--tail", type=float, default=1e-3, show_default=True, help="Share of the light left to deeper paths.")
 @click.option("--missed", type=float, default=1e-3, show_default=True, help="Share of the light outside the time axis.")
+@click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
 @click.option("--strict", is_flag=True, help="Carry polarization between smooth surfaces too.")
 @click.option("--no-pilot", is_flag=True, help="Decide from the file alone, without tracing paths.")
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
@@ -58,6 +59,7 @@ def command(scene: Path, **options: Any) -> None:
         missed=options["missed"],
         strict=options["strict"],
         pilot=not options["no_pilot"],
+        sensor=options["sensor"],
         seed=options["seed"],
         film=film,
         **{name: options[name] for name in wishes},

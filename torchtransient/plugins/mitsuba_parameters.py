@@ -11,7 +11,6 @@ from torchtransient.plugins.node_walk import bsdfs_below
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
     CORRECT,
-    SILHOUETTES,
     VALUE,
     ParameterEffect,
     Row,
@@ -32,11 +31,11 @@ SENSOR_KEYS = (
 # What a medium has that does not change how far light gets.
 _NO_EXTINCTION = ("albedo", "phase_function")
 
-SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", reason=SILHOUETTES, trusted=True)
+SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", trusted=True)
 SENSOR = replace(SHAPE, role="sensor")
-# Shadow edges move with a light, too.
-EMITTER = replace(SHAPE, role="emitter", reason=CORRECT)
-NORMAL = replace(SHAPE, role="normal", reason=CORRECT, trusted=False)
+# Shadow edges move with a light.
+EMITTER = replace(SHAPE, role="emitter")
+NORMAL = replace(SHAPE, role="normal", trusted=False)
 MEDIUM = ParameterEffect(moves_medium=True, role="medium")
 INDEX = ParameterEffect(
     moves_length=True,
@@ -54,7 +53,7 @@ COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transm
 RIGID_ONLY = replace(
     SHAPE,
     biased=True,
-    reason=f"{SILHOUETTES}; rigid motion only: the area of an emitting mesh is not differentiated",
+    reason="rigid motion only: the area of an emitting mesh is not differentiated",
 )
 
 

@@ -40,7 +40,8 @@ class ParameterEffect:
     "delay": a lifetime; "medium": an extinction; "value": none.
 
     ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, besides the missing
-    boundary term of ``moves_silhouette``. ``reason``: the state in words.
+    boundary term of ``moves_silhouette``. ``reason``: the state in words; where a silhouette moves and there is a
+    derivative, it begins with ``SILHOUETTES``, which is put there when a row does not say it.
 
     ``trusted``: the derivative is right although Mitsuba marks the parameter as not differentiable. ``stand_in``: name
     of the plugin that is built in place of Mitsuba's when the derivative is asked for.
@@ -55,6 +56,11 @@ class ParameterEffect:
     reason: str = CORRECT
     trusted: bool = False
     stand_in: str = ""
+
+    def __post_init__(self) -> None:
+        if self.moves_silhouette and self.supported and SILHOUETTES not in self.reason:
+            more = self.reason.removeprefix(CORRECT).removeprefix("; ")
+            object.__setattr__(self, "reason", "; ".join(filter(None, (SILHOUETTES, more))))
 
     @property
     def moves(self) -> bool:

@@ -14,6 +14,7 @@ from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import chosen
 
 SEED_RANGE = 2**32
+TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
 def whole_number(seed: Any) -> int | None:
@@ -48,6 +49,13 @@ def samples(name: str, value: int | None) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
     return value
+
+
+def checked_filter(name: str) -> str:
+    """The name of a temporal filter, or "auto". Raises ``SceneError``."""
+    if name not in TEMPORAL_FILTERS:
+        raise SceneError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {name!r}.")
+    return name
 
 
 def checked_grad_seed(value: int | str | None) -> int | str | None:

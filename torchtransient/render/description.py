@@ -16,8 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient import plugins
 from torchtransient.errors import SceneError
 
+# Properties of this library's plugins that hold any number of numbers, which Mitsuba only knows as a text: its own
+# lists are vectors and colours of three.
+_NUMBERS_IN_TEXT = (
+    "frequencies", "pulse_opl", "pulse_values", "irf_opl", "irf_values", "decay_opl", "decay_values",
+)  # fmt: skip
 # Entries of a bitmap or volume that hold pixels, not a transform, even when they happen to be 4 x 4.
 _ARRAY_KEYS = ("data", "bitmap", "grid")
 
@@ -189,7 +195,10 @@ def _to_plain(value: Any, path: str) -> Any:
         for key, item in value.items():
             if not isinstance(key, str):
                 raise SceneError(f"tt.load: keys must be strings, got {key!r} at {where}.")
-            plain[key] = _to_plain(item, f"{path}.{key}" if path else key)
+            below = f"{path}.{key}" if path else key
+            entry = _to_plain(item, below)
+            listed = key in _NUMBERS_IN_TEXT and isinstance(entry, (list, np.ndarray))
+            plain[key] = _numbers_in_text(entry, below) if listed and _is_ours(value) else entry
         return plain
     if isinstance(value, (bool, int, float, str, Pixels)):
         return value
@@ -204,6 +213,21 @@ def _to_plain(value: Any, path: str) -> Any:
     if hasattr(value, "detach") and hasattr(value, "cpu"):
         return _to_plain(value.detach().cpu().numpy(), path)
     return _plain_mitsuba(value, where)
+
+
+def _is_ours(node: Mapping[str, Any]) -> bool:
+    """Whether a node is of a plugin of this library, or of one that was added to it."""
+    return plugins.kind_of(str(node.get("type"))) is not None
+
+
+def _numbers_in_text(entry: list[Any] | np.ndarray, where: str) -> str:
+    array = np.asarray(entry)
+    if array.ndim != 1 or array.dtype.kind not in "fiu":
+        raise SceneError(
+            f"tt.load: expected a list of numbers at {where}, got shape {array.shape} of {array.dtype}. Give one row "
+            "of real numbers, or a text of numbers with commas."
+        )
+    return ", ".join(repr(float(number)) for number in array)
 
 
 def _plain_sequence(value: list[Any] | tuple[Any, ...], where: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,8 @@ class Effects(abc.ABC):
     """The decisions about one scene that a renderer takes over where its own arguments do not say otherwise.
 
     ``film_choice``, ``max_depth``, ``pulse`` and ``irf`` None keep what the scene has; ``temporal_filter`` is empty for
-    films without one.
+    films without one, and ``filter_is_given`` says that it was asked for, so that no other one may take its place.
+    ``sensor``: the one whose light the decisions are about.
     """
 
     scene: Scene = field(repr=False)
@@ -28,6 +30,8 @@ class Effects(abc.ABC):
     pulse: Pulse | None
     irf: Pulse | None
     temporal_filter: str
+    filter_is_given: bool = False
+    sensor: int = 0
 
     @abc.abstractmethod
     def __str__(self) -> str:
@@ -47,8 +51,17 @@ class Effects(abc.ABC):
     def film_settings(self, film: FilmChoice | None, temporal_filter: str) -> tuple[FilmChoice | None, str]:
         """Film and temporal filter of a renderer: its own where it has some, else the plan's."""
         film = self.film_choice if film is None else film
-        # A planned box stays "auto": parameters that were not planned for may call for a slope.
-        takes_it = film is None or film.has_filter
-        if temporal_filter == "auto" and takes_it and self.temporal_filter not in ("box", ""):
-            temporal_filter = self.temporal_filter
+        # A box of the plan's own choice stays "auto": parameters that were not planned for may call for a slope.
+        decided = self.temporal_filter if self.filter_is_given or self.temporal_filter != "box" else ""
+        if temporal_filter == "auto" and decided and (film is None or film.has_filter):
+            temporal_filter = decided
         return film, temporal_filter
+
+    def check_sensors(self, sensors: Sequence[int]) -> None:
+        """Raise ``SceneError`` for a sensor that was not planned for."""
+        others = sorted(set(sensors) - {self.sensor})
+        if others:
+            raise SceneError(
+                f"effects: the plan was made for sensor {self.sensor}, got sensors={list(sensors)}: another one sees "
+                f"light of other depths and times. Leave sensors out, or plan with tt.plan(scene, sensor={others[0]})."
+            )

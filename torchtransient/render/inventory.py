@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchtransient.axes import TimeAxis
+from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import of_plugin
 from torchtransient.render.inventory_colour import COLOUR, MEASURED, colour_of_node, colour_of_value
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, kind_of_node, reachable, roots
@@ -61,6 +62,7 @@ class SceneInventory:
     film: str | None = None
     film_axis: TimeAxis | None = None
     temporal_filter: str | None = None
+    film_settings: FilmChoice | None = None
     pulsed: bool = False
     plugins: set[str] = field(default_factory=set)
 
@@ -170,6 +172,7 @@ def _note_film(inventory: SceneInventory, state: Any, order: list[int], sensor: 
         inventory.temporal_filter = str(props["temporal_filter"])
     kind = of_plugin(inventory.film)
     inventory.film_axis = None if kind is None else kind.axis_in(props)
+    inventory.film_settings = None if kind is None else kind.settings_in(props)
 
 
 def _note_integrator(inventory: SceneInventory, state: Any) -> None:

@@ -30,6 +30,7 @@ from torchtransient.render.variant import active_variant
 
 # Decisions of a draft that a plan takes over as they are.
 _OF_THE_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
+_PLAIN = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "sensor", "reasons")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class Plan(Effects):
     ``film`` is "transient", "steady" (one bin), "phasor" or "gated". ``max_depth`` None keeps the scene's; so do
     ``time_axis``, ``frequencies`` and ``gates``. ``temporal_filter`` is empty for phasor and gated films.
     ``reasons``: one line per decision. ``pilot``: what the pilot run found, None without one. ``sensor``: the one
-    that was planned for. ``str(plan)`` prints the reasons.
+    that was planned for, which the renderer takes; another one is refused. ``str(plan)`` prints the reasons.
     """
 
     outputs: tuple[str, ...]
@@ -47,7 +48,6 @@ class Plan(Effects):
     parameters: tuple[str, ...]
     reasons: tuple[str, ...]
     pilot: PilotReport | None = None
-    sensor: int = 0
 
     @property
     def time_axis(self) -> TimeAxis | None:
@@ -72,13 +72,11 @@ class Plan(Effects):
         plan's.
         """
         settings.setdefault("parameters", self.parameters)
-        settings.setdefault("sensors", self.sensor)
         return TransientRenderer(self.scene, effects=self, **settings)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, as plain data for JSON."""
-        names = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "reasons")
-        plain: dict[str, Any] = {name: getattr(self, name) for name in names}
+        plain: dict[str, Any] = {name: getattr(self, name) for name in _PLAIN}
         for kind in all_films():
             plain[kind.argument] = self.film_choice.plain() if isinstance(self.film_choice, kind) else None
         for name in ("pulse", "irf"):
@@ -132,15 +130,16 @@ def plan(
     Every choice can be taken over: ``variant``, ``integrator``, ``max_depth`` (a number, or "scene" for the scene's
     own), ``time_axis`` (an axis, or "scene"), ``num_bins`` and ``bin_width_opl`` of the axis to be found,
     ``temporal_filter``, ``frequencies``, ``gates``, or ``film``, an object that says the same. ``pulse`` and ``irf``
-    are handed to the renderer, and widen the axis. A bin width that the scene's film has is kept.
+    are handed to the renderer, and widen the axis. A bin width that the scene's film has is kept. ``sensor``: the one
+    that is planned for, and rendered.
 
     The variant with which a scene was loaded only says on which device to compute. Depths and times hold for the
     description's values: parameters that change brightness or geometry very much call for another plan.
 
     Raises ``SceneError`` for unknown outputs and parameters, for outputs that need different films, for scenes that
     cannot be read or rendered, and when the pilot run sees no light and no time axis is given; ``UnitError`` for
-    shares outside (0, 1); ``VariantError`` for unknown variants; ``GradientError`` for a box filter with parameters
-    that change path lengths.
+    shares outside (0, 1); ``VariantError`` for unknown variants; ``GradientError`` for a box filter, or gates that open
+    or close at once, with parameters that change path lengths.
     """
     for name, share in (("tail", tail), ("missed", missed)):
         if not 0 < share < 1:
@@ -163,7 +162,7 @@ def plan(
         variant=variant or best.value,
         integrator=integrator or tracer.value,
         film=kind,
-        film_choice=choices.film_settings(kind, given, inventory.film),
+        film_choice=choices.film_settings(kind, given, inventory.film, asked),
         pulse=checked_pulse("pulse", pulse),
         irf=checked_pulse("irf", irf),
         parameters=tuple(parameters),
@@ -173,7 +172,7 @@ def plan(
     finder = Finder(draft, reasons, inventory, tail, missed, seed)
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _OF_THE_DRAFT}
-    return Plan(outputs=asked, film=kind.name, **kept, **vars(found))
+    return Plan(outputs=asked, film=kind.name, filter_is_given=temporal_filter is not None, **kept, **vars(found))
 
 
 def inventory_of(scene: Scene, sensor: int = 0) -> SceneInventory:

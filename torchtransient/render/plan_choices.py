@@ -52,13 +52,17 @@ def checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
     return asked
 
 
-def film_settings(film: PlannedFilm, given: FilmChoice | None, plugin: str | None) -> FilmChoice | None:
+def film_settings(
+    film: PlannedFilm, given: FilmChoice | None, plugin: str | None, outputs: Sequence[str]
+) -> FilmChoice | None:
     """The settings of the plan's film: those ``given`` by the call; None to keep those of the scene's film, which is a
-    ``plugin``, or to find them. Raises ``SceneError``.
+    ``plugin``, or to find them. ``outputs``: what is asked for, from which ``film`` follows. Raises ``SceneError``.
     """
     if given is not None and type(given) is not film.kind:
+        of_any_film = (name for name in outputs if name in _OF_ANY_FILM)
         raise SceneError(
-            f"tt.plan: {given.argument} have no effect on a {film.name} film; add {given.output!r} to the outputs."
+            f"tt.plan: outputs={tuple(outputs)} call for a {film.name} film, on which {given.argument} have no effect; "
+            f"ask for outputs={(given.output, *of_any_film)}."
         )
     if given is None and plugin != film.kind.plugin and film.kind.needed():
         raise SceneError(film.kind.needed())

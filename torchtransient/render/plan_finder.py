@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import SceneError
+from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
 from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
@@ -249,16 +250,20 @@ class Finder:
     # --------------------------------------------------------------------------------------------- temporal filter
 
     def _filter(self, given: str | None) -> str:
-        if not self.draft.film.kind.has_filter:
-            if given is not None:
-                raise SceneError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
-            return ""
+        kind = self.draft.film.kind
+        if not kind.has_filter and given is not None:
+            raise SceneError(f"tt.plan: a {self.draft.film.name} film takes no temporal filter; leave it out.")
         table = self.draft.scene.parameters() if self.draft.parameters else {}
         for key in self.draft.parameters:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
         moving = needing_slope(table, self.draft.parameters)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
+        if not kind.has_filter:
+            film = self.draft.film_choice or self.inventory.film_settings
+            jump = "" if film is None or pulsed else film.jump()
+            check_slope(moving, not jump, jump, kind.slope_remedy)
+            return ""
         own = self.inventory.temporal_filter or "box"
         if given is not None:
             check_filter(moving, given, pulsed)

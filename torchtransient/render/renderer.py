@@ -13,12 +13,14 @@ from torch import nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import DeviceError, SceneError, ShapeError
 from torchtransient.gates import Gate
+from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
     SEED_RANGE,
     Values,
     as_float,
+    checked_filter,
     checked_grad_seed,
     film_asked_for,
     fit_shape,
@@ -39,10 +41,8 @@ from torchtransient.render.parameters import ParameterInfo, needing_slope
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
-from torchtransient.render.slope import check_filter, filter_for, has_slope
+from torchtransient.render.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.render.variant import active_variant, device_type, stokes_components
-
-TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
 class TransientRenderer(nn.Module):
@@ -75,14 +75,15 @@ class TransientRenderer(nn.Module):
     instead of its own; each arrival is spread by both while rendering, what falls beyond the axis counts as outside,
     and every filter has a slope then. After a render ``sensing.pulse.apply_pulse`` does the same to a transient.
 
-    ``sensors``: an index, or a list of indices, or "all": a list adds a leading sensor dimension, and its films must
-    measure the same in one shape. ``grad_seed``: None draws the samples of the derivative independently of the render
-    (which makes gradients of squared losses unbiased), "same" takes the render's seed, an integer is taken as it is.
+    ``sensors``: an index (None: the first, or a plan's), a list of indices, or "all": a list adds a leading sensor
+    dimension, and its films must measure the same in one shape. ``grad_seed``: None draws the samples of the derivative
+    independently of the render (which makes gradients of squared losses unbiased), "same" takes the render's seed, an
+    integer is taken as it is.
 
     ``effects``: "auto" keeps the scene's transient film and integrator, and gives a steady scene the integrator that
     its contents call for; a :class:`Plan` of :func:`torchtransient.plan` brings variant, integrator, depth, time axis
-    or frequencies, and temporal filter, where the arguments beside it do not say otherwise. ``sampler``: plugin name of
-    a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
+    or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks of one sensor.
+    ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -97,7 +98,7 @@ class TransientRenderer(nn.Module):
         spp_grad: int | None = None,
         max_depth: int | None = None,
         temporal_filter: str = "auto",
-        sensors: int | Sequence[int] | str = 0,
+        sensors: int | Sequence[int] | str | None = None,
         effects: Effects | str = "auto",
         grad_seed: int | str | None = None,
         sampler: str | None = None,
@@ -115,19 +116,16 @@ class TransientRenderer(nn.Module):
             film, temporal_filter = effects.film_settings(film, temporal_filter)
             max_depth = effects.max_depth if max_depth is None else max_depth
             pulse, irf = pulse or effects.pulse, irf or effects.irf
+            sensors = effects.sensor if sensors is None else sensors
         elif effects != "auto":
             raise SceneError(f"effects: expected 'auto' or a plan of tt.plan(...), got {effects!r}.")
-        if temporal_filter not in TEMPORAL_FILTERS:
-            raise SceneError(
-                f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
-            )
         if isinstance(parameters, str):
             raise SceneError(
                 f"parameters: expected a list of keys, got the string {parameters!r}; write [{parameters!r}]."
             )
         self.scene: Scene = load(scene)
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
-        self.temporal_filter = temporal_filter
+        self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
         self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
@@ -136,7 +134,9 @@ class TransientRenderer(nn.Module):
         self._options = self._build_options(max_depth, sampler, changes)
         self._infos = self._parameter_infos()
         with active_variant(self.scene.variant):
-            self._read_scene(sensors)
+            self._read_scene(0 if sensors is None else sensors)
+            if isinstance(effects, Effects):
+                effects.check_sensors(self._sensors)
             start = self._initial_values(parameters)
         self._names = mangle(self._keys)
         for key in self._keys:
@@ -167,6 +167,7 @@ class TransientRenderer(nn.Module):
         self._channels = tuple(films[0].channel_names())
         self._scene_spp = int(found[self._sensors[0]].sampler().sample_count())
         self._pulsed = all(film.pulses for film in films)
+        self._response = response_of(films)
         self._scene_filter = films[0].temporal_filter
         if not self.film.has_filter:
             if self.temporal_filter != "auto":
@@ -233,10 +234,8 @@ class TransientRenderer(nn.Module):
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
         has.
         """
-        if temporal_filter is not None and temporal_filter not in TEMPORAL_FILTERS:
-            raise SceneError(
-                f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {temporal_filter!r}."
-            )
+        if temporal_filter is not None:
+            checked_filter(temporal_filter)
         if not self.film.has_filter and temporal_filter not in (None, "auto"):
             raise SceneError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
         twin = copy.deepcopy(self)
@@ -247,8 +246,9 @@ class TransientRenderer(nn.Module):
         return twin
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
-        """Whether gradients for ``keys`` exist with the filter in use: a box has none for what moves a path length."""
-        return has_slope(self.effective_filter, self._pulsed) or not needing_slope(self._infos, keys)
+        """Whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths."""
+        there = has_slope(self.effective_filter, self._pulsed) and self._response[0]
+        return there or not needing_slope(self._infos, keys)
 
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
@@ -278,7 +278,7 @@ class TransientRenderer(nn.Module):
 
         Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for
         unknown keys, ``ShapeError``, ``DeviceError``, ``UnitError`` for values that are not finite, ``StorageError``
-        when the cube would not fit into memory, ``GradientError`` for a derivative through a box filter.
+        when the cube would not fit into memory, ``GradientError`` for a derivative through a box.
         """
         tensors, batched, batch = self._collect(values)
         temporal_filter = self.effective_filter
@@ -343,7 +343,9 @@ class TransientRenderer(nn.Module):
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
         if torch.is_grad_enabled():
             wanted = [key for key, tensor in zip(self._keys, tensors, strict=True) if tensor.requires_grad]
-            check_filter(needing_slope(self._infos, wanted), temporal_filter, self._pulsed)
+            moving = needing_slope(self._infos, wanted)
+            check_filter(moving, temporal_filter, self._pulsed)
+            check_slope(moving, *self._response)
 
     def _items(self, seed: int | Sequence[int] | None, batch: int | None) -> tuple[Item, ...]:
         entries = 1 if batch is None else batch

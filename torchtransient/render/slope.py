@@ -1,12 +1,13 @@
 """Temporal filters of histograms, and the derivatives of parameters that change path lengths.
 
 A box has no slope in time; a tent and a Gaussian have one, and a pulse or an impulse response gives one to every
-filter.
+filter. Films without a filter have a response of their own: a gate that opens at once has no slope either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from torchtransient.plugins.parameters import check_slope
 
@@ -14,6 +15,14 @@ from torchtransient.plugins.parameters import check_slope
 def has_slope(temporal_filter: str, pulsed: bool) -> bool:
     """Whether a film with this filter has a slope in time. ``temporal_filter`` is empty for a film that has none."""
     return pulsed or temporal_filter != "box"
+
+
+def response_of(films: Iterable[Any]) -> tuple[bool, str, str]:
+    """Whether all those films that have no temporal filter have a slope; if not, what messages call the response of the
+    first one without, and what to do.
+    """
+    lacking = (film for film in films if not film.temporal_filter and not film.has_slope)
+    return next(((False, film.response_name, film.slope_remedy) for film in lacking), (True, "", ""))
 
 
 def filter_for(moving: Sequence[str], own: str, pulsed: bool) -> str:

@@ -98,7 +98,11 @@ class Compose(Sensor):
             if isinstance(first, Compose):
                 raise ShapeError("Compose: expected ItofCorrelation as the first stage itself, not in a chain.")
             if not isinstance(first, ItofCorrelation):
-                raise ShapeError(f"Compose: expected ItofCorrelation as the first stage, got {type(first).__name__}.")
+                raise ShapeError(
+                    f"Compose: expected a transient for {type(first).__name__}, got a phasor image, which "
+                    "ItofCorrelation alone takes, as the first stage. Render with time_axis=... instead of "
+                    "frequencies, or put ItofCorrelation in front."
+                )
             return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), 1
         raise ShapeError(
             "Compose: expected a tensor (..., C, T, H, W) or the output of a renderer with a transient, got "

@@ -14,6 +14,10 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
+_OTHER_FILMS = (
+    "Render with time_axis=...; phasors (out.phasor) go to ItofCorrelation, as the first stage of Compose([...]), and "
+    "gated images (out.gated) are no bins: only what follows a gate may take them."
+)
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -52,6 +56,11 @@ def check_transient(x: Tensor, where: str) -> Tensor:
         raise ShapeError(
             f"{where}: expected a tensor (..., C, T, H, W), got {tuple(x.shape)}. Add the missing dimensions."
         )
+    if x.is_complex():
+        raise UnitError(
+            f"{where}: expected a transient, got complex numbers ({x.dtype}): a phasor image? Render with "
+            "time_axis=...; of the sensors ItofCorrelation alone takes phasors."
+        )
     if not x.is_floating_point():
         raise UnitError(f"{where}: expected a floating dtype, got {x.dtype}. Convert with .float().")
     return x
@@ -60,12 +69,14 @@ def check_transient(x: Tensor, where: str) -> Tensor:
 def not_a_transient(x: object) -> str:
     """What was given instead of a transient, and what to do: the end of a message."""
     if x is None:
-        return (
-            "None, which is the transient of a render with a phasor or gated film. Render with time_axis=...; gated "
-            "images (out.gated) are no bins, and only what follows a gate may take them."
-        )
-    if hasattr(x, "transient"):
+        return f"None, which is the transient of a render with a phasor or gated film. {_OTHER_FILMS}"
+    if getattr(x, "transient", None) is not None:
         return f"{type(x).__name__}. Give its tensor, out.transient, or put the sensor into Compose([...])."
+    if hasattr(x, "transient"):
+        there = [name for name in ("phasor", "gated", "steady") if getattr(x, name, None) is not None]
+        there += [name for name, value in getattr(x, "others", {}).items() if isinstance(value, Tensor)]
+        held = f"holds {', '.join(there)} and no transient" if there else "holds no transient"
+        return f"{type(x).__name__}, which {held}. {_OTHER_FILMS}"
     return f"{type(x).__name__}."
 
 

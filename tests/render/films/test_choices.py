@@ -16,6 +16,7 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError
+from torchtransient.render import films
 from torchtransient.render.films import choices
 from torchtransient.render.films.gates import Gates
 from torchtransient.render.films.histogram import Histogram
@@ -146,6 +147,50 @@ def test_one_film_is_asked_for():
     for wrong in ({"time_axis": 3.0}, {"gates": ["rectangular 1 2"]}, {"frequencies": [float("nan")]}):
         with pytest.raises(TorchTransientError):
             tt.TransientRenderer(room, **wrong)
+
+
+def test_where_the_pages_say_that_they_are():
+    for kind in choices.all_films():
+        assert getattr(films, kind.__name__) is kind
+
+
+@pytest.mark.parametrize(
+    "given, argument",
+    [
+        (lambda: Gates(list(GIVEN["gates"])), "gates"),
+        (lambda: Gates(gate for gate in GIVEN["gates"]), "gates"),
+        (lambda: Phasors(GIVEN["frequencies"]), "frequencies"),
+    ],
+)
+def test_objects_take_what_their_keywords_take(given, argument):
+    choice = given()
+    assert choice == choice_for(argument) and hash(choice) == hash(choice_for(argument))
+
+
+def test_a_single_setting():
+    gate = GIVEN["gates"][0]
+    assert Gates(gate) == Gates([gate]) == choices.chosen({"gates": gate}) and Gates(gate).count == 1
+    for numbers in ([0.5], (0.5,), 0.5, torch.tensor([0.5]), np.array([0.5])):
+        assert Phasors(numbers) == Phasors(tt.FrequencyAxis((0.5,))) == choices.chosen({"frequencies": numbers})
+    axis = GIVEN["time_axis"]
+    assert tt.TransientRenderer(tt.scenes.cornell_box(4), film=Gates([gate])).gates == (gate,)
+    assert Histogram(axis).axis == axis
+
+
+@pytest.mark.parametrize(
+    "kind, wrong",
+    [
+        (Histogram, 3), (Histogram, None), (Histogram, (0.0, 1.0, 3)),
+        (Gates, 3), (Gates, []), (Gates, "rectangular 1 2"), (Gates, [GIVEN["gates"]]), (Gates, None),
+        (Phasors, []), (Phasors, None), (Phasors, "high"), (Phasors, [[0.5]]), (Phasors, GIVEN["time_axis"]),
+    ],
+)  # fmt: skip
+def test_objects_refuse_what_their_keywords_refuse(kind, wrong):
+    with pytest.raises(TorchTransientError, match="expected"):
+        kind(wrong)
+    if wrong is not None:
+        with pytest.raises(TorchTransientError, match="expected"):
+            tt.TransientRenderer(tt.scenes.cornell_box(4), **{kind.argument: wrong})
 
 
 @each

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from torchtransient.errors import SceneError, TorchTransientError
-from torchtransient.gates import gates_from_text
+from torchtransient.gates import SLOPE_REMEDY, gates_from_text, jump_in
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.gate_table import GateTable, put_gates, read_gates
@@ -34,7 +34,7 @@ class GatedHDRFilm(TimeResolvedFilm):
     ``energy_before`` and ``energy_after`` are zero.
 
     Gradients through the path length need gates that rise from zero and fall to zero (``gaussian``, ``tabulated`` with
-    zeros at both ends, or a pulse); a rectangular gate has no slope and asking for one raises GradientError. Filter
+    zeros at both ends, or a pulse); any other gate has no slope and asking for one raises GradientError. Filter
     settings of an integrator are ignored. A profile is straight between 2049 points, or exact where its own points
     are at equal distances.
 
@@ -71,11 +71,11 @@ class GatedHDRFilm(TimeResolvedFilm):
 
     @property
     def response_name(self) -> str:
-        return "rectangular gate"
+        return jump_in(self.gates) or "gate"
 
     @property
     def slope_remedy(self) -> str:
-        return "Use gates that rise from zero and fall to zero (gaussian, tabulated), or give the film a pulse."
+        return SLOPE_REMEDY
 
     def arrivals(self):
         """What can count: arrivals while some gate is open."""

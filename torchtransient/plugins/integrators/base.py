@@ -11,7 +11,7 @@ from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
-from torchtransient.plugins.integrators.launch import Pass, passes_of, seed_array
+from torchtransient.plugins.integrators.launch import Pass, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
@@ -147,7 +147,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def passes(self, world, sensor, film, seed, spp) -> tuple[list[Pass], int]:
         """The launches of a job, and the largest number of samples per pixel."""
-        return passes_of(sensor.sampler().clone(), film, seed_array(seed), spp, world.most_events())
+        return passes_of(sensor.sampler().clone(), film, seed, spp, world.most_events())
 
     def start(self, scene, sensor, film, job: Pass) -> PrimaryRays:
         """The primary rays of one pass."""

@@ -50,22 +50,32 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) ->
             some = min(rows_per_pass, first_row + rows - row)
             result += [Pass(band, row, some, count, sum(counts), None) for count in counts]
     for i, p in enumerate(result):
-        # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
-        p.seed = seed if len(result) == 1 else mi.sample_tea_32(seed, mi.UInt32(i))[0]
+        p.seed = _seed_of_pass(seed, i, len(result))
     return result, max(p.total for p in result)
+
+
+def _seed_of_pass(seed: Any, number: int, count: int) -> Any:
+    # A single pass keeps the user's seed, so results agree with those of Mitsuba's convention.
+    if count == 1:
+        return seed_array(seed)
+    if dr.is_array_v(seed):
+        return mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(number))[0]
+    # Of a number it is known here, without a kernel of its own.
+    return seed_array(int(mi.sample_tea_32(mi.UInt32(_whole(seed)), mi.UInt32(number))[0][0]))
 
 
 def seed_array(seed: Any) -> Any:
     """A seed as an array in memory: an array of one, or a whole number, of which the lowest 32 bits count. Raises
     UnitError.
     """
-    if dr.is_array_v(seed):
-        return mi.UInt32(seed)
+    return mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, _whole(seed))
+
+
+def _whole(seed: Any) -> int:
     try:
-        number = operator.index(seed)
+        return operator.index(seed) % 2**32
     except TypeError:
         raise UnitError(f"seed: expected a whole number, got {seed!r}.") from None
-    return dr.opaque(mi.UInt32, number % 2**32)
 
 
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:

@@ -61,6 +61,8 @@ class FilmChoice(abc.ABC):
     has_axis: ClassVar[bool] = False
     takes_pulse: ClassVar[bool] = False
     spares_steady: ClassVar[bool] = False
+    # What to do where `jump` names a response over time without a slope: the end of an error message.
+    slope_remedy: ClassVar[str] = ""
 
     # ------------------------------------------------------------------------------------------ where it comes from
 
@@ -111,6 +113,12 @@ class FilmChoice(abc.ABC):
     @abc.abstractmethod
     def describe(self, temporal_filter: str) -> str:
         """How ``print(renderer)`` shows it."""
+
+    def jump(self) -> str:
+        """What messages call the response over time where it jumps, so that there is no slope without a pulse; empty
+        where it does not, and for films whose temporal filter decides.
+        """
+        return ""
 
     # ------------------------------------------------------------------------------------------------ scene and film
 
@@ -182,6 +190,11 @@ class FilmChoice(abc.ABC):
     @classmethod
     def axis_in(cls, props: Any) -> TimeAxis | None:
         """The time axis that a film node describes, None for films without one."""
+        return None
+
+    @classmethod
+    def settings_in(cls, props: Any) -> Self | None:
+        """The settings that a film node describes, as far as a plan has to know them before a scene is built."""
         return None
 
     @classmethod

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 
-from torchtransient.errors import SceneError
-from torchtransient.gates import Gate, gates_from_text, gates_to_text
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
 from torchtransient.render.films.choice import CommandOption, FilmChoice, measured
 from torchtransient.render.films.layout import cube_channels_first
 
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gates(FilmChoice):
-    """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates."""
+    """The light as each of ``gates`` sees it: float32 (C, G, H, W). The steady image is the sum over the gates.
+
+    One :class:`~torchtransient.gates.Gate` or several. Raises ``SceneError`` for anything else.
+    """
 
     measures: ClassVar[str] = "gated"
     plugin: ClassVar[str] = "gated_hdr_film"
@@ -35,18 +38,23 @@ class Gates(FilmChoice):
     )
     pictures: ClassVar[tuple[str, ...]] = ("video",)
     takes_pulse: ClassVar[bool] = True
+    slope_remedy: ClassVar[str] = SLOPE_REMEDY
 
     gates: tuple[Gate, ...]
 
-    @classmethod
-    def from_argument(cls, value: Any) -> Self:
-        gates = (value,) if isinstance(value, Gate) else tuple(value)
+    def __post_init__(self) -> None:
+        given: Any = self.gates
+        gates = tuple(given) if isinstance(given, Iterable) else (given,)
         if not gates or not all(isinstance(gate, Gate) for gate in gates):
             raise SceneError(
                 "gates: expected one or more tt.Gate objects, for instance [tt.Gate.gaussian(6.0, 0.2)], got "
-                f"{gates!r}."
+                f"{given!r}."
             )
-        return cls(gates)
+        object.__setattr__(self, "gates", gates)
+
+    @classmethod
+    def from_argument(cls, value: Any) -> Self:
+        return cls(value)
 
     @classmethod
     def from_film(cls, film: Any) -> Self:
@@ -87,6 +95,9 @@ class Gates(FilmChoice):
     def describe(self, temporal_filter: str) -> str:
         return f"gates={self.count}"
 
+    def jump(self) -> str:
+        return jump_in(self.gates)
+
     def write(self, props: Any) -> None:
         props["gates"] = gates_to_text(self.gates)
 
@@ -101,6 +112,13 @@ class Gates(FilmChoice):
 
         video(output, path, progress=progress)
         return f"{self.count} frames, one for each gate"
+
+    @classmethod
+    def settings_in(cls, props: Any) -> Self | None:
+        try:
+            return cls(gates_from_text(str(props["gates"]))) if "gates" in props else None
+        except TorchTransientError as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
 
     @classmethod
     def film_of_pilot(cls, planned: FilmChoice | None) -> FilmChoice | None:

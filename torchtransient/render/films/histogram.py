@@ -20,7 +20,7 @@ _ANY_AXIS = TimeAxis(0.0, 1.0, 1)
 
 @dataclass(frozen=True)
 class Histogram(FilmChoice):
-    """Radiance integrated over each bin of ``axis``: float32 (C, T, H, W)."""
+    """Radiance integrated over each bin of ``axis``: float32 (C, T, H, W). ``SceneError`` for what is no axis."""
 
     measures: ClassVar[str] = "transient"
     plugin: ClassVar[str] = "transient_hdr_film"
@@ -44,10 +44,13 @@ class Histogram(FilmChoice):
 
     axis: TimeAxis
 
+    def __post_init__(self) -> None:
+        given: Any = self.axis
+        if not isinstance(given, TimeAxis):
+            raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(given).__name__}; write {self.example}.")
+
     @classmethod
     def from_argument(cls, value: Any) -> Self:
-        if not isinstance(value, TimeAxis):
-            raise SceneError(f"time_axis: expected a tt.TimeAxis, got {type(value).__name__}.")
         return cls(value)
 
     @classmethod

@@ -23,7 +23,11 @@ _PEER_FREQUENCIES = (
 
 @dataclass(frozen=True)
 class Phasors(FilmChoice):
-    """Radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of ``frequencies``: complex64 (C, F, H, W)."""
+    """Radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of ``frequencies``: complex64 (C, F, H, W).
+
+    A :class:`~torchtransient.axes.FrequencyAxis`, or numbers in cycles per metre. Raises ``UnitError`` or
+    ``ShapeError`` for anything else.
+    """
 
     measures: ClassVar[str] = "phasor"
     plugin: ClassVar[str] = "phasor_hdr_film"
@@ -42,9 +46,13 @@ class Phasors(FilmChoice):
 
     frequencies: FrequencyAxis
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.frequencies, FrequencyAxis):
+            object.__setattr__(self, "frequencies", FrequencyAxis(self.frequencies))
+
     @classmethod
     def from_argument(cls, value: Any) -> Self:
-        return cls(value if isinstance(value, FrequencyAxis) else FrequencyAxis(value))
+        return cls(value)
 
     @classmethod
     def from_film(cls, film: Any) -> Self:
