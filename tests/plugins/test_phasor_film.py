@@ -128,14 +128,14 @@ def exact_sums(frequencies, opl, value, active, pixels, slope=None):
     return total.reshape(len(frequencies), value.shape[1], pixels, -1).sum(-1).transpose(2, 0, 1)
 
 
-def summed(film, job, opl, value, active, depth, slope=None):
+def summed(film, job, opl, value, active, slope=None):
     """What the film's block makes of these events: (pixels of the pass, F, C)."""
     film.prepare()
     width, channels = int(film.crop_size()[0]), film.channel_count()
     paths = width * job.rows * job.spp
     pixel = dr.arange(mi.UInt32, paths) // job.spp + job.first_row * width
     base = pixel * film.entries_per_pixel()
-    block = film.create_block(job, base, Copies(), depth, tangents=slope is not None)
+    block = film.create_block(job, base, Copies(), len(opl), tangents=slope is not None)
     events = block.begin()
     for e in range(len(opl)):
         v = [mi.Float(value[e, c]) for c in range(channels)]
@@ -160,7 +160,7 @@ def test_sums_of_events(frequencies, spp):
     film, rng = make_film(3, 4, **frequencies), np.random.default_rng(spp)
     job, events = Job(1, 2, spp), 7
     opl, value, active = random_events(6 * spp, events, 3, rng)
-    found = summed(film, job, opl, value, active, depth=4)
+    found = summed(film, job, opl, value, active)
     expected = exact_sums(film.frequencies, opl, value, active, 6)
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.sqrt(spp * events) * np.abs(value).max())
 
@@ -171,11 +171,11 @@ def test_paths_with_more_events_than_fit(monkeypatch, tangents):
     film, rng = make_film(2, 1, **GRID), np.random.default_rng(1)
     opl, value, active = random_events(10, 9, 3, rng)
     slope = rng.normal(size=value.shape) if tangents else None
-    roomy = summed(film, Job(0, 1, 5), opl, value, active, 5, slope)
+    roomy = summed(film, Job(0, 1, 5), opl, value, active, slope)
     monkeypatch.setattr(phasor_events, "MAX_EVENTS", 4)
-    block = film.create_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 5, tangents)
+    block = film.create_block(Job(0, 1, 5), mi.UInt32(0), Copies(), 9, tangents)
     assert block.slots == 4 and block.overflows
-    tight = summed(film, Job(0, 1, 5), opl, value, active, 5, slope)
+    tight = summed(film, Job(0, 1, 5), opl, value, active, slope)
     scale = np.abs(roomy).max()
     np.testing.assert_allclose(tight, roomy, atol=2e-6 * scale)
     np.testing.assert_allclose(tight, exact_sums(film.frequencies, opl, value, active, 2, slope), atol=5e-6 * scale)
@@ -187,7 +187,7 @@ def test_tangents(frequencies):
     film, rng = make_film(2, 2, **frequencies), np.random.default_rng(2)
     opl, value, active = random_events(4 * 9, 5, 3, rng)
     slope = rng.normal(size=value.shape)
-    found = summed(film, Job(0, 2, 9), opl, value, active, 4, slope)
+    found = summed(film, Job(0, 2, 9), opl, value, active, slope)
     expected = exact_sums(film.frequencies, opl, value, active, 4, slope)
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
 

@@ -50,6 +50,8 @@ class EventBlock(FilmBlock):
         self.overflows = most_events > self.slots
         self.width = int(film.crop_size()[0])
         self.paths = self.width * job.rows * job.spp
+        # In memory: as a literal, every number of samples would compile kernels of its own.
+        self.stride = dr.opaque(mi.UInt32, self.paths)
         numbers = film.channel_count() * (2 if tangents else 1)
         self.count = dr.empty(mi.UInt32, self.paths)
         self.opl = dr.empty(mi.Float64, self.slots * self.paths)
@@ -80,7 +82,7 @@ class EventBlock(FilmBlock):
         n = events["count"]
         fits = some & (n < self.slots)
         # Events of the same number lie side by side: those that few paths reach are memory that is never touched.
-        index = dr.fma(n, self.paths, events["path"])
+        index = dr.fma(n, self.stride, events["path"])
         dr.scatter(self.opl, opl, index, fits)
         for target, value in zip(self.values, values, strict=True):
             dr.scatter(target, value, index, fits)
@@ -176,7 +178,7 @@ def sum_events(events, frequencies, first, last):
     count = dr.gather(mi.UInt32, events.count, path)
     while dr.hint(path < last, label="phasor sums"):
         live = n < count
-        index = dr.fma(n, events.paths, path)
+        index = dr.fma(n, events.stride, path)
         opl = dr.gather(mi.Float64, events.opl, index, live)
         values = [dr.gather(mi.Float, array, index, live) for array in events.values]
         for j, (cos, sin) in enumerate(frequencies.rotations(opl)):
