@@ -153,7 +153,7 @@ def test_light_is_not_lost():
 def test_deep_paths_and_no_limit():
     """More bounces than a path's memory has room for: equal to enough room, and right without any limit."""
     scene = scene_of(phasor_camera(), max_depth=20, rr_depth=50)
-    assert phasor_events.events_at_most(20, tangents=False) == phasor_events.MAX_EVENTS < 40
+    assert phasor_events.slots_for(2 * 20) == phasor_events.MAX_EVENTS < 40
     steady, a = render(scene)
     before = phasor_events.MAX_EVENTS
     try:
