@@ -47,6 +47,15 @@ class ThreeEmitterSamples(volpath.TransientVolpath):
         return segment, scattering, [EmitterFound(), EmitterSampled(), SecondEmitterSample(), ThirdEmitterSample()]
 
 
+class GuidedWithPointLight(Guided):
+    """Both at once."""
+
+    def strategies(self, contents):
+        segment, scattering, connections = super().strategies(contents)
+        return segment, scattering, [*connections, OwnPointLight([0.5, 0.0, 4.0], 10.0)]
+
+
+register("integrator", "transient_guided_with_point_light", GuidedWithPointLight)
 register("integrator", "transient_three_emitter_samples", ThreeEmitterSamples)
 register("integrator", "transient_two_emitter_samples", TwoEmitterSamples)
 register("integrator", "transient_with_point_light", WithPointLight)

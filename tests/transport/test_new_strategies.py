@@ -141,11 +141,12 @@ def test_light_inside_a_short_window():
     assert gated == pytest.approx(expected, rel=0.01) and gated > 0
 
 
-def test_own_light_equals_the_scene_s():
+@pytest.mark.parametrize("plugin", ["transient_with_point_light", "transient_guided_with_point_light"])
+def test_own_light_equals_the_scene_s(plugin):
     """A light of our own is the scene's: as bright, and at the same time."""
     dark = {"type": "point", "position": [0.5, 0.0, 4.0], "intensity": 1e-20}
     ours, theirs = (images(scene(p, **c), 1024, 8)[1] for p, c in (
-        ("transient_with_point_light", {"light": dark}), ("transient_path", {})))  # fmt: skip
+        (plugin, {"light": dark}), ("transient_path", {})))  # fmt: skip
     assert theirs.sum() > 0
     assert ours.sum() == pytest.approx(theirs.sum(), rel=2e-3)
     centers = np.arange(theirs.shape[-2])

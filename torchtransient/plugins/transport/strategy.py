@@ -44,8 +44,9 @@ class Vertex(Local):
 
 class Proposal(Local):
     """Where a connection wants to connect to: ``d`` (unit Vector3f in the world), ``active`` (a subset of
-    ``vertex.goes_on``, which keeps to ``max_depth``), ``ds`` (what lies there: ``p, n, d, dist, delta, emitter`` of a
-    DirectionSample3f, as far as guides are used), and what is the connection's own.
+    ``vertex.goes_on``, which keeps to ``max_depth``), ``ds`` (what lies there: ``p, n, d, dist, delta`` of a
+    DirectionSample3f and its ``emitter``, None for a light that is no part of the scene), and what is the connection's
+    own.
     """
 
 

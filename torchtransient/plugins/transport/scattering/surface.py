@@ -131,6 +131,8 @@ class Surface(Scattering):
         """Density with which the walk goes from ``p`` to the light's point ``ds``; ``pdf``: that of the scattering."""
         if not self.guides:
             return pdf
+        if ds.emitter is None:  # a light that lies on no shape
+            return self.own_share * pdf
         shape = ds.emitter.get_shape()
         active = active & ~ds.delta
         guided = sum(g.share * g.density(world, p, ds.p, ds.n, shape, active) for g in self.guides)
