@@ -68,6 +68,8 @@ CASES = [
          move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, spp=8192, seeds=6),
     Case("guided_area_light", "", lambda: scene("transient_guided", light=area_light()),
          move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, spp=4096, seeds=6),
+    Case("guided_fog", "", lambda: scene("transient_guided", media=True, light=area_light()),
+         set_color("block.interior_medium.sigma_t.value.value"), 0.4, 0.03, spp=8192, seeds=6),
     Case("guided_albedo", "", lambda: scene("transient_guided"),
          set_color("side.bsdf.reflectance.value"), 0.8, 0.02, spp=1024, seeds=6),
 ]  # fmt: skip
