@@ -16,21 +16,38 @@ WRITTEN_AGAINST = "3.9.1"
 # ----------------------------------------------------------------------------------------- what Mitsuba's BSDFs return
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
-# Those of the others (Mitsuba's dielectric and mask, ours) divide by the detached probability.
-_CANCELLING = ("ThinDielectric", "SmoothPlastic")
+# Those of the others (Mitsuba's dielectric, ours) divide by the detached probability.
+_CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
 # A scene's BSDFs show themselves by their description, nested ones included.
-_TWO_SIDED, _TWO_SIDED_DESCRIPTION = "TwoSidedBRDF", "TwoSided["
+_TWO_SIDED_DESCRIPTION = "TwoSided["
+# Mixtures, and the slot of the texture that says how much of the (second) nested BSDF there is.
+_WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight"}
+_MIXTURES = ("Mask[", "BlendBSDF[")
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
     """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
 
-    Inside ``mask`` the opacity hides in the same place and is attached already; such nested lobes are left as they are.
+    Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
     """
-    name = bsdf.class_name()
-    if name == _TWO_SIDED:
-        return any(nested in str(bsdf) for nested in _CANCELLING)
-    return name in _CANCELLING
+    shown = str(bsdf)
+    return any(name in shown for name in _CANCELLING) and not any(name in shown for name in _MIXTURES)
+
+
+def weight_slot(bsdf: Any) -> str | None:
+    """Name of the texture that mixes what a BSDF holds, None for BSDFs that are no mixture. A mixture of one BSDF lets
+    the rest of the light pass.
+    """
+    return _WEIGHT_SLOTS.get(bsdf.class_name())
+
+
+def mixes_delta(bsdf: Any) -> bool:
+    """Whether a BSDF is a blend of which a part has a delta lobe.
+
+    Mitsuba divides the sum of both parts' values by the sum of their densities, of which that of a delta lobe is a
+    probability instead: the values of such blends are wrong, and the derivatives of their weights.
+    """
+    return bool(bsdf.class_name() == "BlendBSDF" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def is_two_sided(bsdf: Any) -> bool:
@@ -41,6 +58,11 @@ def is_two_sided(bsdf: Any) -> bool:
     exchanged.
     """
     return _TWO_SIDED_DESCRIPTION in str(bsdf)
+
+
+def is_two_sided_itself(bsdf: Any) -> bool:
+    """Whether a BSDF is ``twosided``."""
+    return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
 def has_equal_sides(bsdf: Any) -> bool:

@@ -19,7 +19,8 @@ import numpy as np
 class Case:
     """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown into it.
 
-    ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given.
+    ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given. ``side``: 1 or
+    -1 for differences on that side of the value alone, where it ends.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Case:
     spp: int = 1024
     seeds: int = 6
     fd_spp: int = 0
+    side: int = 0
     support: str = "correct"
     tags: tuple[str, ...] = field(default=())
 
@@ -98,6 +100,15 @@ class Problem:
         self.install(mi.Float(x))
         _, transient = self.scene.integrator().render(self.scene, seed=seed, spp=self.case.fd_spp)
         return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())
+
+    def difference(self, seed: int) -> float:
+        """Finite difference of the loss: central, or of second order on one side."""
+        x, h = self.case.value, self.case.step
+        if self.case.side:
+            h *= self.case.side
+            here, near, far = (self.loss(x + k * h, seed) for k in range(3))
+            return (4 * near - 3 * here - far) / (2 * h)
+        return (self.loss(x + h, seed) - self.loss(x - h, seed)) / (2 * h)
 
     def reverse(self, seed: int) -> float:
         x = mi.Float(self.case.value)

@@ -6,6 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from torchtransient.plugins.bsdfs.composites import mixtures_of
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
@@ -20,7 +21,7 @@ class SceneContents:
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
+    which have an index. ``delays``: the BSDFs that scatter late. ``mixtures``: masks and blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables and
     media are None where the scene has no such thing.
@@ -30,7 +31,8 @@ class SceneContents:
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
         shapes = scene.shapes()
-        self.bsdfs, self.delays = delays_of(bsdfs_of_scene(scene))
+        met, self.delays = delays_of(bsdfs_of_scene(scene))
+        self.bsdfs, self.mixtures = mixtures_of(met)
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.instances = any(is_instance(shape) for shape in shapes)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())

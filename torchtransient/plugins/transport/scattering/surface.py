@@ -38,6 +38,7 @@ class Surface(Scattering):
         contents = world.contents
         self.refraction = None if contents.refraction is None else contents.refraction.read()
         self.delays = None if contents.delays is None else contents.delays.read()
+        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted is not None)
         for guide in self.guides:
             guide.prepare(world)
 
@@ -50,7 +51,10 @@ class Surface(Scattering):
 
     def arrive(self, world, path, vertex, sampler):
         vertex.u_delay = None if self.delays is None else sampler.next_2d()
+        vertex.u_part = None if self.mixtures is None else sampler.next_1d()
         vertex.delay = self.delay(vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
+        if self.mixtures is not None:
+            self.mixtures.take_part(vertex.delay, vertex.si, vertex.u_part, vertex.si.is_valid())
         vertex.bsdf = vertex.delay.bsdf
         vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
         vertex.connectable = self.connectable(world, vertex)
@@ -91,7 +95,7 @@ class Surface(Scattering):
         weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
-            u_delay=vertex.u_delay,
+            u_delay=vertex.u_delay, u_part=vertex.u_part,
             delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         )  # fmt: skip
         step.unconnected = step.delta
@@ -191,6 +195,8 @@ class Surface(Scattering):
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
             fields["u_delay"] = mi.Point2f
+        if self.mixtures is not None:
+            fields["u_part"] = mi.Float
         return fields | ({"pdf": mi.Float} if self.guides else {})
 
     def record(self, step):
@@ -203,6 +209,9 @@ class Surface(Scattering):
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
         vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
+        if self.mixtures is not None:
+            u_part = v.of(self.name)["u_part"]
+            self.mixtures.take_part(vertex.delay, si, u_part, vertex.sid.is_valid())
         vertex.bsdf = vertex.delay.bsdf
         (vertex.scattered_si,) = self.behind(vertex.delay, si)
         vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
