@@ -78,6 +78,10 @@ def test_delta_weights_lack_the_derivative_of_their_probability(plugin, attach):
     assert abs(density) > 0.1 and abs(weight) < 0.3 * abs(density)
     assert compat.hides_lobe_probability(bsdf)
     assert compat.hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
+    bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 1)))}}
+    assert compat.hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
+    # Mixtures are asked part by part.
+    assert not compat.hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
 
 
 @pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
@@ -87,6 +91,22 @@ def test_delta_weights_of_others_have_it(plugin):
     weight, density = slopes_of_lobe(bsdf, 0.01, by_direction)
     assert density == 0 and abs(weight) > 0.1
     assert not compat.hides_lobe_probability(bsdf)
+
+
+def test_blends_of_delta_lobes_have_wrong_values():
+    activate(RGB)
+    mirror = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
+    paint = {"type": "diffuse", "reflectance": 0.5}
+    bsdf = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": mirror})
+    n = 100_000
+    u = mi.Float((np.arange(n) + 0.5) / n)
+    si = interaction(unit(0.3, 0.0, 0.8))
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, u, mi.Point2f(0.3, 0.4))
+    reflected = dr.mean(dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), weight.x, 0))
+    # Half of the mirror: 0.45. What comes is divided by 1 / 2 and half of the density of the paint.
+    assert abs(float(reflected[0]) - 0.45) > 0.02
+    assert compat.mixes_delta(bsdf) and compat.weight_slot(bsdf) == "weight"
+    assert not compat.mixes_delta(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
 
 
 # -------------------------------------------------------------------------------------------------------- polarization

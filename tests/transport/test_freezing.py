@@ -36,6 +36,9 @@ def scene_of(kind):
         result["sensor"]["film"] = result["sensor"]["film"] | {"pulse": "gaussian", "pulse_fwhm_opl": 0.5}
     if kind == "thin glass":  # its lobes hide the derivative of their probability
         result["small-box"] = small | {"bsdf": {"type": "thindielectric"}}
+    if kind == "mixture":
+        blend = {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"}, "b": {"type": "conductor"}}
+        result["small-box"] = small | {"bsdf": {"type": "mask", "opacity": 0.7, "nested": blend}}
     if kind == "delayed":
         result["small-box"] = small | {"bsdf": {"type": "delayed", "lifetime": 0.3, "nested": {"type": "diffuse"}}}
     if kind == "filter":
@@ -45,7 +48,7 @@ def scene_of(kind):
     return result
 
 
-KINDS = ("surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed")
+KINDS = ("surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture")
 
 
 def render(scene, params, x, adjoint, seed):

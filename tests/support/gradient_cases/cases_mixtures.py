@@ -72,6 +72,24 @@ def opacity(name, nested, value=0.6, **options):
     return weight(name, partial(mask, nested), value, "opacity.value", **options)
 
 
+def blend_in_fog(bsdf):
+    """The wall in a block of thin fog."""
+    scene = mirror_room(bsdf)
+    scene["integrator"]["type"] = "transient_prbvolpath"
+    fog = {"type": "homogeneous", "sigma_t": 0.1, "albedo": 0.8}
+    scene["fog"] = {
+        "type": "cube", "to_world": transform().scale([0.8, 0.8, 0.6]), "bsdf": {"type": "null"}, "interior": fog
+    }  # fmt: skip
+    return scene
+
+
+def polarizing(weight):
+    """A smooth metal, of which a part is painted, seen from behind."""
+    scene = mirror_room(two_sided(blend(DIFFUSE, {"type": "diff_conductor", "eta": 0.5, "k": 2.0}, weight)))
+    scene["wall"]["to_world"] = transform().rotate([0, 1, 0], 180)
+    return scene
+
+
 SLOW = {"tags": ("slow",)}
 CASES = [
     weight("blend_of_diffuse_and_mirror", partial(blend, DIFFUSE, MIRROR)),
@@ -114,6 +132,27 @@ CASES = [
         0.0,
         0.05,
         spp=4096,
+        **SLOW,
+    ),
+    Case(
+        "blend_in_fog",
+        "blend weight",
+        lambda: blend_in_fog(blend(DIFFUSE, MIRROR)),
+        set_color("wall.bsdf.weight.value"),
+        0.4,
+        0.02,
+        spp=2048,
+        **SLOW,
+    ),
+    Case(
+        "polarized_blend",
+        "blend weight",
+        lambda: polarizing(0.4),
+        set_color("wall.bsdf.brdf_0.weight.value"),
+        0.4,
+        0.02,
+        variant="llvm_ad_mono_polarized",
+        spp=2048,
         **SLOW,
     ),
 ]
