@@ -20,8 +20,8 @@ WRITTEN_AGAINST = "3.9.1"
 _CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
 # A scene's BSDFs show themselves by their description, nested ones included.
 _TWO_SIDED_DESCRIPTION = "TwoSided["
-# Mixtures, and the slot of the texture that says how much of the (second) nested BSDF there is.
-_WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight"}
+# Mixtures, and the slot of the texture or volume that says how much of the (second) nested one there is.
+_WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFunction": "weight"}
 _MIXTURES = ("Mask[", "BlendBSDF[")
 
 
@@ -35,8 +35,8 @@ def hides_lobe_probability(bsdf: Any) -> bool:
 
 
 def weight_slot(bsdf: Any) -> str | None:
-    """Name of the texture that mixes what a BSDF holds, None for BSDFs that are no mixture. A mixture of one BSDF lets
-    the rest of the light pass.
+    """Name of the texture or volume that mixes what a BSDF or phase function holds, None for those that are no mixture.
+    A mixture of one BSDF lets the rest of the light pass.
     """
     return _WEIGHT_SLOTS.get(bsdf.class_name())
 

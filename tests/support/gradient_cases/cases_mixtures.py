@@ -7,6 +7,7 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
+from support.gradient_cases.cases_media import PHASE, block, homogeneous
 from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import mirror_room, transform
 from support.gradient_cases.unknowns import move, rotate, set_color
@@ -90,6 +91,13 @@ def polarizing(weight):
     return scene
 
 
+def phases(weight):
+    """A medium with a blend of phase functions, of which one is a blend as well."""
+    inner = {"type": "blendphase", "weight": 0.5, "a": {"type": "isotropic"}, "b": {"type": "hg", "g": -0.6}}
+    outer = {"type": "blendphase", "weight": weight, "a": {"type": "hg", "g": 0.8}, "b": inner}
+    return block({**homogeneous(), "phase": outer})
+
+
 SLOW = {"tags": ("slow",)}
 CASES = [
     weight("blend_of_diffuse_and_mirror", partial(blend, DIFFUSE, MIRROR)),
@@ -154,5 +162,20 @@ CASES = [
         variant="llvm_ad_mono_polarized",
         spp=2048,
         **SLOW,
+    ),
+    *(
+        Case(
+            f"phase_of_weight_{value:g}",
+            "phase function",
+            lambda value=value: phases(value),
+            set_color(PHASE + "weight.value.value"),
+            value,
+            0.02,
+            spp=4096,
+            seeds=16,
+            side=side,
+            **SLOW,
+        )
+        for value, side in ((0.0, 1), (1.0, -1))
     ),
 ]

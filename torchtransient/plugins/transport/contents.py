@@ -6,10 +6,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from torchtransient.plugins.bsdfs.composites import mixtures_of
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
+from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
@@ -32,7 +32,7 @@ class SceneContents:
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
         shapes = scene.shapes()
         met, self.delays = delays_of(bsdfs_of_scene(scene))
-        self.bsdfs, self.mixtures = mixtures_of(met)
+        self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF)
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.instances = any(is_instance(shape) for shape in shapes)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import GradientError
+from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import shapes_of_scene
 
 
@@ -17,7 +18,7 @@ class MediaContents:
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
     lines go through several media. ``emitter_sampling``: every medium allows connections to emitters. ``extent``: the
-    size of the scene in metres.
+    size of the scene in metres. ``phase_mixtures``: blends of phase functions, None where there are none.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -30,6 +31,8 @@ class MediaContents:
         self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
         self.open_boundaries = open_boundaries
         self.extent = extent
+        phases = {phase.ptr: phase for phase in (medium.phase_function() for medium in media)}
+        _, self.phase_mixtures = mixtures_of(list(phases.values()), mi.PhaseFunction)
 
     @property
     def one_stretch(self) -> bool:

@@ -1,9 +1,9 @@
-"""Mixtures of BSDFs (``mask``, ``blendbsdf``): a path chooses one part of them and sees that part alone.
+"""Mixtures (``mask``, ``blendbsdf``, ``blendphase``): a path chooses one part of them and sees that part alone.
 
 Mitsuba samples such a mixture as a whole. Where a part has a delta lobe that goes wrong: a blend divides by the sum of
-a probability and a density (:func:`~..mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
+a probability and a density (:func:`.mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
 part was chosen is lost. Here the choice is made outside of the BSDFs' methods, as between delayed and prompt light
-(:mod:`.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which the
+(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which the
 weight is attached and the probability is not.
 
 Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
@@ -54,44 +54,43 @@ class Sides:
 
 
 class Mixture:
-    """The parts of one BSDF of a scene.
+    """The parts of one BSDF or phase function of a scene.
 
     ``always``: it is taken apart in renders, too. ``for_derivatives``: it is taken apart where there are derivatives.
     """
 
-    def __init__(self, bsdf: Any) -> None:
-        self.bsdf = bsdf
+    def __init__(self, node: Any, kind: type) -> None:
+        self.node, self._kind = node, kind
         self.parts: list[Any] = []
         self.textures: list[Any] = []
         # (the wrapper of the scene, the one around a part), whose plain numbers have to be kept equal
         self.wrapped: list[tuple[Any, Any]] = []
         self._null: Any = None
-        self.tree = self._tree_of(bsdf, ())
-        below = [bsdf, *objects_below(bsdf, mi.BSDF)]
-        self.always = any(mixes_delta(part) for part in below)
+        self.tree = self._tree_of(node, ())
+        self.always = any(mixes_delta(part) for part in [node, *objects_below(node, kind)])
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
-    def _tree_of(self, bsdf: Any, wrappers: tuple[Any, ...]) -> Any:
-        slot = weight_slot(bsdf)
-        nested = [value for _, value in objects_of(bsdf) if isinstance(value, mi.BSDF)]
+    def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
+        slot = weight_slot(node)
+        nested = [value for _, value in objects_of(node) if isinstance(value, self._kind)]
         if slot is not None:
-            texture = dict(objects_of(bsdf))[slot]
+            texture = dict(objects_of(node))[slot]
             self.textures.append(texture)
             if len(nested) == 1:  # a mask: the rest passes straight through
                 self._null = self._null or mi.load_dict({"type": "null"})
                 nested = [self._null, *nested]
             first, second = (self._tree_of(part, wrappers) for part in nested)
             return Choice(texture, first, second)
-        if not any(is_mixture(part) for part in nested):
-            return self._leaf(bsdf, wrappers)
-        trees = [self._tree_of(part, (*wrappers, bsdf)) for part in nested]
+        if not any(is_mixture(part, self._kind) for part in nested):
+            return self._leaf(node, wrappers)
+        trees = [self._tree_of(part, (*wrappers, node)) for part in nested]
         return trees[0] if len(trees) == 1 else Sides(*trees)
 
-    def _leaf(self, bsdf: Any, wrappers: tuple[Any, ...]) -> Leaf:
+    def _leaf(self, node: Any, wrappers: tuple[Any, ...]) -> Leaf:
         for wrapper in reversed(wrappers):
-            bsdf = rebuild_wrapper(wrapper, bsdf)
-            self.wrapped.append((wrapper, bsdf))
-        self.parts.append(bsdf)
+            node = rebuild_wrapper(wrapper, node)
+            self.wrapped.append((wrapper, node))
+        self.parts.append(node)
         return Leaf(len(self.parts) - 1)
 
     def follow(self) -> None:
@@ -121,21 +120,21 @@ class Mixture:
         )
 
 
-def is_mixture(bsdf: Any) -> bool:
-    """Whether a BSDF is a mixture or holds one."""
-    return any(weight_slot(part) is not None for part in (bsdf, *objects_below(bsdf, mi.BSDF)))
+def is_mixture(node: Any, kind: type) -> bool:
+    """Whether a BSDF or phase function is a mixture or holds one."""
+    return any(weight_slot(part) is not None for part in (node, *objects_below(node, kind)))
 
 
 class Mixtures:
     """The mixtures of a scene: what of them does not change with their parameters."""
 
     def __init__(self, mixtures: list[Mixture]) -> None:
-        self.mixtures = {mixture.bsdf.ptr: mixture for mixture in mixtures}
+        self.mixtures = {mixture.node.ptr: mixture for mixture in mixtures}
         firsts, numbers = [], []
         for mixture in mixtures:
             firsts.append(len(numbers))
             numbers += [registry_number(part) for part in mixture.parts]
-        self._first = PointerTable([mixture.bsdf for mixture in mixtures], firsts)
+        self._first = PointerTable([mixture.node for mixture in mixtures], firsts)
         self._numbers = mi.UInt32(numbers)
         dr.make_opaque(self._numbers)
 
@@ -148,9 +147,9 @@ class Mixtures:
         chosen = {ptr: how for ptr, how in chosen.items() if any(how)}
         return MixtureChoice(self, chosen) if chosen else None
 
-    def pointer(self, bsdf: Any, index: Any, active: Any) -> Any:
-        """Pointer of the part ``index`` of mixtures ``bsdf``."""
-        at = self._first.look_up(bsdf, active) + index
+    def number(self, pointer: Any, index: Any, active: Any) -> Any:
+        """Number in Dr.Jit's registry of the part ``index`` of what ``pointer`` points to."""
+        at = self._first.look_up(pointer, active) + index
         return dr.gather(mi.UInt32, self._numbers, at, active)
 
 
@@ -164,35 +163,39 @@ class MixtureChoice:
         self._of, self._chosen = mixtures, chosen
 
     def take_part(self, sample: Any, si: Any, u: Any, active: Any) -> None:
-        """Change ``sample`` (a :class:`.delay_table.DelaySample`) to one part, chosen by the uniform number ``u``."""
-        bsdf = dr.select(active, sample.bsdf, dr.zeros(mi.BSDFPtr))
-        index, weight, apart = dr.dispatch(bsdf, self._choose, si, u, active)
-        apart &= active
-        pointer = dr.select(
-            apart, self._of.pointer(bsdf, index, apart), dr.reinterpret_array(mi.UInt32, sample.bsdf)
-        )
-        sample.bsdf = dr.reinterpret_array(mi.BSDFPtr, pointer)
-        weight = dr.select(apart, weight, 1)
+        """Change ``sample`` (a :class:`.bsdfs.delay_table.DelaySample`) to one part, chosen by the uniform number
+        ``u``.
+        """
+        sample.bsdf, weight = self.part_of(sample.bsdf, si, u, active)
         sample.weight = weight if sample.weight is None else sample.weight * weight
 
-    def _choose(self, bsdf: Any, si: Any, u: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(number of a part, its weight over its probability, whether it takes the place of ``bsdf``)."""
-        everywhere, at_ends = self._chosen.get(bsdf.ptr, (False, False))
+    def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
+        """(pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        kind = type(pointer)
+        pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
+        index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)
+        apart &= active
+        number = dr.select(apart, self._of.number(pointer, index, apart), dr.reinterpret_array(mi.UInt32, pointer))
+        return dr.reinterpret_array(kind, number), dr.select(apart, weight, 1)
+
+    def _choose(self, node: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(number of a part, its weight over its probability, whether it takes the place of ``node``)."""
+        everywhere, at_ends = self._chosen.get(node.ptr, (False, False))
         if not (everywhere or at_ends):
             return mi.UInt32(0), mi.Float(1), mi.Bool(False)
-        index, weight, end = _descend(self._of.mixtures[bsdf.ptr].tree, si, u, active, at_ends)
+        index, weight, end = _descend(self._of.mixtures[node.ptr].tree, interaction, u, active, at_ends)
         return index, weight, mi.Bool(True) if everywhere else end
 
 
-def _descend(tree: Any, si: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
+def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
     """(number of a part, its weight over its probability, whether a weight on the way or beside it is 0 or 1)."""
     if isinstance(tree, Leaf):
         return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
     if isinstance(tree, Sides):
-        front = si.wi.z > 0
-        a, b = (_descend(side, si, u, active, at_ends) for side in (tree.front, tree.back))
+        front = interaction.wi.z > 0
+        a, b = (_descend(side, interaction, u, active, at_ends) for side in (tree.front, tree.back))
         return tuple(dr.select(front, x, y) for x, y in zip(a, b, strict=True))
-    w = tree.texture.eval_1(si, active)
+    w = tree.texture.eval_1(interaction, active)
     # Its ends keep their derivative.
     w = dr.select(w < 0, 0, dr.select(w > 1, 1, w))
     p, end = dr.detach(w), mi.Bool(False)
@@ -202,22 +205,22 @@ def _descend(tree: Any, si: Any, u: Any, active: Any, at_ends: bool) -> tuple[An
     second = u < p
     chance = dr.select(second, p, 1 - p)
     u = dr.select(second, u, u - p) / dr.select(chance > 0, chance, 1)
-    a, b = (_descend(part, si, u, active, at_ends) for part in (tree.first, tree.second))
+    a, b = (_descend(part, interaction, u, active, at_ends) for part in (tree.first, tree.second))
     index, weight, below = (dr.select(second, y, x) for x, y in zip(a, b, strict=True))
     weight *= dr.select(second, w, 1 - w) / dr.select(chance > 0, chance, 1)
     return index, weight, end | a[2] | b[2] if at_ends else below
 
 
-def mixtures_of(bsdfs: list[Any]) -> tuple[list[Any], Mixtures | None]:
-    """(BSDFs that paths can meet, the mixtures among them or None): a mixture that is always taken apart is replaced by
-    its parts, the parts of others join it.
+def mixtures_of(nodes: list[Any], kind: type) -> tuple[list[Any], Mixtures | None]:
+    """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
+    apart is replaced by its parts, the parts of others join it.
     """
     met, mixtures = [], []
-    for bsdf in bsdfs:
-        if not is_mixture(bsdf):
-            met.append(bsdf)
+    for node in nodes:
+        if not is_mixture(node, kind):
+            met.append(node)
             continue
-        mixture = Mixture(bsdf)
+        mixture = Mixture(node, kind)
         mixtures.append(mixture)
-        met += mixture.parts if mixture.always else [bsdf, *mixture.parts]
+        met += mixture.parts if mixture.always else [node, *mixture.parts]
     return met, Mixtures(mixtures) if mixtures else None
