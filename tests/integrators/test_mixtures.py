@@ -10,8 +10,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.gradient_cases.cases_mixtures import DIFFUSE, GLASS, METAL, MIRROR, PLASTIC, blend, bump, mask, normal_map
-from support.gradient_cases.cases_mixtures import mirror_room, two_sided
+from support.gradient_cases.cases_mixtures import (
+    DIFFUSE,
+    GLASS,
+    METAL,
+    MIRROR,
+    PLASTIC,
+    blend,
+    bump,
+    mask,
+    mirror_room,
+    normal_map,
+    two_sided,
+)
 
 VARIANT = "llvm_ad_mono"
 SEEDS = 6

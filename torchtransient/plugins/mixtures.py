@@ -3,8 +3,8 @@
 Mitsuba samples such a mixture as a whole. Where a part has a delta lobe that goes wrong: a blend divides by the sum of
 a probability and a density (:func:`.mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
 part was chosen is lost. Here the choice is made outside of the BSDFs' methods, as between delayed and prompt light
-(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which the
-weight is attached and the probability is not.
+(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which
+the weight is attached and the probability is not.
 
 Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
 probability of its lobes. Where the weight itself has a derivative and is exactly zero or one, the part that would never

@@ -1,4 +1,4 @@
-"""Gradient cases of mixtures (mask, blend) with delta lobes, of what such lobes hide, and of weights of zero and one."""
+"""Gradient cases of mixtures (mask, blend): delta lobes, what such lobes hide, weights of zero and one."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ CASES = [
     weight("blend_of_mirrors", partial(blend, MIRROR, DIM_MIRROR)),
     weight("blend_of_diffuse_and_glass", partial(blend, DIFFUSE, GLASS), seeds=16, **SLOW),
     weight("bumpy_blend", lambda w: bump(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
-    weight("blend_under_normals", lambda w: normal_map(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
+    weight("blend_of_normals", lambda w: normal_map(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
     weight("two_sided_blend", lambda w: two_sided(blend(DIFFUSE, MIRROR, w)), key="brdf_0.weight.value", **SLOW),
     weight("blend_of_a_bumpy_mirror", lambda w: blend(bump(MIRROR), DIFFUSE, w), **SLOW),
     weight("blend_of_a_mask", partial(blend, mask(MIRROR), DIFFUSE), **SLOW),
