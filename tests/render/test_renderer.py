@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.render import memory
-from torchtransient.render.arguments import mix_seed
+from torchtransient.render.seeds import mix_seed
 from torchtransient.render.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 

@@ -1,8 +1,7 @@
-"""Checks of what is passed to the renderer, and seeds derived from one another."""
+"""Checks of what is passed to the renderer, values and settings."""
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,33 +12,7 @@ from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import chosen
 
-SEED_RANGE = 2**32
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
-
-
-def whole_number(seed: Any) -> int | None:
-    """A seed as one number; None for a sequence of them. Raises ``UnitError`` for what is neither."""
-    try:
-        return operator.index(seed)
-    except TypeError:
-        pass
-    try:
-        several = len(seed) >= 0 and not isinstance(seed, str)
-    except TypeError:
-        several = False
-    if not several:
-        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.")
-    return None
-
-
-def mix_seed(seed: int, number: int) -> int:
-    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
-    if number == 0:
-        return seed % SEED_RANGE
-    z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) % 2**64
-    return (z ^ (z >> 31)) % SEED_RANGE
 
 
 def samples(name: str, value: int | None) -> int | None:

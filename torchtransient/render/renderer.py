@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,6 @@ from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
-    SEED_RANGE,
     Values,
     as_float,
     checked_filter,
@@ -25,22 +24,22 @@ from torchtransient.render.arguments import (
     film_asked_for,
     fit_shape,
     mangle,
-    mix_seed,
     samples,
     sensor_list,
-    whole_number,
 )
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.effects import Effects
-from torchtransient.render.engine import Item, RenderJob
+from torchtransient.render.engine import RenderJob
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.layout import steady_channels_first
+from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput, RenderStats
 from torchtransient.render.parameters import ParameterInfo, needing_slope
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load, unknown_key
+from torchtransient.render.seeds import Item, Seeding, drawn
 from torchtransient.render.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
@@ -89,6 +88,7 @@ class TransientRenderer(nn.Module):
     derivatives raise ``GradientError``.
     """
 
+    @opaque
     def __init__(
         self,
         scene: Any,
@@ -259,6 +259,7 @@ class TransientRenderer(nn.Module):
             sampler.set_sample_count(spp)
             return int(sampler.sample_count())
 
+    @opaque
     def forward(
         self,
         values: Mapping[str, torch.Tensor] | None = None,
@@ -284,13 +285,15 @@ class TransientRenderer(nn.Module):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         used = samples("spp", spp) or self.spp or self._scene_spp
-        items = self._items(seed, batch)
+        seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
+        number, per_entry = drawn(seed)
         bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
             options=self._options,
             keys=self._keys,
-            items=items,
+            items=() if number is None else seeding.items(number),
+            seeding=seeding,
             batched=tuple(batched),
             spp=used,
             spp_grad=self.spp_grad or used,
@@ -298,7 +301,7 @@ class TransientRenderer(nn.Module):
             progress=bar,
         )
         try:
-            steady, response = Render.apply(job, *tensors)
+            steady, response = Render.apply(job, per_entry, *tensors)
         finally:
             if bar is not None:
                 bar.close()
@@ -347,46 +350,19 @@ class TransientRenderer(nn.Module):
             check_filter(moving, temporal_filter, self._pulsed)
             check_slope(moving, *self._response)
 
-    def _items(self, seed: int | Sequence[int] | None, batch: int | None) -> tuple[Item, ...]:
-        entries = 1 if batch is None else batch
-        per_entry = len(self._sensors)
-        if seed is None:
-            seed = int(torch.randint(0, SEED_RANGE, (), dtype=torch.int64))
-        if (number := whole_number(seed)) is not None:
-            seeds = [mix_seed(number, n) for n in range(entries * per_entry)]
-        else:
-            given = list(seed) if isinstance(seed, Iterable) else []
-            if len(given) != entries:
-                raise ShapeError(
-                    f"seed: expected one integer, or one for each of {entries} batch entries, got {len(given)}."
-                )
-            seeds = [mix_seed(int(s), n) for s in given for n in range(per_entry)]
-        items = []
-        for n, value in enumerate(seeds):
-            items.append(Item(n // per_entry, self._sensors[n % per_entry], value, self._seed_of_gradient(value, n)))
-        return tuple(items)
-
-    def _seed_of_gradient(self, seed: int, number: int) -> int:
-        if self.grad_seed == "same":
-            return seed
-        if isinstance(self.grad_seed, int):
-            return mix_seed(self.grad_seed, number)
-        return mix_seed(seed, 0x5EED)
-
     def _stats(self, job: RenderJob) -> RenderStats:
-        log = job.log
-        pixels = self._cube_shape[0] * self._cube_shape[1]
-        paths = log["spp"] * pixels * len(job.items)
+        runs, pixels = job.log, self._cube_shape[0] * self._cube_shape[1]
+        items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
         return RenderStats(
-            spp=log["spp"],
-            seconds=log["seconds"],
-            samples_per_second=paths / log["seconds"],
+            spp=runs[0].spp,
+            seconds=seconds,
+            samples_per_second=runs[0].spp * pixels * len(items) / seconds,
             variant=self.scene.variant,
-            integrator=log["integrator"],
+            integrator=runs[0].integrator,
             temporal_filter=job.temporal_filter or "",
-            seeds=tuple(item.seed for item in job.items),
-            energy_before=log["energy_before"],
-            energy_after=log["energy_after"],
+            seeds=tuple(item.seed for item in items),
+            energy_before=tuple(energy for run in runs for energy in run.energy_before),
+            energy_after=tuple(energy for run in runs for energy in run.energy_after),
         )
 
     def extra_repr(self) -> str:
