@@ -10,7 +10,9 @@ import torch
 from torch import nn
 
 import torchtransient as tt
-from torchtransient.testing.small_room import COLOUR, VARIANT as VARIANT  # noqa: PLC0414
+from support.sensing.all_entries import ENTRIES
+from torchtransient.testing.small_room import COLOUR
+from torchtransient.testing.small_room import VARIANT as VARIANT
 
 START = torch.tensor([0.8, 0.5, 0.2])
 
@@ -29,11 +31,14 @@ class Pipeline(nn.Module):
         super().__init__()
         self.code = nn.Linear(3, 3)
         self.renderer = renderer
-        self.blur = tt.sensing.TemporalIRF.gaussian(fwhm_s=1e-9) if hasattr(tt.sensing, "TemporalIRF") else nn.Identity()
+        responses = [entry for entry in ENTRIES if entry.name == "ImpulseResponse-gaussian"]
+        self.response, self.noise = responses[0].module(torch.float32), tt.sensing.ShotNoise(grad="expected")
 
     def forward(self, x):
         out = self.renderer({COLOUR: torch.sigmoid(self.code(x))}, seed=0)
-        return out.transient.square().sum() + out.stats.spp
+        seen = self.response(out.transient)
+        counts = self.noise(seen.clamp_min(0), generator=torch.Generator().manual_seed(1))
+        return counts.square().sum() + seen.sum() + out.stats.spp
 
 
 def results(function, x, *modules):

@@ -13,6 +13,7 @@ from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.render.films.choices import of_output
+from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.variant import active_variant
@@ -44,6 +45,7 @@ def _response(out: RenderOutput) -> torch.Tensor:
     return response
 
 
+@opaque
 def cost_of_accuracy(
     renderer: TransientRenderer,
     spp: Sequence[int] = (16, 64, 256, 1024),

@@ -21,6 +21,7 @@ from torchtransient.render.effects import Effects
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, planned
 from torchtransient.render.inventory import SceneInventory, take_inventory
+from torchtransient.render.opaque import opaque
 from torchtransient.render.plan_finder import Draft, Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
@@ -90,6 +91,7 @@ class Plan(Effects):
         return "\n".join(self.reasons)
 
 
+@opaque
 def plan(
     scene: Any,
     outputs: Sequence[str] | str = ("transient",),

@@ -230,6 +230,7 @@ class TransientRenderer(nn.Module):
             return self.temporal_filter
         return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
 
+    @opaque
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
         has.
@@ -250,6 +251,7 @@ class TransientRenderer(nn.Module):
         there = has_slope(self.effective_filter, self._pulsed) and self._response[0]
         return there or not needing_slope(self._infos, keys)
 
+    @opaque
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
         they can lay out.

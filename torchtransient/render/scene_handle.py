@@ -12,6 +12,7 @@ from typing import Any
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.render.build import BuildOptions, BuiltScene, build
 from torchtransient.render.description import Description, describe_dict, describe_xml, same_description
+from torchtransient.render.opaque import opaque
 from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table
 from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
 
@@ -43,6 +44,7 @@ class Scene:
             self._variant = resolve_variant(self._requested_variant)
         return self._variant
 
+    @opaque
     def parameters(self) -> ParameterTable:
         """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives
         a table.
@@ -131,6 +133,7 @@ def unknown_key(key: str, known: list[str]) -> str:
     return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
+@opaque
 def load(
     scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, variant: str | None = None, **xml_parameters: Any
 ) -> Scene:
