@@ -19,6 +19,12 @@ class SceneError(TorchTransientError, ValueError):
     """A scene description, plugin parameter or parameter key cannot be used."""
 
 
+class UnknownKeyError(SceneError, KeyError):
+    """A table or a renderer has nothing under a key."""
+
+    __str__ = Exception.__str__  # that of KeyError would put the message in quotation marks
+
+
 class StorageError(TorchTransientError, ValueError):
     """A file cannot be read or written, or a result would not fit into memory."""
 

@@ -21,6 +21,7 @@ from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
+from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
@@ -98,7 +99,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _check_root(state)
             name_nodes(state)
             if not options.merge:
-                _name_nested(state)
+                take_merged_apart(state)
+                name_nested(state)
             _override_films(state, options)
             _override_integrator(state, options)
             _override_samplers(state, options)
@@ -145,45 +147,6 @@ def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, proper
     if len(state.node_paths):
         state.node_paths = [*state.node_paths, key]
     state.nodes[parent].props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
-
-
-def name_nodes(state: Any) -> None:
-    """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``,
-    ``shape_1``.
-    """
-    direct = [state.nodes[index] for _, index in children(state, state.root)]
-    taken = {node.props.id() for node in direct}
-    nameless = [node for node in direct if not node.props.id()]
-    count: dict[str, int] = {}
-    for node in nameless:
-        kind = str(node.type).rsplit(".", 1)[-1].lower()
-        count[kind] = count.get(kind, 0) + 1
-    seen: dict[str, int] = {}
-    for node in nameless:
-        kind = str(node.type).rsplit(".", 1)[-1].lower()
-        number = seen.get(kind, 0)
-        name = kind if count[kind] == 1 else f"{kind}_{number}"
-        while name in taken:
-            number += 1
-            name = f"{kind}_{number}"
-        seen[kind] = number + 1
-        taken.add(name)
-        node.props.set_id(name)
-
-
-def _name_nested(state: Any) -> None:
-    """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
-    import mitsuba as mi
-
-    direct = {index for _, index in children(state, state.root)}
-    taken = {node.props.id() for node in state.nodes}
-    for index, node in enumerate(state.nodes):
-        if node.type == mi.ObjectType.BSDF and index not in direct:
-            name = f"{node.props.id()}#{index}"
-            while name in taken:
-                name += "'"
-            taken.add(name)
-            node.props.set_id(name)
 
 
 def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import nn
 
 from torchtransient.render.opaque import opaque
@@ -16,7 +15,7 @@ from torchtransient.render.renderer import TransientRenderer
 @opaque
 def render(
     scene: Any,
-    values: Mapping[str, torch.Tensor] | None = None,
+    values: Mapping[str, Any] | None = None,
     *,
     spp: int | None = None,
     seed: int | Sequence[int] | None = None,

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import DeviceError, SceneError, ShapeError
+from torchtransient.errors import SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.pulses import Pulse
@@ -35,10 +35,10 @@ from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.layout import steady_channels_first
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput, RenderStats
-from torchtransient.render.parameters import ParameterInfo, needing_slope
+from torchtransient.render.parameters import ParameterInfo, needing_slope, unknown_key
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
-from torchtransient.render.scene_handle import Scene, load, unknown_key
+from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.seeds import Item, Seeding, drawn
 from torchtransient.render.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.render.variant import active_variant, device_type, stokes_components
@@ -192,8 +192,9 @@ class TransientRenderer(nn.Module):
         for slot in slots:
             value = torch.tensor(slot.initial, dtype=torch.float32, device=device).reshape(slot.shape)
             if isinstance(given, Mapping) and given[slot.key] is not None:
-                value = torch.as_tensor(given[slot.key], dtype=torch.float32).detach().clone().to(device)
-                value, batched = fit_shape(slot.key, value, slot.shape)
+                own = given[slot.key]
+                own = as_float(slot.key, own.to(device) if isinstance(own, torch.Tensor) else own, device)
+                value, batched = fit_shape(slot.key, own.detach().clone(), slot.shape)
                 if batched:
                     raise ShapeError(
                         f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}."
@@ -264,7 +265,7 @@ class TransientRenderer(nn.Module):
     @opaque
     def forward(
         self,
-        values: Mapping[str, torch.Tensor] | None = None,
+        values: Mapping[str, Any] | None = None,
         *,
         seed: int | Sequence[int] | None = None,
         spp: int | None = None,
@@ -272,8 +273,9 @@ class TransientRenderer(nn.Module):
     ) -> RenderOutput:
         """Render. ``values`` replaces the module's own parameters, key by key; keys are those of ``parameters``.
 
-        A value has the shape listed by ``scene.parameters()``, or one leading batch dimension B more; values without
-        it are used for every entry. Any floating dtype is taken and computed in float32.
+        A value is a tensor, an array, a list or a number of the shape listed by ``scene.parameters()``, or with one
+        leading batch dimension B more; values without it are used for every entry. Any real dtype is taken and computed
+        in float32.
 
         ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
         every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
@@ -314,7 +316,7 @@ class TransientRenderer(nn.Module):
             self.film, steady, self.film.channels_first(response, leading, components), stats, self._channels
         )
 
-    def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
+    def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
         given = dict(values or {})
         for key in given:
@@ -325,13 +327,7 @@ class TransientRenderer(nn.Module):
         tensors, batched, batch = [], [], None
         for key in self._keys:
             value = given.get(key, self.values[key])
-            value = as_float(key, value)
-            if value.device.type != expected:
-                raise DeviceError(
-                    f"value of {key!r}: expected a tensor on {expected!r}, where variant {self.scene.variant} "
-                    f"computes, got {str(value.device)!r}. Move it with .to({expected!r}), or load the scene with a "
-                    f"variant of the other kind."
-                )
+            value = as_float(key, value, expected)
             value, has_batch = fit_shape(key, value, self._shapes[key])
             if has_batch:
                 if batch is not None and value.shape[0] != batch:

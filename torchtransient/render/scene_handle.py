@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -13,7 +12,7 @@ from torchtransient.errors import GradientError, SceneError
 from torchtransient.render.build import BuildOptions, BuiltScene, build
 from torchtransient.render.description import Description, describe_dict, describe_xml, same_description
 from torchtransient.render.opaque import opaque
-from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table
+from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table, unknown_key
 from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
@@ -124,13 +123,6 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r})"
-
-
-def unknown_key(key: str, known: list[str]) -> str:
-    """The message for a parameter key that a scene does not have."""
-    close = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
-    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
 @opaque
