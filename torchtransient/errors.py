@@ -19,6 +19,10 @@ class SceneError(TorchTransientError, ValueError):
     """A scene description, plugin parameter or parameter key cannot be used."""
 
 
+class PhysicsError(SceneError):
+    """What ``PhysicsWarning`` is about, where an error was asked for (``physics="error"``)."""
+
+
 class UnknownKeyError(SceneError, KeyError):
     """A table or a renderer has nothing under a key."""
 

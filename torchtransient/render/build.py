@@ -17,12 +17,14 @@ from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
 from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -71,12 +73,21 @@ class BuildOptions:
 
 @dataclass
 class BuiltScene:
-    """A Mitsuba scene with what has to be known about its nodes."""
+    """A Mitsuba scene with what has to be known about its nodes. ``to_world``: all transforms as described, by key."""
 
     scene: Any
     params: Any
     mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
     integrator: str = ""
+    to_world: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def findings(self) -> dict[str, str]:
+        """What is unphysical in the description, by key."""
+        if self._findings is None:
+            self._findings = scene_findings(described_shares(self.params), self.to_world)
+        return self._findings
+
+    _findings: dict[str, str] | None = None
 
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
@@ -106,6 +117,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _override_samplers(state, options)
             _substitute_plugins(state, options)
             transforms = _mesh_transforms(state)
+            placed = _placed(state)
             integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             _forget_queries(state)
@@ -118,7 +130,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
     except (RuntimeError, ValueError, TypeError) as error:
         text = str(error).replace("While loading string", f"While loading {description.name}")
         raise SceneError(f"{description.name}: Mitsuba could not build the scene. {text}") from error
-    return BuiltScene(scene, mi.traverse(scene), transforms, plugin)
+    return BuiltScene(scene, mi.traverse(scene), transforms, plugin, placed)
 
 
 def _location(error: BaseException | None) -> str | None:
@@ -161,6 +173,16 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
                 matrix = np.array(node.props["to_world"].matrix, dtype=np.float64)
             result[node.props.id()] = matrix
     return result
+
+
+def _placed(state: Any) -> dict[str, np.ndarray]:
+    """Every ``to_world`` of the description, by its key."""
+    found = {}
+    for node in state.nodes:
+        if "to_world" in node.props:
+            name = node.props.id() or node.props.plugin_name()
+            found[f"{name}.to_world"] = np.array(node.props["to_world"].matrix, dtype=np.float64)
+    return found
 
 
 # ----------------------------------------------------------------------------------------------------- overrides

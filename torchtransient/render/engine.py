@@ -27,6 +27,7 @@ from torchtransient.render.films.choices import of_film
 from torchtransient.render.filter_override import temporal_filter
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
+from torchtransient.render.physics import PhysicsWatch, are_finite, smallest_and_largest
 from torchtransient.render.seeds import Item, Seeding
 from torchtransient.render.variant import active_variant
 
@@ -52,9 +53,9 @@ class RenderJob:
     """Everything about a call that is not a tensor.
 
     ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
-    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects
-    what each primal run reports (seconds, seeds, energy outside the window) and belongs to one call: under ``vmap`` a
-    call is several runs.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``watch``: says
+    what is unphysical. ``log`` collects what each primal run reports (seconds, seeds, energy outside the window) and
+    belongs to one call: under ``vmap`` a call is several runs.
     """
 
     scene: Scene
@@ -66,6 +67,7 @@ class RenderJob:
     spp: int
     spp_grad: int
     temporal_filter: str | None
+    watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
     progress: Callable[[float], None] | None = None
     log: list[RunLog] = field(default_factory=list)
@@ -163,7 +165,7 @@ def _session(job: RenderJob) -> Iterator[_Session]:
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
-    _check_finite(job, values)
+    _check_values(job, values)
     with _session(job) as session:
         started = time.perf_counter()
         check_items(session.sensors, job.items)
@@ -171,6 +173,9 @@ def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor
         steady, response, before, after = _render_items(session, values)
         seconds, spp = time.perf_counter() - started, _drawn_samples(session)
         job.log.append(RunLog(job.items, seconds, session.slots.built.integrator, spp, before, after))
+        channels = len(session.film(job.items[0]).channel_names())
+    if job.watch.looks:
+        job.watch.window(steady, channels, sum(before), sum(after))
     return steady, response
 
 
@@ -268,13 +273,16 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
     return next(iter(found.values()))[0]
 
 
-def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
+def _check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
     for key, value in zip(job.keys, values, strict=True):
-        if not bool(torch.isfinite(value).all()):
+        low, high = smallest_and_largest(value)
+        if not are_finite(low, high):
             bad = int((~torch.isfinite(value)).sum())
             raise UnitError(
                 f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
             )
+        if job.watch.looks:
+            job.watch.value(key, value, low, high)
 
 
 # ----------------------------------------------------------------------------------------------------- derivatives

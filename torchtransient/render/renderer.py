@@ -14,6 +14,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.plugins.parameters import check_slope
+from torchtransient.plugins.shares import is_share
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
@@ -36,6 +37,7 @@ from torchtransient.render.films.layout import steady_channels_first
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput, RenderStats
 from torchtransient.render.parameters import ParameterInfo, needing_slope, unknown_key
+from torchtransient.render.physics import PhysicsWatch
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load
@@ -84,6 +86,11 @@ class TransientRenderer(nn.Module):
     or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks of one sensor.
     ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
+    ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
+    outside of [0, 1], described or given, transforms without an inverse, and windows that miss more than 5 % of the
+    light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
+    ``PhysicsError``; "ignore" does not look.
+
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
     """
@@ -108,6 +115,7 @@ class TransientRenderer(nn.Module):
         gates: Sequence[Gate] | None = None,
         steady: bool = True,
         film: FilmChoice | None = None,
+        physics: str = "warn",
     ):
         super().__init__()
         film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
@@ -127,6 +135,7 @@ class TransientRenderer(nn.Module):
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
+        self._watch = PhysicsWatch(physics, self.scene.told)
         self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
@@ -138,6 +147,7 @@ class TransientRenderer(nn.Module):
             if isinstance(effects, Effects):
                 effects.check_sensors(self._sensors)
             start = self._initial_values(parameters)
+            self._look_at_scene()
         self._names = mangle(self._keys)
         for key in self._keys:
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
@@ -183,6 +193,17 @@ class TransientRenderer(nn.Module):
                 f"temporal_filter: the films of sensors {list(self._sensors)} have different ones, {', '.join(names)}. "
                 "Say which, for instance temporal_filter='box', or use one TransientRenderer per sensor."
             )
+
+    def _look_at_scene(self) -> None:
+        if self._watch.looks:
+            built = self.scene.built(self._options)
+            slots = self.scene.slots(self._keys, self._options).slots
+            self._watch.window_name = f"window of {self.film.describe('')}"
+            self._watch.shares = frozenset(key for key in self._keys if is_share(built.params, key))
+            self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
+            # What is given replaces what is described.
+            findings = self.scene.findings(self._options)
+            self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
 
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
         slots = self.scene.slots(self._keys, self._options).slots
@@ -302,6 +323,7 @@ class TransientRenderer(nn.Module):
             spp=used,
             spp_grad=self.spp_grad or used,
             temporal_filter=temporal_filter or None,
+            watch=self._watch,
             progress=bar,
         )
         try:

@@ -35,6 +35,8 @@ class Scene:
         # Not in the built scenes: what refers to itself is freed late.
         self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
         self._table: ParameterTable | None = None
+        # Which unphysical things were said already (`render.physics`).
+        self.told: set[str] = set()
 
     @property
     def variant(self) -> str:
@@ -66,6 +68,14 @@ class Scene:
             while len(self._builds) > _MAX_BUILDS:
                 self.drop(next(iter(self._builds)))
         self._builds.move_to_end(options)
+        return found
+
+    def findings(self, options: BuildOptions) -> dict[str, str]:
+        """What is unphysical in the description, by key. Must be called inside ``active_variant(scene.variant)``."""
+        found = self.built(options).findings()
+        if found and options.merge:
+            # Merged shapes have lost their names: those of the build that `parameters()` reads.
+            found = self.built(BuildOptions(real_bitmaps=True)).findings()
         return found
 
     def drop(self, options: BuildOptions) -> None:
