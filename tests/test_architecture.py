@@ -25,6 +25,7 @@ LEVEL = {
     "render": 3,
     "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
     "cli": 5,
+    "__main__": 6,
 }  # fmt: skip
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "vis"}
 MITSUBA = {"mitsuba", "drjit"}

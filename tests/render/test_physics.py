@@ -76,6 +76,7 @@ def test_media_of_the_description(room):
 
 
 def test_what_may_be_larger_than_one_is_left_alone(room):
+    room["integrator"] = {"type": "transient_prbvolpath", "max_depth": 3}
     room["box"]["interior"] = {**FOG, "albedo": 1.0, "sigma_t": 8.0}
     room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": 1.0}
     room["box"]["bsdf"] = {"type": "roughconductor", "eta": 1.5, "k": 3.0}
@@ -186,6 +187,16 @@ def test_a_window_that_holds_the_light(room):
     assert said(tt.render, loaded(room), spp=16, seed=0, physics="error")[1] == []
     short = tt.TimeAxis(6.0, 0.25, 4)
     assert said(tt.render, loaded(room), spp=16, seed=0, time_axis=short, steady=False, physics="error")[1] == []
+
+
+def test_what_a_filter_spreads_over_the_rim_of_one_bin_for_all_times_is_not_missed(room):
+    everything = tt.TimeAxis(0.0, 100.0, 1)
+    scene = loaded(room)
+    renderer = tt.TransientRenderer(scene, time_axis=everything, temporal_filter="tent", spp=4, physics="error")
+    out = renderer(seed=0)
+    assert sum(out.stats.energy_before) > 0.1 * float(out.steady.mean(0).sum())
+    with pytest.raises(PhysicsError, match="misses"):
+        tt.render(scene, time_axis=tt.TimeAxis(0.0, 8.0, 1), spp=4, seed=0, physics="error")
 
 
 def test_stokes_vectors_count_by_their_first_component(room):

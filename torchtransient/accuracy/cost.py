@@ -80,6 +80,11 @@ def cost_of_accuracy(
     that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
     per curve.
     """
+    if not isinstance(renderer, TransientRenderer):
+        raise SceneError(
+            f"cost_of_accuracy: expected a tt.TransientRenderer, got {type(renderer).__name__}. Make one of a scene: "
+            "tt.TransientRenderer(scene, parameters=[...])."
+        )
     missing = [key for key in gradients if key not in renderer.values]
     if missing:
         raise SceneError(

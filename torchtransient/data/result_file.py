@@ -91,16 +91,22 @@ def check_folder(path: str | Path) -> None:
         raise StorageError(f"result file: '{target}' {what}. Choose another place.")
 
 
-def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, Any] | None = None) -> Path:
-    """Write a render. An existing file is replaced once the new one is complete.
+def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
+    """Write a render, or a result that was read. An existing file is replaced once the new one is complete.
 
     `metadata`: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render. Raises
     StorageError for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
     """
     target = check_target(path)
-    stats = asdict(output.stats)
+    given: Any = output
+    if not isinstance(given, RenderOutput | Result):
+        raise StorageError(
+            f"result file: expected what a render returned, a RenderOutput, got {type(given).__name__}. Tensors alone "
+            "have no axis; write them with torch.save."
+        )
+    own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
     try:
-        note = json.dumps({**(metadata or {}), "stats": stats})
+        note = json.dumps({**(metadata or {}), **own})
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
     film = of_output(output)

@@ -34,8 +34,8 @@ class PhysicsWatch:
     ``PhysicsError``, "ignore" looks at nothing.
 
     ``told``: what was said before, of the same scene: ``tt.render`` in a loop makes a renderer each time.
-    ``window_name``: what tells its window from others. ``shares``: which of the renderer's keys are shares of the
-    light; ``transforms``: which are transforms.
+    ``window_name``: what tells its window from others, empty where none is looked at. ``shares``: which of the
+    renderer's keys are shares of the light; ``transforms``: which are transforms.
     """
 
     def __init__(self, mode: str, told: set[str]):
@@ -78,7 +78,7 @@ class PhysicsWatch:
 
     def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
         """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""
-        if before + after <= 0 or (self.mode != "error" and self.window_name in self._told):
+        if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._told):
             return
         total = float(steady[..., :channels].sum(dtype=torch.float64)) / channels
         if total > 0 and before + after > MISSED * total:

@@ -198,7 +198,9 @@ class TransientRenderer(nn.Module):
         if self._watch.looks:
             built = self.scene.built(self._options)
             slots = self.scene.slots(self._keys, self._options).slots
-            self._watch.window_name = f"window of {self.film.describe('')}"
+            if self.film.count > 1 or self.effective_filter in ("", "box"):
+                # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
+                self._watch.window_name = f"window of {self.film.describe('')}"
             self._watch.shares = frozenset(key for key in self._keys if is_share(built.params, key))
             self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
             # What is given replaces what is described.
