@@ -152,7 +152,7 @@ def test_list_of_parameters(folder):
         (("box.xml", "--set", "gray.reflectance.value=0.1"), "Did you mean 'grey.reflectance.value'"),
         (("box.xml", "--set", "grey.reflectance.value=0.1"), "expected shape (3,)"),
         (("box.xml", "--variant", "scalar_rgb"), "llvm_ad_rgb"),
-        (("box.xml", "--sensor", "2"), "sensors"),
+        (("box.xml", "--sensor", "2"), "--sensor"),
         (("box.xml", "--param", "res=60000", "--quiet"), "TiB"),
         (("box.xml", "-o", "out.exr"), ".npz"),
         (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),

@@ -91,6 +91,15 @@ def test_results_from_files_make_batches(outputs, tmp_path):
     assert "metadata" in repr(results[0]) and "float32 (3, 24, 3, 4)" in repr(results[0])
 
 
+def test_what_sensing_returns_makes_batches_too(outputs):
+    returns = [tt.sensing.first_return(out.transient, 0.01) for out in outputs]
+    batch = default_collate(returns)
+    assert batch.position.shape == (2, 3, 1, 3, 4) and batch.valid.dtype == torch.bool
+    double = batch.to(torch.float64)
+    assert double.position.dtype == torch.float64 and double.valid.dtype == torch.bool
+    assert len(repr(batch)) < 200
+
+
 def test_a_tree_of_tensors(outputs):
     leaves, spec = _pytree.tree_flatten({"a": outputs[0]})
     assert len(leaves) == 2 and all(isinstance(leaf, torch.Tensor) for leaf in leaves)

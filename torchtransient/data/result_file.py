@@ -31,7 +31,7 @@ from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.gates import Gate
 from torchtransient.render.films.choices import of_entries, of_output
 from torchtransient.render.output import RenderOutput, named_fields
-from torchtransient.render.tensor_record import TensorRecord
+from torchtransient.tensor_record import TensorRecord
 
 FORMAT = "torchtransient result 1"
 _HDF5 = (".h5", ".hdf5")

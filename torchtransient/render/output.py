@@ -12,8 +12,8 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.render.films.choice import FilmChoice
-from torchtransient.render.tensor_record import TensorRecord
 from torchtransient.render.variant import stokes_components
+from torchtransient.tensor_record import TensorRecord
 
 
 @dataclass(frozen=True)

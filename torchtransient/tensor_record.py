@@ -44,13 +44,14 @@ class TensorRecord:
         return self._with({name: function(tensor) for name, tensor in self.tensors().items()})
 
     def to(self, *args: Any, **keywords: Any) -> Self:
-        """Every tensor through its ``to``; of a real dtype, complex tensors take the complex one of its precision."""
+        """Every tensor through its ``to``. As in modules, a dtype is for real numbers; complex tensors take the complex
+        one of its precision, and whole numbers and truth values stay what they are.
+        """
 
         def moved(tensor: torch.Tensor) -> torch.Tensor:
-            if not tensor.is_complex():
-                return tensor.to(*args, **keywords)
-            given = {name: _complex_of(value) for name, value in keywords.items()}
-            return tensor.to(*(_complex_of(value) for value in args), **given)
+            values = [_dtype_for(tensor, value) for value in args]
+            named = {name: _dtype_for(tensor, value) for name, value in keywords.items()}
+            return tensor.to(*values, **named)
 
         return self.map(moved)
 
@@ -177,8 +178,12 @@ def _short(value: Any) -> str:
     return text if len(text) <= 100 else text[:97] + "..."
 
 
-def _complex_of(value: Any) -> Any:
-    return value.to_complex() if isinstance(value, torch.dtype) and not value.is_complex else value
+def _dtype_for(tensor: torch.Tensor, value: Any) -> Any:
+    if not isinstance(value, torch.dtype):
+        return value
+    if tensor.is_complex():
+        return value if value.is_complex else value.to_complex()
+    return value if tensor.is_floating_point() else tensor.dtype
 
 
 class _Rest:
