@@ -232,6 +232,17 @@ def test_extinction_is_told_from_albedo():
     assert table["box.interior_medium.albedo.value.value"].differentiable
 
 
+def test_a_key_that_the_table_does_not_have(room_scene):
+    table = room_scene.parameters()
+    with pytest.raises(
+        tt.errors.SceneError, match=r"^the scene has no parameter 'box\.bsdf\.reflectanse.*Did you mean"
+    ):
+        table["box.bsdf.reflectanse.value"]
+    with pytest.raises(KeyError):
+        table["nope"]
+    assert "nope" not in table and table.get("nope") is None
+
+
 def test_unknown_key_suggests_the_right_one(room_scene):
     with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value"):
         tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])

@@ -7,13 +7,14 @@ and normals follow.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
 from torchtransient.render.build import BuiltScene
@@ -53,6 +54,8 @@ class ParameterTable(Mapping[str, ParameterInfo]):
         self._entries = {entry.key: entry for entry in entries}
 
     def __getitem__(self, key: str) -> ParameterInfo:
+        if key not in self._entries:
+            raise UnknownKeyError(unknown_key(key, list(self._entries)))
         return self._entries[key]
 
     def __iter__(self) -> Iterator[str]:
@@ -80,6 +83,13 @@ class ParameterTable(Mapping[str, ParameterInfo]):
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def unknown_key(key: str, known: list[str]) -> str:
+    """The message for a parameter key that a scene does not have."""
+    close = difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
+    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
+    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
 def _short(value: Any) -> str:
