@@ -8,6 +8,7 @@ import mitsuba as mi
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
+from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
@@ -77,6 +78,10 @@ class TransientIntegrator(mi.CppADIntegrator):
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
 
+    def traverse(self, cb):
+        super().traverse(cb)
+        note_scene(self, cb)
+
     # ----------------------------------------------------------------------------------- preparation
 
     def resolve(self, scene, sensor):
@@ -120,12 +125,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         return self._seen_scene(scene).tracker(scene)
 
     def reference(self, scene):
-        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
+        """The sphere around the scene as described, which light from and to infinity is timed by."""
         return self._seen_scene(scene).reference
 
     def _seen_scene(self, scene) -> SeenScene:
         if self._seen is None or not self._seen.is_of(scene):
-            self._seen = SeenScene(scene)
+            self._seen = SeenScene(scene, self)
         return self._seen
 
     def settings(self) -> PathSettings:
