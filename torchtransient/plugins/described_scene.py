@@ -49,8 +49,8 @@ def described(scene: Any, *also: Any) -> DescribedScene:
 
 
 def note_scene(plugin: Any, callback: Any) -> None:
-    """To be called in ``traverse`` of a plugin that keeps what a scene was like: when ``mi.traverse`` walks a scene, the
-    scene is as described, or was noted before.
+    """For the ``traverse`` of a plugin that keeps what a scene was like: a scene that ``mi.traverse`` walks is as
+    described, or was noted before.
     """
     # Mitsuba's own callback knows the way down to each plugin; others do not install values.
     hierarchy = getattr(callback, "hierarchy", {})

@@ -8,10 +8,11 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_two_sided
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.transport.media_contents import media_of
 
 
@@ -22,8 +23,9 @@ class SceneContents:
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
     which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables and
-    media are None where the scene has no such thing.
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
+    (:class:`~..sampling.sphere_lights.SphereLights`). Tables, media and lights are None where the scene has no such
+    thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -39,7 +41,7 @@ class SceneContents:
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
-        self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
+        self.sphere_lights = SphereLights.of(scene)
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:
