@@ -15,9 +15,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
+from torchtransient.plugins.finite_values import check_parameters
 from torchtransient.plugins.sampling.distant import distant_reference
 
 
@@ -30,6 +32,7 @@ class DescribedScene:
         self.reference = distant_reference(scene)
         self._key = _key_of(scene)
         self._kept = scene.shapes()[:1]
+        self.is_finite = False
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
@@ -59,6 +62,17 @@ def note_scene(plugin: Any, callback: Any) -> None:
         above = hierarchy.get(above, (None, 0))[0]
     if above is not None:
         described(above)
+
+
+def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = None) -> None:
+    """Raise ``SceneError`` where a number of a scene is NaN or infinite; a scene that was found right is not asked
+    again. ``params``: its ``mi.traverse``, ``known``: what is known of it, where the caller has them.
+    """
+    known = known or described(scene)
+    if known.is_finite or dr.flag(dr.JitFlag.FreezingScope):  # a recording has no values
+        return
+    check_parameters(mi.traverse(scene) if params is None else params)
+    known.is_finite = True
 
 
 def _keepers_of(scene: Any) -> list[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchtransient.plugins.described_scene import described
+from torchtransient.plugins.described_scene import check_scene, described
 from torchtransient.plugins.parameters import ParameterTracker
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.contents import SceneContents
@@ -21,6 +21,7 @@ class SeenScene:
 
     def __init__(self, scene: Any, integrator: Any) -> None:
         self._described = described(scene, integrator)
+        check_scene(scene, known=self._described)
         self.reference: DistantReference = self._described.reference
         self._plugins: tuple[int, ...] = ()
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
