@@ -13,6 +13,7 @@ from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
+from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.media_contents import media_of
 
 
@@ -21,7 +22,7 @@ class SceneContents:
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
+    which have an index. ``surroundings``: what may lie around the sensor. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). Tables, media and lights are None where the scene has no such
@@ -32,12 +33,14 @@ class SceneContents:
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
         shapes = scene.shapes()
-        self.bsdfs, self.delays = delays_of(bsdfs_of_scene(scene))
+        outermost = bsdfs_of_scene(scene)
+        self.bsdfs, self.delays = delays_of(outermost)
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.instances = any(is_instance(shape) for shape in shapes)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
         self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
+        self.surroundings = Surroundings.of(sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
