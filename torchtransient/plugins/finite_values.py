@@ -62,10 +62,17 @@ def numbers_of(value: Any) -> np.ndarray | None:
     if isinstance(value, (mi.Bitmap, mi.VolumeGrid, np.ndarray)):
         array = np.asarray(value)
     elif dr.is_array_v(value) and dr.is_float_v(value):
-        array = np.array(dr.detach(value))
+        array = _components(dr.detach(value))
     else:
         return None
     return array if array.dtype.kind == "f" else None
+
+
+def _components(value: Any) -> np.ndarray:
+    """All numbers, read one component at a time: to put them into one array would take a kernel."""
+    if dr.depth_v(value) > 1 and not dr.is_tensor_v(value):
+        return np.concatenate([_components(entry).reshape(-1) for entry in value])
+    return np.array(value)
 
 
 def _at_faces(mesh: Any, array: np.ndarray) -> np.ndarray:
