@@ -129,7 +129,7 @@ SQUARE = [[-1, -1, 0, 0, 0], [1, -1, 0, 1, 0], [1, 1, 0, 1, 1], [-1, 1, 0, 0, 1]
 def test_vertices_of_a_file(tmp_path, x):
     broken = scene()
     broken["wall"] = mesh_file(tmp_path / "wall.ply", [[-1, -1, x, 0, 0], *SQUARE[1:]])
-    with pytest.raises(SceneError, match="wall.ply.*invalid vertex position"):  # found by Mitsuba
+    with pytest.raises(SceneError, match=r"wall\.ply.*invalid vertex position"):  # found by Mitsuba
         tt.TransientRenderer(tt.load(broken, variant=VARIANT))
 
 

@@ -36,8 +36,8 @@ def check_finite(state: Any) -> None:
     waiting, seen = [(state.root, "")], set()
     while waiting:
         node, path = waiting.pop()
-        for key in node.props.keys():
-            array = numbers_of(node.props[key])
+        for key, value in node.props.items():
+            array = numbers_of(value)
             if array is not None:
                 count_bad(bad, f"{path}{key}", array)
         for key, index in children(state, node):

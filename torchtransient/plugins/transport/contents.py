@@ -22,11 +22,12 @@ class SceneContents:
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``surroundings``: what may lie around the sensor. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
-    variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
-    (:class:`~..sampling.sphere_lights.SphereLights`). Tables, media and lights are None where the scene has no such
-    thing.
+    which have an index. ``surroundings``: what may lie around the sensor
+    (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``two_sided``: the
+    two-sided BSDFs in polarized variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their
+    probability. ``media``: the participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the
+    spherical area lights (:class:`~..sampling.sphere_lights.SphereLights`). Tables, surroundings, media and lights are
+    None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
