@@ -313,3 +313,37 @@ def test_forward_mode_through_a_batch_of_sensors_ends_the_process():
         run = subprocess.run([sys.executable, "-c", BATCH % batch], capture_output=True, text=True, timeout=300)
         assert (run.returncode != 0) == ends, run.stderr
         assert not ends or "unrecoverable" in run.stderr
+
+
+# -------------------------------------------------------------------------------------------------------- sphere lights
+
+
+def towards_sphere(radius, height, p=(0, 0, 0), u=(0.3, 0.4), radiance=1.0, **more):
+    """(direction sample, emission over density, density that is asked for) of Mitsuba's area light on a sphere."""
+    activate("llvm_ad_mono")
+    light = {"type": "sphere", "center": [0, 0, height], "radius": radius, **more}
+    shape = mi.load_dict(light | {"emitter": {"type": "area", "radiance": radiance}})
+    it = dr.zeros(mi.Interaction3f, max(dr.width(p), dr.width(u)))
+    it.p = mi.Point3f(p)
+    ds, weight = shape.emitter().sample_direction(it, mi.Point2f(u))
+    return ds, weight.x, shape.emitter().pdf_direction(it, ds)
+
+
+def test_cone_of_a_small_sphere_has_no_digits_left():
+    """pi L (r / d)^2 of a sphere of 1 mm, and of one of 0.3 mm, at 3 m."""
+    weights = [float(towards_sphere(radius, 3.0)[1][0]) / (np.pi * (radius / 3.0) ** 2) for radius in (1e-3, 3e-4)]
+    assert weights[0] == pytest.approx(1.07, abs=0.06) and abs(weights[0] - 1) > 0.01
+    assert weights[1] == 0
+
+
+def test_sphere_draws_and_answers_with_different_densities_on_its_own_surface():
+    """Of points on its inner side some see it from outside."""
+    activate("llvm_ad_mono")
+    n = 1 << 12
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(3, n)).astype(np.float32)
+    p /= np.linalg.norm(p, axis=0)
+    u = mi.Point2f(rng.random((2, n)).astype(np.float32))
+    ds, _, asked = towards_sphere(1.0, 0.0, mi.Point3f(p), u, flip_normals=True)
+    different = np.abs(np.array(asked) / np.array(ds.pdf) - 1) > 0.05
+    assert 1e-3 < different.mean() < 0.1

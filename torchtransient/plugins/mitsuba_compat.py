@@ -103,6 +103,14 @@ def is_sphere(shape: Any) -> bool:
     return bool(shape.class_name() == "Sphere")
 
 
+def samples_its_shape(emitter: Any) -> bool:
+    """Whether an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the solid
+    angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from a
+    point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
+    """
+    return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
+
+
 def bounds_of(shape: Any) -> Any:
     """The bounding box of a shape. Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's
     bounds lack it.

@@ -16,6 +16,7 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
@@ -23,7 +24,7 @@ from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
-from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.nodes import check_finite, children, find_child, is_film, is_integrator, media_in_use
 from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
@@ -120,17 +121,20 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             placed = _placed(state)
             integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
+            check_finite(state)
             _forget_queries(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
             if not isinstance(scene, mi.Scene):
                 raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
+            params = mi.traverse(scene)
+            check_scene(scene, params)
     except TorchTransientError as error:
         raise type(error)(f"{_location(error.__cause__) or description.name}: {error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         text = str(error).replace("While loading string", f"While loading {description.name}")
         raise SceneError(f"{description.name}: Mitsuba could not build the scene. {text}") from error
-    return BuiltScene(scene, mi.traverse(scene), transforms, plugin, placed)
+    return BuiltScene(scene, params, transforms, plugin, placed)
 
 
 def _location(error: BaseException | None) -> str | None:

@@ -8,11 +8,13 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_two_sided
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.sampling.sphere_lights import SphereLights
+from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.media_contents import media_of
 
 
@@ -21,28 +23,32 @@ class SceneContents:
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``delays``: the BSDFs that scatter late. ``mixtures``: masks and blends, of which a path may be
-    handed one part. ``two_sided``: the two-sided BSDFs in polarized variants. ``hidden_probability``: BSDFs whose delta
-    lobes hide the derivative of their probability. ``media``: the participating media
-    (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables, mixtures and
-    media are None where the scene has no such thing.
+    which have an index. ``surroundings``: what may lie around the sensor
+    (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``: masks and
+    blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
+    ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
+    (:class:`~..sampling.sphere_lights.SphereLights`). Tables, surroundings, mixtures, media and lights are None where
+    the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
         shapes = scene.shapes()
-        met, self.delays = delays_of(bsdfs_of_scene(scene))
+        outermost = bsdfs_of_scene(scene)
+        met, self.delays = delays_of(outermost)
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF)
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.instances = any(is_instance(shape) for shape in shapes)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
         self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
+        self.surroundings = Surroundings.of(sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
-        self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
+        self.sphere_lights = SphereLights.of(scene)
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:

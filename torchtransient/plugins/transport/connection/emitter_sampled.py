@@ -18,22 +18,40 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 
 
 class EmitterSampled(Connection):
-    """A point of an emitter, drawn by Mitsuba's sampling of emitters."""
+    """A point of an emitter, drawn by Mitsuba's sampling of emitters, but for spheres."""
 
     name = "emitter_sampled"
     light_of_scene_alone = True
+
+    def prepare(self, world):
+        lights = world.contents.sphere_lights
+        self.spheres = None if lights is None else lights.read(world.scene)
+
+    def tables(self):
+        return [] if self.spheres is None else [self.spheres.values]
+
+    def sample(self, world, ref, u, active):
+        """(direction sample, emission over density) towards an emitter."""
+        if self.spheres is not None:
+            return self.spheres.sample(world.scene, ref, u, active)
+        return world.scene.sample_emitter_direction(ref, u, False, active)
 
     # ------------------------------------------------------------------------------------------------- primal
 
     def propose(self, world, path, vertex, sampler):
         active = vertex.goes_on & vertex.connectable
         u = sampler.next_2d()
-        ds, weight = world.scene.sample_emitter_direction(vertex.at, u, False, active)
+        ds, weight = self.sample(world, vertex.at, u, active)
         active &= ds.pdf != 0
         return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
     def density(self, world, ref, ds, active):
-        return dr.select(ds.delta, ds.pdf, world.scene.pdf_emitter_direction(ref, ds, active & ~ds.delta))
+        smooth = active & ~ds.delta
+        if self.spheres is not None:
+            pdf = self.spheres.pdf(world.scene, ref, ds, smooth)
+        else:
+            pdf = world.scene.pdf_emitter_direction(ref, ds, smooth)
+        return dr.select(ds.delta, ds.pdf, pdf)
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
@@ -72,8 +90,7 @@ class EmitterSampled(Connection):
         # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone.
         if not wanted.sphere_lights:
             return None
-        on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-        return on_surface & (emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere))
+        return self.spheres.lists(emitter)
 
     def numbers(self, recorded):
         return [recorded["u"].x, recorded["u"].y]
@@ -109,7 +126,7 @@ class EmitterSampled(Connection):
         """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
         scene = world.scene
         with dr.suspend_grad():
-            ds, weight = scene.sample_emitter_direction(dr.detach(si), u, False, lit)
+            ds, weight = self.sample(world, dr.detach(si), u, lit)
             flags = ds.emitter.flags()
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
@@ -123,7 +140,7 @@ class EmitterSampled(Connection):
         if wanted.sphere_lights:
             light.cone = surface & self.claims(world, ds.emitter, wanted)
             light.surface = surface & ~light.cone
-            moving, light.cone_weight = scene.sample_emitter_direction(si, u, False, light.cone)
+            moving, light.cone_weight = self.sample(world, si, u, light.cone)
             light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))
         if wanted.emitter_shape:
             self._follow_shape(world, si, light)

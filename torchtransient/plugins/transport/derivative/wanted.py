@@ -34,7 +34,7 @@ class Wanted:
         self.emitter_shape = any(isinstance(node, mi.Shape) and node.is_emitter() for node in moved("shape"))
         self.sensor = any(node.ptr in sensors for node in moved("sensor"))
         self.sensor |= any(node.ptr in carriers for node in moved("shape"))
-        self.sphere_lights = self.geometry and contents.sphere_lights
+        self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
