@@ -39,6 +39,9 @@ class World:
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
+        # Where path lengths change, surfaces that belong to instances are attached to their matrices.
+        attached = contents.instances is not None and wanted is not None and wanted.geometry
+        self.instances = contents.instances.read() if attached else None
         self.segment, self.scattering, self.connections = strategies
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
@@ -71,8 +74,9 @@ class World:
         return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
-        """What the strategies have computed of the scene's parameters."""
-        return [table for strategy in self.strategies() for table in strategy.tables()]
+        """What has been computed of the scene's parameters, by the strategies and of instances."""
+        tables = [] if self.instances is None else [self.instances.table]
+        return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property
     def index_changes(self) -> bool:

@@ -1,0 +1,137 @@
+"""Surface interactions with derivatives in scenes that have instances of shape groups.
+
+Mitsuba's instance detaches its normal, its frame and the ray, and refuses derivatives of its own parameters beside
+those of the shapes in its group. Here the interaction is the one of the shape in its group, with the ray in the group's
+space, brought back by the matrix of the instance: all three are attached, each by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.node_walk import shown_by
+from torchtransient.plugins.pointer_table import registry_number
+
+# Entries of a matrix; the table holds it and its inverse, so that no lane inverts matrices.
+_ENTRIES = 16
+
+
+class Instances:
+    """The instances of a scene. Does not change once built."""
+
+    def __init__(self, instances: Sequence[Any]) -> None:
+        self._shown = [
+            (node, next(value for value in shown_by(node)[0] if value.key == "to_world")) for node in instances
+        ]
+        self._numbers = [registry_number(node) for node in instances]
+
+    @staticmethod
+    def of(scene: Any) -> Instances | None:
+        """Those of ``scene``, None when it has none."""
+        found = [shape for shape in scene.shapes() if is_instance(shape)]
+        return Instances(found) if found else None
+
+    def read(self) -> InstanceTable:
+        """Their matrices as they are now, attached where they are; to be called outside of loops, once a job."""
+        with dr.resume_grad():
+            return InstanceTable(self._numbers, [shown.read(node).matrix for node, shown in self._shown])
+
+    @contextmanager
+    def detached(self) -> Iterator[None]:
+        """Hide from Mitsuba, for as long as derivatives are taken, that the matrices are attached. It would refuse to
+        trace anything where parameters of the shapes in their groups are attached beside them.
+        """
+        with dr.resume_grad():
+            attached = [(shown, mi.AffineTransform4f(shown.read(node))) for node, shown in self._shown]
+            attached = [(shown, matrix) for shown, matrix in attached if dr.grad_enabled(matrix)]
+        try:
+            for shown, matrix in attached:
+                mi.set_property(shown.handle, shown.cpptype, dr.detach(matrix))
+            yield
+        finally:
+            with dr.resume_grad():
+                for shown, matrix in attached:
+                    mi.set_property(shown.handle, shown.cpptype, matrix)
+
+
+class InstanceTable:
+    """The matrices of the instances by their number in Dr.Jit's registry; for every other shape the identity.
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """
+
+    def __init__(self, numbers: Sequence[int], matrices: Sequence[Any]) -> None:
+        identity = np.tile(np.eye(4, dtype=np.float32).reshape(-1), 2 * (1 + max(numbers)))
+        self.table = mi.Float(identity)
+        for number, matrix in zip(numbers, matrices, strict=True):
+            first = 2 * number * _ENTRIES
+            for offset, entries in ((0, matrix), (_ENTRIES, dr.rcp(matrix))):
+                index = dr.arange(mi.UInt32, first + offset, first + offset + _ENTRIES)
+                dr.scatter(self.table, dr.ravel(mi.Matrix4f(entries), order="C"), index)
+
+    def _matrices(self, instance: Any) -> tuple[Any, Any]:
+        """(matrix, its inverse) by instance pointer, the identity for null."""
+        row = 2 * dr.reinterpret_array(mi.UInt32, instance)
+        return dr.gather(mi.Matrix4f, self.table, row), dr.gather(mi.Matrix4f, self.table, row + 1)
+
+    def interaction(self, pi: Any, ray: Any, flags: int, active: Any) -> Any:
+        """``pi.compute_surface_interaction(ray, flags, active)``, attached to ray, shapes and instances."""
+        with dr.suspend_grad():
+            si = pi.compute_surface_interaction(dr.detach(ray), flags, active)
+            valid = si.is_valid()
+        M, inverse = self._matrices(si.instance)
+        local_ray = mi.Ray3f(ray)
+        local_ray.o, local_ray.d = _point(inverse, ray.o), _vector(inverse, ray.d)
+        local = si.shape.compute_surface_interaction(local_ray, pi, flags, active & valid)
+
+        # What Mitsuba found keeps its value to the bit.
+        si.p = dr.replace_grad(si.p, dr.select(valid, _point(M, local.p), 0))
+        t = local.t
+        if mi.has_flag(flags, mi.RayFlags.FollowShape):
+            t = dr.norm(dr.select(valid, si.p - ray.o, mi.Vector3f(1))) * dr.rsqrt(dr.squared_norm(ray.d))
+        si.t = dr.replace_grad(si.t, dr.select(valid, t, 0))
+        si.n = dr.replace_grad(si.n, _normal(inverse, local.n, valid))
+        if mi.has_flag(flags, mi.RayFlags.ShadingFrame):
+            si.uv = dr.replace_grad(si.uv, dr.select(valid, local.uv, 0))
+            si.dp_du = dr.replace_grad(si.dp_du, dr.select(valid, _vector(M, local.dp_du), 0))
+            si.dp_dv = dr.replace_grad(si.dp_dv, dr.select(valid, _vector(M, local.dp_dv), 0))
+            n = _normal(inverse, local.sh_frame.n, valid)
+            si.sh_frame = dr.replace_grad(si.sh_frame, _frame(n, si.dp_du))
+        si.wi = dr.replace_grad(si.wi, dr.select(valid, si.to_local(-ray.d), -ray.d))
+        return si
+
+
+def surface_interaction(instances: InstanceTable | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
+    """The attached interaction of a preliminary one; ``instances``: None where derivatives have none on their way."""
+    if instances is None:
+        return pi.compute_surface_interaction(ray, flags, active)
+    return instances.interaction(pi, ray, flags, active)
+
+
+def _point(M: Any, p: Any) -> Any:
+    return mi.Point3f(*[M[i, 0] * p.x + M[i, 1] * p.y + M[i, 2] * p.z + M[i, 3] for i in range(3)])
+
+
+def _vector(M: Any, v: Any) -> Any:
+    return mi.Vector3f(*[M[i, 0] * v.x + M[i, 1] * v.y + M[i, 2] * v.z for i in range(3)])
+
+
+def _normal(inverse: Any, n: Any, valid: Any) -> Any:
+    """A unit normal, brought to the other space by the transpose of the inverse; some normal where not ``valid``."""
+    n = dr.select(valid, n, mi.Normal3f(0, 0, 1))
+    return dr.normalize(mi.Normal3f(*[inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]))
+
+
+def _frame(n: Any, dp_du: Any) -> Any:
+    """The shading frame that Mitsuba makes of a normal and a tangent, which may be zero."""
+    across = dp_du - n * dr.dot(n, dp_du)
+    across = dr.select(dr.any(dp_du != 0), across, mi.coordinate_system(n)[0])
+    s = dr.normalize(across)
+    return mi.Frame3f(s, dr.cross(n, s), n)
