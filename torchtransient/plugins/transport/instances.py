@@ -88,11 +88,13 @@ class InstanceTable:
             valid = si.is_valid()
         M, inverse = self._matrices(si.instance)
         local_ray = mi.Ray3f(ray)
-        local_ray.o, local_ray.d = _point(inverse, ray.o), _vector(inverse, ray.d)
+        # Selected before the products: what an idle lane holds must not reach the matrices, which all lanes share.
+        local_ray.o = _point(inverse, dr.select(valid, ray.o, 0))
+        local_ray.d = _vector(inverse, dr.select(valid, ray.d, mi.Vector3f(0, 0, 1)))
         local = si.shape.compute_surface_interaction(local_ray, pi, flags, active & valid)
 
         # What Mitsuba found keeps its value to the bit.
-        si.p = dr.replace_grad(si.p, dr.select(valid, _point(M, local.p), 0))
+        si.p = dr.replace_grad(si.p, _point(M, dr.select(valid, local.p, 0)))
         t = local.t
         if mi.has_flag(flags, mi.RayFlags.FollowShape):
             t = dr.norm(dr.select(valid, si.p - ray.o, mi.Vector3f(1))) * dr.rsqrt(dr.squared_norm(ray.d))
@@ -100,8 +102,8 @@ class InstanceTable:
         si.n = dr.replace_grad(si.n, _normal(inverse, local.n, valid))
         if mi.has_flag(flags, mi.RayFlags.ShadingFrame):
             si.uv = dr.replace_grad(si.uv, dr.select(valid, local.uv, 0))
-            si.dp_du = dr.replace_grad(si.dp_du, dr.select(valid, _vector(M, local.dp_du), 0))
-            si.dp_dv = dr.replace_grad(si.dp_dv, dr.select(valid, _vector(M, local.dp_dv), 0))
+            si.dp_du = dr.replace_grad(si.dp_du, _vector(M, dr.select(valid, local.dp_du, 0)))
+            si.dp_dv = dr.replace_grad(si.dp_dv, _vector(M, dr.select(valid, local.dp_dv, 0)))
             n = _normal(inverse, local.sh_frame.n, valid)
             si.sh_frame = dr.replace_grad(si.sh_frame, _frame(n, si.dp_du))
         si.wi = dr.replace_grad(si.wi, dr.select(valid, si.to_local(-ray.d), -ray.d))
