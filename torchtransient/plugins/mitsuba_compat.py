@@ -81,6 +81,13 @@ def is_sphere(shape: Any) -> bool:
     return bool(shape.class_name() == "Sphere")
 
 
+def leaves_hits_detached(shape: Any) -> bool:
+    """Whether the interactions of a shape lie at a detached distance along the ray: they follow neither the shape nor a
+    ray that moves.
+    """
+    return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
+
+
 def bounds_of(shape: Any) -> Any:
     """The bounding box of a shape. Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's
     bounds lack it.

@@ -127,7 +127,7 @@ declare_effects(
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
-    declare_effects(_curve, {"control_points": replace(SHAPE, trusted=False)})
+    declare_effects(_curve, {"control_points": SHAPE})
 declare_effects("SDFGrid", {"grid": replace(SHAPE, trusted=False)})
 for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
     declare_effects(_blobs, {"data": replace(SHAPE, trusted=False)})

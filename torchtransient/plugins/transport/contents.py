@@ -13,6 +13,7 @@ from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_sph
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
+from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import Instances
 from torchtransient.plugins.transport.media_contents import media_of
 
@@ -21,7 +22,8 @@ class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: those of shape groups
-    (:class:`.instances.Instances`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
+    (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
+    (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
     which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables,
@@ -34,7 +36,7 @@ class SceneContents:
         shapes = scene.shapes()
         self.bsdfs, self.delays = delays_of(bsdfs_of_scene(scene))
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
-        self.instances = Instances.of(scene)
+        self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
         self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)

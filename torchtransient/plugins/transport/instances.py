@@ -18,6 +18,7 @@ import numpy as np
 from torchtransient.plugins.mitsuba_compat import is_instance
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.transport.hits import HitTable
 
 # Entries of a matrix; the table holds it and its inverse, so that no lane inverts matrices.
 _ENTRIES = 16
@@ -81,8 +82,8 @@ class InstanceTable:
         row = 2 * dr.reinterpret_array(mi.UInt32, instance)
         return dr.gather(mi.Matrix4f, self.table, row), dr.gather(mi.Matrix4f, self.table, row + 1)
 
-    def interaction(self, pi: Any, ray: Any, flags: int, active: Any) -> Any:
-        """``pi.compute_surface_interaction(ray, flags, active)``, attached to ray, shapes and instances."""
+    def interaction(self, pi: Any, ray: Any, flags: int, active: Any, hits: HitTable | None) -> Any:
+        """As :func:`surface_interaction`."""
         with dr.suspend_grad():
             si = pi.compute_surface_interaction(dr.detach(ray), flags, active)
             valid = si.is_valid()
@@ -91,6 +92,8 @@ class InstanceTable:
         # Selected before the products: what an idle lane holds must not reach the matrices, which all lanes share.
         local_ray.o = _point(inverse, dr.select(valid, ray.o, 0))
         local_ray.d = _vector(inverse, dr.select(valid, ray.d, mi.Vector3f(0, 0, 1)))
+        if hits is not None:
+            pi = hits.attach(pi, si.shape, local_ray, active & valid)
         local = si.shape.compute_surface_interaction(local_ray, pi, flags, active & valid)
 
         # What Mitsuba found keeps its value to the bit.
@@ -110,11 +113,39 @@ class InstanceTable:
         return si
 
 
-def surface_interaction(instances: InstanceTable | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
-    """The attached interaction of a preliminary one; ``instances``: None where derivatives have none on their way."""
-    if instances is None:
+class AttachedSurfaces:
+    """What the derivative of a scene's surfaces needs beside Mitsuba. A plain object, which Dr.Jit loops leave alone."""
+
+    def __init__(self, instances: InstanceTable | None, hits: HitTable | None) -> None:
+        self._instances, self._hits = instances, hits
+
+    @staticmethod
+    def of(contents: Any) -> AttachedSurfaces | None:
+        """Those of one job, None where Mitsuba's own interactions are right."""
+        if contents.instances is None and contents.detached_hits is None:
+            return None
+        return AttachedSurfaces(*(part and part.read() for part in (contents.instances, contents.detached_hits)))
+
+    def tables(self) -> list[Any]:
+        """What has been computed of parameters: attached where they are."""
+        tables = [] if self._instances is None else [self._instances.table]
+        return tables if self._hits is None else tables + self._hits.tables()
+
+    def interaction(self, pi: Any, ray: Any, flags: int, active: Any) -> Any:
+        """As :func:`surface_interaction`."""
+        if self._instances is not None:
+            return self._instances.interaction(pi, ray, flags, active, self._hits)
+        return self._hits.attach(pi, pi.shape, ray, active & pi.is_valid()).compute_surface_interaction(ray, flags, active)
+
+
+def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
+    """``pi.compute_surface_interaction(ray, flags, active)``, attached to the ray, the shape, and what moves the shape.
+
+    ``surfaces``: those of ``world``, None where Mitsuba's own are right.
+    """
+    if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)
-    return instances.interaction(pi, ray, flags, active)
+    return surfaces.interaction(pi, ray, flags, active)
 
 
 def _point(M: Any, p: Any) -> Any:

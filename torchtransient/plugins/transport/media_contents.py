@@ -56,11 +56,11 @@ class FlightSettings:
     before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
     differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
     not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
-    ``instances``: the attached matrices of instances (:class:`.instances.InstanceTable`), or None.
+    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.instances.AttachedSurfaces`), or None.
     """
 
-    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, instances: Any = None):
-        self.instances = instances
+    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):
+        self.surfaces = surfaces
         self.at_sensor, self.emitter_sampling = contents.at_sensor, contents.emitter_sampling
         self.homogeneous, self.heterogeneous = contents.homogeneous, contents.heterogeneous
         self.open_boundaries, self.one_stretch = contents.open_boundaries, contents.one_stretch

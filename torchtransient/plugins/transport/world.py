@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.transport.instances import AttachedSurfaces
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,8 @@ class World:
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
-        # Where path lengths change, surfaces that belong to instances are attached to their matrices.
-        attached = contents.instances is not None and wanted is not None and wanted.geometry
-        self.instances = contents.instances.read() if attached else None
+        # Only where path lengths change is it asked how surfaces move.
+        self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
@@ -74,8 +74,8 @@ class World:
         return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
-        """What has been computed of the scene's parameters, by the strategies and of instances."""
-        tables = [] if self.instances is None else [self.instances.table]
+        """What has been computed of the scene's parameters, by the strategies and for the surfaces."""
+        tables = [] if self.surfaces is None else self.surfaces.tables()
         return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property

@@ -54,10 +54,10 @@ def optical_depth(media, leg, part, x0, x1, active):
         end = dr.select(leg.far, end, dr.norm(span))
         if media.open_boundaries:
             passed = inside & part.entry.is_valid()
-            behind = surface_interaction(media.instances, part.entry, ray, mi.RayFlags.Minimal, passed)
+            behind = surface_interaction(media.surfaces, part.entry, ray, mi.RayFlags.Minimal, passed)
             begin = dr.select(passed, behind.t, 0)
             ends &= inside
-            end = dr.select(ends, surface_interaction(media.instances, part.pi, ray, mi.RayFlags.Minimal, ends).t, end)
+            end = dr.select(ends, surface_interaction(media.surfaces, part.pi, ray, mi.RayFlags.Minimal, ends).t, end)
     if media.heterogeneous:
         hits, near, far = part.medium.intersect_aabb(ray)
         begin = dr.select(hits, dr.maximum(begin, near), begin)

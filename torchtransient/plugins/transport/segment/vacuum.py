@@ -111,7 +111,7 @@ class Vacuum(Segment):
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
-        si = surface_interaction(world.instances, v.pi, ray, mi.RayFlags.All, v.active)
+        si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, v.active)
         return self.arrived(world, v, carry, ray, si, wanted)
 
     def arrived(self, world, v, carry, ray, si, wanted):
