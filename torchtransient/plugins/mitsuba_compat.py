@@ -57,6 +57,13 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
+def is_bump_map(bsdf: Any) -> bool:
+    """Whether a BSDF takes its normals from the slope of a texture, which Mitsuba keeps between the texels of a bitmap:
+    it jumps at each of them.
+    """
+    return bool(bsdf.class_name() == "BumpMap")
+
+
 # Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
 # number for it, its rough dielectric detaches it where directions are sampled.
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
@@ -74,6 +81,11 @@ POLARIZED_PLUGINS = {
 def is_instance(shape: Any) -> bool:
     """Whether a shape is one copy of a shape group."""
     return bool(shape.class_name() == "Instance")
+
+
+def has_surface(shape: Any) -> bool:
+    """Whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF nevertheless."""
+    return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
 
 
 def is_sphere(shape: Any) -> bool:

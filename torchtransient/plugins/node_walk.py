@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mitsuba_compat import has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -91,7 +91,7 @@ def bsdfs_below(node: Any) -> list[Any]:
 def bsdfs_of_scene(scene: Any) -> list[Any]:
     """The outermost BSDFs of a scene, those of shape groups included, each once."""
     # Every shape is asked for its own: some (ellipsoids) do not show it in a walk.
-    bsdfs = (shape.bsdf() for shape in shapes_of_scene(scene))
+    bsdfs = (shape.bsdf() for shape in shapes_of_scene(scene) if has_surface(shape))
     return list({bsdf.ptr: bsdf for bsdf in bsdfs if bsdf is not None}.values())
 
 

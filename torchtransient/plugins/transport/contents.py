@@ -23,11 +23,11 @@ class SceneContents:
 
     ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: those of shape groups
     (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
-    (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
-    variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables,
-    instances and media are None where the scene has no such thing.
+    (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
+    transmissive rough BSDFs, which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided
+    BSDFs in polarized variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their
+    probability. ``media``: the participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some
+    light is a sphere. Tables, instances and media are None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """

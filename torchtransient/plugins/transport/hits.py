@@ -28,6 +28,11 @@ class DetachedHits:
         shown = [(shape, {value.key: value for value in shown_by(shape)[0]}) for shape in shapes]
         self._ellipsoids = [(shape, values) for shape, values in shown if "data" in values]
         self._curves = [(shape, values) for shape, values in shown if "control_points" in values]
+        # Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none.
+        ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
+        segments = _starts([values["segment_indices"].read(shape) for shape, values in self._curves], 1)
+        self._first_ellipsoid = PointerTable([shape for shape, _ in self._ellipsoids], [1 + n for n in ellipsoids])
+        self._first_segment = PointerTable([shape for shape, _ in self._curves], [1 + n for n in segments])
 
     @staticmethod
     def of(scene: Any) -> DetachedHits | None:
@@ -38,8 +43,12 @@ class DetachedHits:
     def read(self) -> HitTable:
         """Their parameters as they are now, attached where they are; to be called outside of loops, once a job."""
         with dr.resume_grad():
-            parts = [EllipsoidTable(self._ellipsoids)] if self._ellipsoids else []
-            return HitTable(parts + ([CurveTable(self._curves)] if self._curves else []))
+            kinds: list[Any] = []
+            if self._ellipsoids:
+                kinds.append(EllipsoidTable(self._ellipsoids, self._first_ellipsoid))
+            if self._curves:
+                kinds.append(CurveTable(self._curves, self._first_segment))
+            return HitTable(kinds)
 
 
 class HitTable:
@@ -63,10 +72,9 @@ class HitTable:
 class EllipsoidTable:
     """The ellipsoids of all shapes, one after the other."""
 
-    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]]) -> None:
-        data = [_floats(values["data"].read(shape)) for shape, values in shapes]
-        self._first = PointerTable([shape for shape, _ in shapes], [1 + n for n in _starts(data, _ELLIPSOID)])
-        self._data = dr.concat(data)
+    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
+        self._first = first
+        self._data = dr.concat([_floats(values["data"].read(shape)) for shape, values in shapes])
         self._extents = dr.concat([_extents(shape, values) for shape, values in shapes])
 
     def tables(self) -> list[Any]:
@@ -97,10 +105,10 @@ class CurveTable:
     place ``v`` is where ``|p - c(v)|^2 - r(v)^2`` is zero and least.
     """
 
-    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]]) -> None:
+    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
         points = [_floats(values["control_points"].read(shape)) for shape, values in shapes]
         segments = [mi.UInt32(values["segment_indices"].read(shape)) for shape, values in shapes]
-        self._first = PointerTable([shape for shape, _ in shapes], [1 + n for n in _starts(segments, 1)])
+        self._first = first
         self._points = dr.concat(points)
         self._segments = dr.concat([s + n for s, n in zip(segments, _starts(points, _POINT), strict=True)])
 

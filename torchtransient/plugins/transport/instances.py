@@ -32,6 +32,8 @@ class Instances:
             (node, next(value for value in shown_by(node)[0] if value.key == "to_world")) for node in instances
         ]
         self._numbers = [registry_number(node) for node in instances]
+        # What is no instance stays where it is.
+        self._identities = mi.Float(np.tile(np.eye(4, dtype=np.float32).reshape(-1), 2 * (1 + max(self._numbers))))
 
     @staticmethod
     def of(scene: Any) -> Instances | None:
@@ -42,7 +44,13 @@ class Instances:
     def read(self) -> InstanceTable:
         """Their matrices as they are now, attached where they are; to be called outside of loops, once a job."""
         with dr.resume_grad():
-            return InstanceTable(self._numbers, [shown.read(node).matrix for node, shown in self._shown])
+            table = mi.Float(self._identities)
+            for number, (node, shown) in zip(self._numbers, self._shown, strict=True):
+                matrix = mi.Matrix4f(shown.read(node).matrix)
+                first = dr.arange(mi.UInt32, _ENTRIES) + 2 * number * _ENTRIES
+                dr.scatter(table, dr.ravel(matrix, order="C"), first)
+                dr.scatter(table, dr.ravel(dr.rcp(matrix), order="C"), first + _ENTRIES)
+            return InstanceTable(table)
 
     @contextmanager
     def detached(self) -> Iterator[None]:
@@ -68,14 +76,8 @@ class InstanceTable:
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
-    def __init__(self, numbers: Sequence[int], matrices: Sequence[Any]) -> None:
-        identity = np.tile(np.eye(4, dtype=np.float32).reshape(-1), 2 * (1 + max(numbers)))
-        self.table = mi.Float(identity)
-        for number, matrix in zip(numbers, matrices, strict=True):
-            first = 2 * number * _ENTRIES
-            for offset, entries in ((0, matrix), (_ENTRIES, dr.rcp(matrix))):
-                index = dr.arange(mi.UInt32, first + offset, first + offset + _ENTRIES)
-                dr.scatter(self.table, dr.ravel(mi.Matrix4f(entries), order="C"), index)
+    def __init__(self, table: Any) -> None:
+        self.table = table
 
     def _matrices(self, instance: Any) -> tuple[Any, Any]:
         """(matrix, its inverse) by instance pointer, the identity for null."""
@@ -114,7 +116,7 @@ class InstanceTable:
 
 
 class AttachedSurfaces:
-    """What the derivative of a scene's surfaces needs beside Mitsuba. A plain object, which Dr.Jit loops leave alone."""
+    """What derivatives of surfaces need beside Mitsuba. A plain object, which Dr.Jit loops leave alone."""
 
     def __init__(self, instances: InstanceTable | None, hits: HitTable | None) -> None:
         self._instances, self._hits = instances, hits
@@ -135,7 +137,8 @@ class AttachedSurfaces:
         """As :func:`surface_interaction`."""
         if self._instances is not None:
             return self._instances.interaction(pi, ray, flags, active, self._hits)
-        return self._hits.attach(pi, pi.shape, ray, active & pi.is_valid()).compute_surface_interaction(ray, flags, active)
+        pi = self._hits.attach(pi, pi.shape, ray, active & pi.is_valid())
+        return pi.compute_surface_interaction(ray, flags, active)
 
 
 def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
@@ -159,7 +162,8 @@ def _vector(M: Any, v: Any) -> Any:
 def _normal(inverse: Any, n: Any, valid: Any) -> Any:
     """A unit normal, brought to the other space by the transpose of the inverse; some normal where not ``valid``."""
     n = dr.select(valid, n, mi.Normal3f(0, 0, 1))
-    return dr.normalize(mi.Normal3f(*[inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]))
+    turned = [inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]
+    return dr.normalize(mi.Normal3f(*turned))
 
 
 def _frame(n: Any, dp_du: Any) -> Any:

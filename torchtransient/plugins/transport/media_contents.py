@@ -17,8 +17,8 @@ class MediaContents:
 
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows connections to emitters. ``extent``: the
-    size of the scene in metres.
+    lines go through several media. ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
+    connections to emitters. ``extent``: the size of the scene in metres.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
