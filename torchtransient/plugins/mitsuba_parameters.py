@@ -57,11 +57,9 @@ COORDINATES = ParameterEffect(moves_silhouette=True, reason=SILHOUETTES + _EDGES
 PATTERN = replace(COORDINATES, role="shape")
 NORMAL_COORDINATES = replace(NORMAL, reason=SILHOUETTES + _EDGES)
 PATTERN_AND_NORMALS = replace(NORMAL_COORDINATES, role="shape")
-SLOPES = replace(
-    NORMAL,
-    biased=True,
-    reason="biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else",
-)
+_STEPS = "biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else"
+SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
+NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
 COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated")
 RIGID_ONLY = replace(
     SHAPE,
@@ -113,6 +111,10 @@ def _places_slopes(site: Site) -> bool:
     return any(is_bump_map(bsdf) for bsdf in _bsdfs_of(site))
 
 
+def _places_delta_slopes(site: Site) -> bool:
+    return _places_slopes(site) and _places_normals(site)
+
+
 def _places_light(site: Site) -> bool:
     """Whether the texture coordinates of a mesh place what it emits."""
     emitter = site.node.emitter()
@@ -156,7 +158,8 @@ declare_effects(
         "vertex_positions": (_EMITTING, Row(SHAPE)),
         "vertex_normals": (_EMITTING, Row(SHAPE)),
         "vertex_texcoords": (
-            Row(SLOPES, _places_slopes, "a bump map"),
+            Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
+            Row(SLOPES, _places_slopes, "another bump map"),
             Row(PATTERN_AND_NORMALS, _places_light_and_normals, "a textured light with a normal map over a delta lobe"),
             Row(NORMAL_COORDINATES, _places_normals, "a normal map over a delta lobe"),
             Row(PATTERN, _places_light, "a light with a textured radiance"),

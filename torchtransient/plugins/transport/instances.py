@@ -162,8 +162,8 @@ def _vector(M: Any, v: Any) -> Any:
 def _normal(inverse: Any, n: Any, valid: Any) -> Any:
     """A unit normal, brought to the other space by the transpose of the inverse; some normal where not ``valid``."""
     n = dr.select(valid, n, mi.Normal3f(0, 0, 1))
-    turned = [inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]
-    return dr.normalize(mi.Normal3f(*turned))
+    across = [inverse[0, i] * n.x + inverse[1, i] * n.y + inverse[2, i] * n.z for i in range(3)]
+    return dr.normalize(mi.Normal3f(*across))
 
 
 def _frame(n: Any, dp_du: Any) -> Any:
