@@ -152,7 +152,9 @@ def test_grids_that_turn_are_not_drawn():
     pose = mi.ScalarTransform4f().scale([4, 4, 1]).translate([-0.5, -0.5, -0.5])
     seen = []
     for turned in (pose, pose @ mi.ScalarTransform4f().rotate([0, 1, 0], 1.0)):
-        scene = mi.load_dict({"type": "scene", "it": {"type": "sdfgrid", "grid": mi.TensorXf(grid), "to_world": turned}})
+        scene = mi.load_dict(
+            {"type": "scene", "it": {"type": "sdfgrid", "grid": mi.TensorXf(grid), "to_world": turned}}
+        )
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 4), mi.Vector3f(0, 0, -1))
         seen.append(bool(scene.ray_intersect_preliminary(ray).is_valid()[0]))
     assert seen == [True, False]
