@@ -63,6 +63,7 @@ MOVES = [
     ("rectangle sphere disk cylinder sdfgrid instance area directionalarea angulararea irradiancemeter", "to_world",
      "LS", "shape"),
     ("cube obj ply instance", "vertex_positions vertex_normals", "LS", "shape"),
+    ("cube obj ply instance", "vertex_texcoords", "S", "value"),
     ("bsplinecurve linearcurve", "control_points", "LS", "shape"),
     ("sdfgrid", "grid", "LS", "shape"),
     ("ellipsoids ellipsoidsmesh", "data", "LS", "shape"),
@@ -200,6 +201,8 @@ def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, be
     assert texture.moves_length == bends and texture.role == ("normal" if bends else "value")
     assert effects["mirror.vertex_texcoords"].moves_length == bends
     assert effects["mirror.vertex_texcoords"].supported
+    # The slope of a bump map is the same all over a texel.
+    assert effects["mirror.vertex_texcoords"].biased == (plugin == "bumpmap")
     colours = [effect for key, effect in effects.items() if "reflectance" in key or ".k." in key]
     assert not any(effect.moves for effect in colours)
 
@@ -208,6 +211,21 @@ def test_coordinates_of_a_mask_over_a_normal_map():
     inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
     scene = mi.load_dict({"type": "scene", "it": {"type": "cube", "bsdf": {"type": "mask", "nested": inner}}})
     assert effect_of(scene.shapes()[0], "vertex_texcoords").moves_length
+
+
+def test_coordinates_of_a_light_with_a_texture_belong_to_its_shape():
+    plain = {"type": "cube", "emitter": {"type": "area", "radiance": 2.0}}
+    patterned = {"type": "cube", "emitter": {"type": "area", "radiance": normals()}}
+    inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
+    told = [effect_of(mi.load_dict(d), "vertex_texcoords") for d in (plain, patterned, patterned | {"bsdf": inner})]
+    assert [(letters(effect), effect.role) for effect in told] == [("S", "value"), ("S", "shape"), ("LS", "shape")]
+
+
+def test_opacities_of_ellipsoids_move_them_where_they_are_clamped():
+    data = {"data": mi.TensorXf([[0.0] * 3 + [1.0] * 3 + [0.0] * 3 + [1.0]]), "opacities": mi.TensorXf([[0.9]])}
+    for clamped in (True, False):
+        shape = mi.load_dict({"type": "ellipsoids", "extent_adaptive_clamping": clamped} | data)
+        assert effect_of(shape, "opacities").moves_length == clamped
 
 
 def test_an_emitting_mesh_without_coordinates_is_differentiated_in_rigid_motion_only():

@@ -79,6 +79,13 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
+def is_bump_map(bsdf: Any) -> bool:
+    """Whether a BSDF takes its normals from the slope of a texture, which Mitsuba keeps between the texels of a bitmap:
+    it jumps at each of them.
+    """
+    return bool(bsdf.class_name() == "BumpMap")
+
+
 # Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
 # number for it, its rough dielectric detaches it where directions are sampled.
 DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
@@ -98,6 +105,11 @@ def is_instance(shape: Any) -> bool:
     return bool(shape.class_name() == "Instance")
 
 
+def has_surface(shape: Any) -> bool:
+    """Whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF nevertheless."""
+    return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
+
+
 def is_sphere(shape: Any) -> bool:
     """Whether a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
     return bool(shape.class_name() == "Sphere")
@@ -109,6 +121,13 @@ def samples_its_shape(emitter: Any) -> bool:
     point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
     """
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
+
+
+def leaves_hits_detached(shape: Any) -> bool:
+    """Whether the interactions of a shape lie at a detached distance along the ray: they follow neither the shape nor a
+    ray that moves.
+    """
+    return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
 def bounds_of(shape: Any) -> Any:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, normal_texture
-from torchtransient.plugins.node_walk import bsdfs_below
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, is_bump_map, normal_texture
+from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
     CORRECT,
+    SILHOUETTES,
     VALUE,
     ParameterEffect,
     Row,
@@ -49,6 +51,15 @@ PRINCIPLED_INDEX = replace(
     INDEX,
     reason="biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md",
 )
+# Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
+_EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
+COORDINATES = ParameterEffect(moves_silhouette=True, reason=SILHOUETTES + _EDGES)
+PATTERN = replace(COORDINATES, role="shape")
+NORMAL_COORDINATES = replace(NORMAL, reason=SILHOUETTES + _EDGES)
+PATTERN_AND_NORMALS = replace(NORMAL_COORDINATES, role="shape")
+_STEPS = "biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else"
+SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
+NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
 COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated")
 RIGID_ONLY = replace(
     SHAPE,
@@ -84,16 +95,39 @@ def _turns_delta_lobes(bsdf: object) -> bool:
     return normal_texture(bsdf) is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # type: ignore[attr-defined]
 
 
+def _bsdfs_of(site: Site) -> list[Any]:
+    """The BSDF of a shape and all that it holds."""
+    outer = site.node.bsdf()
+    return [] if outer is None else [outer, *objects_below(outer, mi.BSDF)]
+
+
 def _places_normals(site: Site) -> bool:
     """Whether the texture coordinates of a mesh place normals of a delta lobe."""
-    outer = site.node.bsdf()
-    waiting = [] if outer is None else [outer]
-    while waiting:
-        bsdf = waiting.pop()
-        if _turns_delta_lobes(bsdf):
-            return True
-        waiting += bsdfs_below(bsdf)
-    return False
+    return any(_turns_delta_lobes(bsdf) for bsdf in _bsdfs_of(site))
+
+
+def _places_slopes(site: Site) -> bool:
+    """Whether the texture coordinates of a mesh place the slopes of a bump map."""
+    return any(is_bump_map(bsdf) for bsdf in _bsdfs_of(site))
+
+
+def _places_delta_slopes(site: Site) -> bool:
+    return _places_slopes(site) and _places_normals(site)
+
+
+def _places_light(site: Site) -> bool:
+    """Whether the texture coordinates of a mesh place what it emits."""
+    emitter = site.node.emitter()
+    return emitter is not None and any(t.is_spatially_varying() for t in objects_below(emitter, mi.Texture))
+
+
+def _places_light_and_normals(site: Site) -> bool:
+    return _places_light(site) and _places_normals(site)
+
+
+def _is_clamped(site: Site) -> bool:
+    """Whether the opacities of ellipsoids decide how large they are."""
+    return any(shown.key == "extent_adaptive_clamping" and shown.read(site.node) for shown in shown_by(site.node)[0])
 
 
 def _is_normal(site: Site) -> bool:
@@ -123,14 +157,31 @@ declare_effects(
         "to_world": (_EMITTING, Row(SHAPE)),
         "vertex_positions": (_EMITTING, Row(SHAPE)),
         "vertex_normals": (_EMITTING, Row(SHAPE)),
-        "vertex_texcoords": (Row(NORMAL, _places_normals, "a normal or bump map over a delta lobe"), Row(VALUE)),
+        "vertex_texcoords": (
+            Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
+            Row(SLOPES, _places_slopes, "another bump map"),
+            Row(PATTERN_AND_NORMALS, _places_light_and_normals, "a textured light with a normal map over a delta lobe"),
+            Row(NORMAL_COORDINATES, _places_normals, "a normal map over a delta lobe"),
+            Row(PATTERN, _places_light, "a light with a textured radiance"),
+            Row(COORDINATES),
+        ),
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
-    declare_effects(_curve, {"control_points": replace(SHAPE, trusted=False)})
-declare_effects("SDFGrid", {"grid": replace(SHAPE, trusted=False)})
+    declare_effects(_curve, {"control_points": SHAPE})
+TURNED_GRID = "; Mitsuba does not draw grids that turn: put the grid into a group and turn an instance of it"
+declare_effects(
+    "SDFGrid",
+    {"grid": replace(SHAPE, trusted=False), "to_world": replace(SHAPE, reason=SILHOUETTES + TURNED_GRID)},
+)
 for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
     declare_effects(_blobs, {"data": replace(SHAPE, trusted=False)})
+CLAMPED = replace(
+    SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
+)
+declare_effects(
+    "Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))}
+)
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 

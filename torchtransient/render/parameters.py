@@ -279,6 +279,18 @@ class Slot:
             params[normals_key] = dr.ravel(dr.normalize(transform @ normals))
 
 
+def changed_with(keys: Iterable[str], params: Any) -> list[str]:
+    """The parameters that Mitsuba has to be told have changed beside ``keys``.
+
+    A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
+    change; where those do and normals do not, it makes up new normals.
+    """
+    ending = ".vertex_texcoords"
+    meshes = [key.removesuffix(ending) for key in keys if key.endswith(ending)]
+    others = [f"{mesh}.{name}" for mesh in meshes for name in ("vertex_positions", "vertex_normals")]
+    return [key for key in others if key in params]
+
+
 class SlotTable:
     """The slots of some keys in one built scene, with the values that the scene goes back to."""
 
@@ -292,6 +304,7 @@ class SlotTable:
             if normals != target and normals in built.params:
                 touched[normals] = None
         self._check_overlap()
+        self._changed_too = changed_with(touched, built.params)
         # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
         self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
 
@@ -309,7 +322,7 @@ class SlotTable:
         """Write one leaf per slot and let the scene follow."""
         for slot, leaf in zip(self.slots, leaves, strict=True):
             slot.write(leaf, self.originals)
-        self.built.params.update()
+        self._update()
 
     def restore(self) -> None:
         """Put the described values back."""
@@ -319,4 +332,9 @@ class SlotTable:
         for key, value in self.originals.items():
             params[key] = value
             params.set_dirty(key)
-        params.update()
+        self._update()
+
+    def _update(self) -> None:
+        for key in self._changed_too:
+            self.built.params.set_dirty(key)
+        self.built.params.update()

@@ -96,6 +96,10 @@ class Problem:
         self.params.update()
         return list(changes)
 
+    def detach(self):
+        """Leave nothing attached: Mitsuba traces what other scenes hold, and refuses some of it when attached."""
+        self.install(mi.Float(self.case.value))
+
     def loss(self, x: float, seed: int) -> float:
         self.install(mi.Float(x))
         _, transient = self.scene.integrator().render(self.scene, seed=seed, spp=self.case.fd_spp)
@@ -121,7 +125,9 @@ class Problem:
         for key in keys:
             dr.enqueue(dr.ADMode.Backward, self.params[key])
         dr.traverse(dr.ADMode.Backward)
-        return float(dr.grad(x)[0])
+        slope = float(dr.grad(x)[0])
+        self.detach()
+        return slope
 
     def forward(self, seed: int) -> float:
         x = mi.Float(self.case.value)
@@ -129,4 +135,5 @@ class Problem:
         self.install(x)
         dr.set_grad(x, 1.0)
         _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
+        self.detach()
         return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())

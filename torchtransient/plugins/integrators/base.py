@@ -258,7 +258,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             jobs, _ = self.passes(world, sensor, film, seed, int(spp))
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
-            with dr.isolate_grad():
+            with dr.isolate_grad(), contents.hidden_from_mitsuba():
                 for job in jobs:
                     self._backward_pass(world, sensor, film, job, g_steady, g_transient)
                     dr.eval()
@@ -328,9 +328,10 @@ class TransientIntegrator(mi.CppADIntegrator):
                 propagate_tangents(self.parameters(scene), world)
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
-            for job in jobs:
-                self._forward_pass(world, sensor, film, job)
-                dr.eval(film.bands[job.band][2], film.steady)
+            with contents.hidden_from_mitsuba():
+                for job in jobs:
+                    self._forward_pass(world, sensor, film, job)
+                    dr.eval(film.bands[job.band][2], film.steady)
             film.finish_render()
             return film.develop() if develop else None
 

@@ -131,7 +131,7 @@ class EmitterSampled(Connection):
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
-        light.p, light.n, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Float(1)
+        light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
         light.cone, light.cone_weight = mi.Bool(False), None
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
@@ -156,12 +156,15 @@ class EmitterSampled(Connection):
         there = light.surface & pi.is_valid() & (dr.detach(found).emitter(world.scene) == light.ds.emitter)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
+        light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
         light.area = dr.relative_grad(dr.select(there, area, 1))
 
     @staticmethod
     def _emission(world, si, light, d, lit, wanted):
         """Emission over density, with the derivative of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
+        if wanted.emitter_shape:  # a pattern that moves over the shape
+            ds.uv = light.uv
         if wanted.geometry:
             ds.p, ds.n, ds.d = light.p, light.n, d
             ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))

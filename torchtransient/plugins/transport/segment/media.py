@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
+from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.media_contents import FlightSettings
 from torchtransient.plugins.transport.segment.free_flight import (
     closed_surface,
@@ -47,7 +48,7 @@ class Media(Vacuum):
     """
 
     def prepare(self, world):
-        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters)
+        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters, world.surfaces)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -150,7 +151,7 @@ class Media(Vacuum):
 
         Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
         """
-        si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active & ~v.scatter)
+        si = surface_interaction(self.settings.surfaces, v.pi, ray, mi.RayFlags.All, v.active & ~v.scatter)
         t, stretch = self._attached_distance(v, ray, wanted)
         mei = medium_interaction(ray, v.end, t)
         mei.wi = -w
@@ -168,9 +169,9 @@ class Media(Vacuum):
         begin = mi.Float(0)
         if self.settings.open_boundaries:
             entered = v.scatter & v.entry.is_valid()
-            behind = v.entry.compute_surface_interaction(ray, mi.RayFlags.Minimal, entered)
+            behind = surface_interaction(self.settings.surfaces, v.entry, ray, mi.RayFlags.Minimal, entered)
             begin = dr.select(entered, behind.t, 0)
-        exit = v.pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, v.scatter)
+        exit = surface_interaction(self.settings.surfaces, v.pi, ray, mi.RayFlags.Minimal, v.scatter)
         bounded = v.scatter & v.pi.is_valid()
         end = dr.select(bounded, exit.t, begin + 1)
         stretch = end - begin
