@@ -13,6 +13,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.mitsuba_compat import attached_distance
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
 from torchtransient.plugins.transport.media_contents import FlightSettings
@@ -168,11 +169,9 @@ class Media(Vacuum):
         begin = mi.Float(0)
         if self.settings.open_boundaries:
             entered = v.scatter & v.entry.is_valid()
-            behind = v.entry.compute_surface_interaction(ray, mi.RayFlags.Minimal, entered)
-            begin = dr.select(entered, behind.t, 0)
-        exit = v.pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, v.scatter)
+            begin = dr.select(entered, attached_distance(v.entry, ray, entered), 0)
         bounded = v.scatter & v.pi.is_valid()
-        end = dr.select(bounded, exit.t, begin + 1)
+        end = dr.select(bounded, attached_distance(v.pi, ray, bounded), begin + 1)
         stretch = end - begin
         ratio = dr.detach((v.t - begin) / stretch)
         return dr.fma(ratio, stretch, begin), dr.select(bounded, stretch, 1)
