@@ -258,6 +258,68 @@ def test_shapes_do_not_speak_of_all_that_moves_them():
 FILM = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
 
 
+def round_shape(plugin):
+    shapes = {
+        "sphere": {"type": "sphere", "radius": 0.8},
+        "cylinder": {"type": "cylinder", "p0": [-2, 0, 0], "p1": [2, 0.1, 0], "radius": 0.7},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.6).rotate([1, 1, 0], 30)},
+    }
+    if plugin in shapes:
+        return {"shape": shapes[plugin]}
+    group = {"type": "shapegroup", "ball": shapes["sphere"]}
+    pose = mi.ScalarTransform4f().translate([0.1, 0, 0])
+    return {"group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
+
+
+def slopes_of_the_way_out(plugin):
+    """Where a ray that shifts and turns leaves a shape: derivative of the distance by finite differences, by Mitsuba,
+    and by what stands in for it.
+    """
+    activate("llvm_ad_mono")
+    scene = mi.load_dict({"type": "scene", **round_shape(plugin)}, optimize=False)
+
+    def ray(x):
+        return mi.Ray3f(mi.Point3f(0.3 + x, 0.2, -4 - 0.5 * x), dr.normalize(mi.Vector3f(0.01 - 0.2 * x, 0.02, 1)))
+
+    def way_out(x):
+        line = ray(mi.Float(x))
+        start = scene.ray_intersect_preliminary(line).t + 1e-3
+        onward = mi.Ray3f(line)
+        onward.o = line(start)
+        pi = scene.ray_intersect_preliminary(onward)
+        pi.t += start
+        return pi
+
+    def slope(distance):
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        t = distance(way_out(0.0), ray(x))
+        dr.forward(x)
+        return float(dr.grad(t)[0])
+
+    h = 1e-2
+    expected = float((way_out(h).t - way_out(-h).t)[0]) / (2 * h)
+    theirs = slope(lambda pi, line: pi.compute_surface_interaction(line, mi.RayFlags.Minimal).t)
+
+    def ours(pi, line):
+        si = pi.compute_surface_interaction(line, mi.RayFlags.Minimal | mi.RayFlags.FollowShape)
+        return compat.attached_distance(pi, si, line, mi.Bool(True))
+
+    return expected, theirs, slope(ours)
+
+
+@pytest.mark.parametrize("plugin", ["sphere", "cylinder", "instance"])
+def test_distances_behind_round_shapes_have_the_derivative_of_those_before(plugin):
+    expected, theirs, _ = slopes_of_the_way_out(plugin)
+    assert abs(theirs - expected) > 5e-3
+
+
+@pytest.mark.parametrize("plugin", ["sphere", "cylinder", "instance", "cube"])
+def test_attached_distance(plugin):
+    expected, _, ours = slopes_of_the_way_out(plugin)
+    assert ours == pytest.approx(expected, abs=5e-4)
+
+
 def test_where_rays_of_sensors_start():
     activate(RGB)
     meter = mi.load_dict({"type": "radiancemeter", "film": FILM})

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 WRITTEN_AGAINST = "3.9.1"
@@ -139,6 +140,21 @@ def bounds_of(shape: Any) -> Any:
         shape.recompute_bbox()
         bounds = shape.bbox()
     return bounds
+
+
+def attached_distance(pi: Any, si: Any, ray: Any, active: Any) -> Any:
+    """Distance along an attached ``ray`` of the surface at ``pi``, which need not be the first that the ray meets;
+    ``si``: the interaction there, which follows its shape (``RayFlags.FollowShape``).
+
+    Mitsuba takes the derivative of the distance of spheres and cylinders from another intersection with the whole
+    shape, so that where a ray leaves them from outside it is that of where it entered. This one intersects the ray with
+    the plane that touches the shape at the hit point and moves with it.
+    """
+    n = dr.detach(si.n)
+    cosine = dr.dot(n, ray.d)
+    meets = active & (dr.detach(cosine) != 0)
+    distance = dr.dot(si.p - ray.o, n) / dr.select(meets, cosine, 1)
+    return dr.replace_grad(pi.t, dr.select(meets, distance, 0))
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors

@@ -39,7 +39,6 @@ class SceneContents:
     """
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
-        shapes = scene.shapes()
         outermost = bsdfs_of_scene(scene)
         met, self.delays = delays_of(outermost)
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF)

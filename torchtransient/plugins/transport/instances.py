@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mitsuba_compat import attached_distance, is_instance
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.hits import HitTable
@@ -149,6 +149,12 @@ def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, fl
     if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)
     return surfaces.interaction(pi, ray, flags, active)
+
+
+def distance_to(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, active: Any) -> Any:
+    """Distance along an attached ``ray`` of the surface at ``pi``."""
+    si = surface_interaction(surfaces, pi, ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active)
+    return attached_distance(pi, si, ray, active)
 
 
 def _point(M: Any, p: Any) -> Any:

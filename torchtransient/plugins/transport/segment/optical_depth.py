@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.instances import surface_interaction
+from torchtransient.plugins.transport.instances import distance_to
 from torchtransient.plugins.transport.segment.free_flight import cross_boundary, generator, medium_interaction
 
 # Streams of random numbers, one for each kind of leg.
@@ -54,10 +54,9 @@ def optical_depth(media, leg, part, x0, x1, active):
         end = dr.select(leg.far, end, dr.norm(span))
         if media.open_boundaries:
             passed = inside & part.entry.is_valid()
-            behind = surface_interaction(media.surfaces, part.entry, ray, mi.RayFlags.Minimal, passed)
-            begin = dr.select(passed, behind.t, 0)
+            begin = dr.select(passed, distance_to(media.surfaces, part.entry, ray, passed), 0)
             ends &= inside
-            end = dr.select(ends, surface_interaction(media.surfaces, part.pi, ray, mi.RayFlags.Minimal, ends).t, end)
+            end = dr.select(ends, distance_to(media.surfaces, part.pi, ray, ends), end)
     if media.heterogeneous:
         hits, near, far = part.medium.intersect_aabb(ray)
         begin = dr.select(hits, dr.maximum(begin, near), begin)
