@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import mitsuba as mi
 
@@ -28,8 +29,6 @@ SENSOR_KEYS = (
     "aperture_radius",
     "focus_distance",
 )
-# What a medium has that does not change how far light gets.
-_NO_EXTINCTION = ("albedo", "phase_function")
 
 SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", trusted=True)
 SENSOR = replace(SHAPE, role="sensor")
@@ -106,11 +105,20 @@ def _is_normal(site: Site) -> bool:
 
 def _is_extinction(site: Site) -> bool:
     """Whether a plugin is part of a medium's extinction."""
-    return any(isinstance(holder, mi.Medium) and name not in _NO_EXTINCTION for holder, name in site.owners)
+    return any(isinstance(holder, mi.Medium) and _attenuates(holder, name) for holder, name in site.owners)
+
+
+def _attenuates(medium: Any, name: str) -> bool:
+    """Whether what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase function does
+    where it is one of flakes, whose projected area is a factor of the extinction.
+    """
+    if name == "phase_function":
+        return bool(mi.has_flag(medium.phase_function().flags(), mi.PhaseFunctionFlags.Microflake))
+    return name != "albedo"
 
 
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
-IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium, outside of albedo and phase function")
+IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -150,4 +158,5 @@ declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
 declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
+declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})
