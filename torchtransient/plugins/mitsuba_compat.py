@@ -57,15 +57,20 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
-# Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
-# number for it, its rough dielectric detaches it where directions are sampled.
-DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# Built in place of Mitsuba's when a key is asked for whose derivative Mitsuba's lacks: its dielectric has a plain number
+# for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic has tables that it
+# computes from roughness and index outside of the graph.
+DIFFERENTIABLE_PLUGINS = {
+    "dielectric": "diff_dielectric",
+    "roughdielectric": "diff_rough_dielectric",
+    "roughplastic": "diff_rough_plastic",
+}
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
 # its conductor, dielectric, polarizer and retarder by the direction are NaN; its rough dielectric depolarises; its wave
 # plate jumps at oblique incidence.
 POLARIZED_PLUGINS = {
-    **DIFFERENTIABLE_PLUGINS,
-    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+    **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
+    "roughdielectric": "diff_rough_dielectric",
 }
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights

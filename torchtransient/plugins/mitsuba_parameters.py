@@ -44,11 +44,14 @@ INDEX = ParameterEffect(
     reason="biased where light is refracted: the path length does not follow this index",
     trusted=True,
 )
-PRINCIPLED_INDEX = replace(
-    INDEX,
-    reason="biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md",
+# Directions are held fixed while the index moves, so what is seen through the surface stays where it is.
+PRINCIPLED_INDEX = ParameterEffect(moves_length=True, role="index", trusted=True)
+COATING = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['roughplastic']} when asked for, which differentiates the "
+    "tables of its coating",
+    trusted=True,
+    stand_in=DIFFERENTIABLE_PLUGINS["roughplastic"],
 )
-COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated")
 RIGID_ONLY = replace(
     SHAPE,
     biased=True,
