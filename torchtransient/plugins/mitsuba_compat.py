@@ -7,9 +7,13 @@ and what asks for it can go. Our own plugins are told by what they declare, neve
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import mitsuba as mi
+
+from torchtransient.errors import SceneError
 
 WRITTEN_AGAINST = "3.9.1"
 
@@ -95,6 +99,14 @@ def bounds_of(shape: Any) -> Any:
         shape.recompute_bbox()
         bounds = shape.bbox()
     return bounds
+
+
+def sun_half_angle(emitter: Any) -> float:
+    """Half the angle (radians) that the sun of a ``sunsky`` fills. Mitsuba shows it in the description alone."""
+    shown = re.search(r"Sun aperture = ([-+.\de]+)", str(emitter))
+    if shown is None:
+        raise SceneError(f"{emitter.class_name()}: expected 'Sun aperture' in its description, got {emitter}.")
+    return math.radians(float(shown[1])) / 2
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors

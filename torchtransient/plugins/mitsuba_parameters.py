@@ -34,6 +34,7 @@ SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", 
 SENSOR = replace(SHAPE, role="sensor")
 # Shadow edges move with a light.
 EMITTER = replace(SHAPE, role="emitter")
+SUN = replace(SHAPE, role="sun", trusted=False)
 NORMAL = replace(SHAPE, role="normal", trusted=False)
 MEDIUM = ParameterEffect(moves_medium=True, role="medium")
 INDEX = ParameterEffect(
@@ -149,6 +150,7 @@ declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 declare_effects("Emitter", {"to_world": replace(EMITTER, trusted=False), "position": replace(EMITTER, trusted=False)})
 declare_effects("PointLight", {"position": EMITTER})
 declare_effects("SpotLight", {"to_world": EMITTER})
+declare_effects("SunskyEmitter", {"sun_direction": SUN})
 
 declare_effects("BSDF", {"eta": INDEX})
 declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})

@@ -24,7 +24,7 @@ from torchtransient.errors import PluginRegistrationError
 CORRECT = "correct"
 SILHOUETTES = "correct except where silhouettes move (no boundary term)"
 ANY_KEY = "*"
-ROLES = ("shape", "normal", "emitter", "sensor", "index", "delay", "medium", "value")
+ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "medium", "value")
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ParameterEffect:
     distances), which albedo and phase function do not.
 
     ``role``: which part of the geometry it moves. "shape": points of a surface; "normal": the frame that a delta lobe
-    works in; "emitter": an emitter without a shape; "sensor": the sensor and its rays; "index": an index of refraction;
+    works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its rays; "index": an index of refraction;
     "delay": a lifetime; "medium": an extinction; "value": none.
 
     ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, besides the missing

@@ -21,9 +21,10 @@ ENTRIES = 64
 _NODES, _NODES_TOTAL_REFLECTION = 32, 128
 
 
-# Half the width, relative to the index, of the differences that take the place of a slope where total reflection sets
-# in: the slope of Fresnel's equations is infinite there, which no quadrature of it survives, and its integral is not.
-_STEP = 0.01
+# Step, in parts of what the index differs from one, of the differences that take the place of a slope where total
+# reflection sets in: the slope of Fresnel's equations is infinite there, which no quadrature survives, while that of the
+# integral is smooth. They are good to 0.5 % from alpha 0.02 to 1 and index 1.1 to 2, most of them to 0.1 %.
+_STEP = 0.2
 
 
 def external_transmittance(alpha: Any, eta: Any, ggx: bool) -> Any:
@@ -80,7 +81,9 @@ def _with_slopes(f: Callable[[Any, Any], Any], alpha: Any, eta: Any, smooth: boo
             dr.set_grad(moving, 1)
             slope = dr.forward_to(f(a, moving))
         else:
-            slope = (f(a, e * (1 + _STEP)) - f(a, e * (1 - _STEP))) / (2 * _STEP * e)
+            h = _STEP * (e - 1)
+            near, far = f(a, e + h) - f(a, e - h), f(a, e + 2 * h) - f(a, e - 2 * h)
+            slope = (8 * near - far) / (12 * h)
         result = result + slope * (eta - e)
     return dr.replace_grad(value, result)
 
