@@ -61,6 +61,12 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
+# Weights at which these skip a lobe, so that the derivative by the weight is zero there although its slope is not.
+SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
+    "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
+    "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
+}
+
 # Built in place of Mitsuba's when a key is asked for whose derivative Mitsuba's lacks: its dielectric has a plain number
 # for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic has tables that it
 # computes from roughness and index outside of the graph.

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, normal_texture
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, SKIPPED_AT, normal_texture
 from torchtransient.plugins.node_walk import bsdfs_below
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
@@ -52,6 +53,10 @@ COATING = ParameterEffect(
     "tables of its coating",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["roughplastic"],
+)
+SKIPPED = ParameterEffect(
+    biased=True,
+    reason="biased: Mitsuba skips a lobe whose weight is exactly zero, and its derivative with it; start from 1e-6",
 )
 RIGID_ONLY = replace(
     SHAPE,
@@ -121,8 +126,25 @@ def _attenuates(medium: Any, name: str) -> bool:
     return name != "albedo"
 
 
+def _skips_a_lobe(site: Site) -> bool:
+    """Whether a texture is the weight of a lobe and has, somewhere, exactly the value at which a lobe is skipped."""
+    if not site.owners:
+        return False
+    holder, name = site.owners[0]
+    values = SKIPPED_AT.get(holder.class_name(), {}).get(name, ())
+    if not values:
+        return False
+    shown = dr.detach(mi.traverse(site.node)[site.key])
+    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
+        return False
+    entries = shown.array if dr.is_tensor_v(shown) else shown
+    return any(bool(dr.any(entries == value, axis=None)) for value in values)
+
+
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
+
+AT_ZERO = Row(SKIPPED, _skips_a_lobe, "the weight of a lobe of principled or principledthin, where a lobe vanishes")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -161,7 +183,7 @@ declare_effects("ThinDielectric", {"eta": VALUE})
 declare_effects("Hair", {"eta": VALUE})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION)})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -27,6 +28,14 @@ def angular_light():
     lamp = area_light()
     lamp["emitter"] = {"type": "angulararea", "radiance": 9.0, "cutoff_angle": 60.0, "beam_width": 5.0}
     return lamp
+
+
+def sky_with_sun():
+    return {"type": "sunsky", "sun_direction": [0.3, 0.4, 0.7]}
+
+
+def turn_sun(params, x):
+    params["light.sun_direction"] = dr.normalize(mi.Vector3f(params["light.sun_direction"]) + mi.Vector3f(0.2, -0.3, 0.1) * x)
 
 
 CASES = [
@@ -99,6 +108,16 @@ CASES = [
         scale_texture("light.data"),
         0.0,
         0.05,
+        spp=4096,
+    ),
+    Case(
+        "sun_direction",
+        "direction of the sun",
+        lambda: room(light=sky_with_sun(), sensor=camera(start=2.0, bins=400)),
+        turn_sun,
+        0.0,
+        0.01,
+        variant="llvm_ad_rgb",
         spp=4096,
     ),
     Case(
