@@ -67,9 +67,9 @@ SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
     "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
 
-# Built in place of Mitsuba's when a key is asked for whose derivative Mitsuba's lacks: its dielectric has a plain number
-# for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic has tables that it
-# computes from roughness and index outside of the graph.
+# Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric has a plain number for
+# the index, its rough dielectric detaches it where directions are sampled, and its rough plastic computes tables from
+# roughness and index outside of the graph.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",

@@ -155,9 +155,9 @@ def check_stand_ins(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> None
     for node, key, effect in effects:
         if effect.stand_in:
             raise GradientError(
-                f"{f'{node.id()}.{key}'.lstrip('.')!r}: Mitsuba's {node.class_name()} does not have the whole derivative "
-                f"of this parameter. Describe the plugin as '{effect.stand_in}', which takes the same properties; "
-                "tt.TransientRenderer does so by itself."
+                f"{f'{node.id()}.{key}'.lstrip('.')!r}: Mitsuba's {node.class_name()} does not have the whole "
+                f"derivative of this parameter. Describe the plugin as '{effect.stand_in}', which takes the same "
+                "properties; tt.TransientRenderer does so by itself."
             )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -35,7 +34,8 @@ def sky_with_sun():
 
 
 def turn_sun(params, x):
-    params["light.sun_direction"] = dr.normalize(mi.Vector3f(params["light.sun_direction"]) + mi.Vector3f(0.2, -0.3, 0.1) * x)
+    # Not of unit length on the way: Mitsuba reads angles from it as if it were.
+    params["light.sun_direction"] = mi.Vector3f(params["light.sun_direction"]) + mi.Vector3f(0.3, -0.2, 0.5) * x
 
 
 CASES = [

@@ -209,7 +209,7 @@ CASES = [
     case("g", "phase function", "plain", set_color(PHASE + "g"), 0.4, 0.02),
     case("blend", "phase function", "blended", set_color(PHASE + "weight.value.value"), 0.4, 0.02, tags=SLOW),
     case("flakes", "flakes (sggx)", "flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
-    case("flakes_in_clouds", "flakes (sggx)", "clouds of flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02, fd_spp=4096),
+    case("flakes_in_clouds", "flakes (sggx)", "clouds of flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
     case("grid", "density and albedo grids", "clouds", scale_texture(GRID), 0.0, 0.02),
     case("grid_sparse", "density and albedo grids", "sparse", scale_texture(GRID), 0.0, 0.02),
     case(

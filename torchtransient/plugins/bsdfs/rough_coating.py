@@ -17,12 +17,13 @@ from .microfacet import normal_density, smith_g1_over_cos
 ENTRIES = 64
 """Entries of a table, equally spaced in the cosine of the angle of incidence from 0 to 1."""
 
-# Nodes of the quadrature in each of two dimensions; the edge of total reflection asks for more of them.
-_NODES, _NODES_TOTAL_REFLECTION = 32, 128
+# Nodes of the quadrature in each of two dimensions: Mitsuba's, of which the edge of total reflection asks for more, and
+# those of slopes by roughness, whose integrand has a logarithm in it.
+_NODES, _NODES_TOTAL_REFLECTION, _NODES_OF_SLOPES = 32, 128, 96
 
 
 # Step, in parts of what the index differs from one, of the differences that take the place of a slope where total
-# reflection sets in: the slope of Fresnel's equations is infinite there, which no quadrature survives, while that of the
+# reflection sets in: the slope of Fresnel's equations is infinite there, which no quadrature survives, while the
 # integral is smooth. They are good to 0.5 % from alpha 0.02 to 1 and index 1.1 to 2, most of them to 0.1 %.
 _STEP = 0.2
 
@@ -99,6 +100,8 @@ def _facet_mean(alpha: Any, eta: Any, ggx: bool, transmitted: bool) -> Any:
     weighed by their density instead, since the derivatives of Mitsuba's sampling are not finite everywhere.
     """
     count = _NODES if _refracts_all(eta) else _NODES_TOTAL_REFLECTION
+    if dr.grad_enabled(alpha):
+        count = max(count, _NODES_OF_SLOPES)
     nodes, weights = (mi.Float(values) for values in mi.quad.gauss_legendre(count))
     pair = dr.arange(mi.UInt32, ENTRIES * count * count)
     which, first, second = pair // (count * count), pair % count, (pair // count) % count

@@ -28,7 +28,7 @@ class DiffRoughPlastic(mi.BSDF):
     ``nonlinear``, ``diffuse_reflectance``, ``specular_reflectance`` (textures). One-sided.
 
     Differentiable: ``alpha``, ``eta`` (inside over outside index) and the textures. Roughness and index act through the
-    lobe and through how much light passes the coating, which is tabulated anew with every update (some 20 ms).
+    lobe and through how much light passes the coating, which is tabulated anew with every update (0.1 s).
     ``sample`` draws a detached direction, its weight is value over density. Depolarizes in polarized variants.
     """
 
@@ -46,7 +46,7 @@ class DiffRoughPlastic(mi.BSDF):
         if name not in _DISTRIBUTIONS:
             raise SceneError(f"diff_rough_plastic: 'distribution' must be 'beckmann' or 'ggx', got '{name}'.")
         if "alpha_u" in props or "alpha_v" in props:
-            raise SceneError("diff_rough_plastic: the coating is isotropic; give 'alpha' instead of 'alpha_u', 'alpha_v'.")
+            raise SceneError("diff_rough_plastic: coatings are isotropic, expected 'alpha', got 'alpha_u', 'alpha_v'.")
         self.ggx = _DISTRIBUTIONS[name]
         self.alpha = opaque(mi.Float(max(float(props.get("alpha", 0.1)), _ALPHA_MIN)))
         self.sample_visible = bool(props.get("sample_visible", True))
@@ -117,7 +117,8 @@ class DiffRoughPlastic(mi.BSDF):
         if has_diffuse:
             base = self.diffuse_reflectance.eval(si, active)
             base = base / (1 - (base * self.thrown_back if self.nonlinear else self.thrown_back))
-            value += base * (passes * look_up(self.transmittance, wo.z, active) * wo.z * dr.inv_pi / dr.square(self.eta))
+            passes *= look_up(self.transmittance, wo.z, active)
+            value += base * (passes * wo.z * dr.inv_pi / dr.square(self.eta))
         value = dr.select(active, value, 0)
         return mi.mueller.depolarizer(value) if mi.is_polarized else value, dr.select(active, pdf, 0)
 

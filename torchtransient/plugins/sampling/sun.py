@@ -24,7 +24,12 @@ class MovingSun:
     """
 
     def __init__(self, emitter: Any) -> None:
-        self.direction = dr.normalize(mi.Vector3f(mi.traverse(emitter)["sun_direction"]))
+        params = mi.traverse(emitter)
+        to_world = mi.AffineTransform4f(params["to_world"])
+        # Mitsuba keeps two angles, taken as those of a unit vector whatever its length: where the sun is seen follows
+        # from them alone.
+        angles = mi.dir_to_sph(to_world.inverse() @ mi.Vector3f(params["sun_direction"]))
+        self.direction = dr.normalize(to_world @ mi.sph_to_dir(*angles))
         self._cosine = float(dr.cos(_MARGIN * sun_half_angle(emitter)))
 
     def contains(self, d: Any) -> Any:

@@ -79,7 +79,9 @@ class EmitterFound(Connection):
         return EventTerm(value=first_column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
 
     def _claimed(self, world, emitter, d, wanted):
-        """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for none."""
+        """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for
+        none.
+        """
         claims = [c.claims(world, emitter, d, wanted) for c in world.connections if c is not self]
         claims = [c for c in claims if c is not None]
         return None if not claims else claims[0] if len(claims) == 1 else dr.any(claims)

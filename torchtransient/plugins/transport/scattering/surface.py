@@ -234,8 +234,8 @@ class Surface(Scattering):
             J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
-        # Some BSDFs throw samples away (a lobe of reflection that leads behind the surface): their weight is zero, though
-        # other lobes have a value and a density there.
+        # Some BSDFs throw samples away (a lobe of reflection that leads behind the surface): their weight is zero,
+        # though other lobes have a value and a density there.
         discarded = r["black"] & ~is_black(towards.value)
         inv_pdf = dr.select(smooth & (pdf > 0) & ~discarded, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
