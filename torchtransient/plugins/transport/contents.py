@@ -18,9 +18,9 @@ from torchtransient.plugins.transport.media_contents import media_of
 class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
-    ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: the scene has shape
-    groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
-    which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
+    ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: the scene has
+    shape groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough
+    BSDFs, which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables and
     media are None where the scene has no such thing.
@@ -32,6 +32,7 @@ class SceneContents:
         shapes = scene.shapes()
         self.bsdfs, self.delays = delays_of(bsdfs_of_scene(scene))
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
+        self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
         self.instances = any(is_instance(shape) for shape in shapes)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None

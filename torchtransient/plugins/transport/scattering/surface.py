@@ -187,7 +187,7 @@ class Surface(Scattering):
     # ------------------------------------------------------------------------------------------------- record
 
     def fields(self, world):
-        fields = {"delta": mi.Bool, "black": mi.Bool}
+        fields = {"delta": mi.Bool} | ({"black": mi.Bool} if world.contents.glossy else {})
         if world.contents.delta:
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
@@ -234,10 +234,12 @@ class Surface(Scattering):
             J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
-        # Some BSDFs throw samples away (a lobe of reflection that leads behind the surface): their weight is zero,
-        # though other lobes have a value and a density there.
-        discarded = r["black"] & ~is_black(towards.value)
-        inv_pdf = dr.select(smooth & (pdf > 0) & ~discarded, v.rr / pdf, 0)
+        counts = smooth & (pdf > 0)
+        if world.contents.glossy:
+            # Some BSDFs throw samples away (the facet that was drawn mirrors to behind the surface): their weight is
+            # zero, though other lobes have a value and a density there.
+            counts &= ~r["black"] | is_black(towards.value)
+        inv_pdf = dr.select(counts, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
