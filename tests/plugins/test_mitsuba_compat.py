@@ -173,6 +173,95 @@ def test_wave_plate_jumps_at_oblique_incidence():
     assert jump("retarder") > 0.5 and jump(compat.POLARIZED_PLUGINS["retarder"]) < 1e-2
 
 
+# ------------------------------------------------------------------------------------------- samples, lobes and tables
+
+
+def many_samples(bsdf, count=20000):
+    """(samples, their weights, interaction) for directions from behind the surface."""
+    rng = mi.PCG32(count)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = -mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    return *bsdf.sample(mi.BSDFContext(), si, u, v), si
+
+
+@pytest.mark.parametrize("plugin", ["principled", "principledthin", "roughdielectric"])
+def test_samples_that_are_thrown_away_have_a_density(plugin):
+    """What asks for it: ``discarded`` in the attached form of scattering by surfaces."""
+    activate(RGB)
+    rough = {"alpha": 0.7} if plugin == "roughdielectric" else {"roughness": 0.8, "spec_trans": 0.5}
+    thin = {"diff_trans": 0.5} if plugin == "principledthin" else {}
+    bsdf = mi.load_dict({"type": plugin, **rough, **thin})
+    sample, weight, si = many_samples(bsdf)
+    value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
+    lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
+    assert dr.count(lost)[0] > 20
+
+
+def clearcoat_slope(weight):
+    """(derivative of a principled surface by its clearcoat, forward difference)."""
+    bsdf = mi.load_dict({"type": "principled", "clearcoat": {"type": "uniform", "value": weight}})
+    params = mi.traverse(bsdf)
+
+    def value(x):
+        params["clearcoat.value"] = x
+        params.update()
+        wi, wo = unit(0.3, 0.1, 0.9), unit(-0.3, -0.1, 0.9)
+        return dr.sum(bsdf.eval(mi.BSDFContext(), interaction(wi), wo))
+
+    x = mi.Float(weight)
+    dr.enable_grad(x)
+    dr.backward(value(x))
+    return float(dr.grad(x)[0]), float(((value(mi.Float(weight + 0.1)) - value(mi.Float(weight))) / 0.1)[0])
+
+
+def test_a_lobe_of_weight_zero_is_skipped():
+    activate(RGB)
+    at_zero, difference = clearcoat_slope(0.0)
+    assert at_zero == 0 and difference > 0.1
+    beside, difference = clearcoat_slope(1e-6)
+    assert beside == pytest.approx(difference, rel=1e-3)
+    assert 0 in compat.SKIPPED_AT["Principled"]["clearcoat"]
+
+
+def test_rough_plastic_has_no_derivative_through_its_tables():
+    activate(RGB)
+    context = mi.BSDFContext()
+    context.component = 1  # of the diffuse base, where roughness acts through the tables alone
+
+    def derivative(plugin):
+        bsdf = mi.load_dict({"type": plugin, "alpha": 0.3})
+        params = mi.traverse(bsdf)
+        x = mi.Float(0.3)
+        dr.enable_grad(x)
+        params["alpha"] = x
+        params.update()
+        value = dr.sum(bsdf.eval(context, interaction(unit(0.3, 0.1, 0.9)), unit(-0.3, -0.1, 0.9)))
+        if not dr.grad_enabled(value):
+            return 0.0
+        dr.backward(value)
+        return float(dr.grad(x)[0])
+
+    assert derivative("roughplastic") == 0
+    assert derivative(compat.DIFFERENTIABLE_PLUGINS["roughplastic"]) < -0.01
+
+
+def test_the_sun_shows_its_angle_in_its_description_alone():
+    activate(RGB)
+    sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8], "sun_aperture": 2.5, "sky_scale": 0.0})
+    assert not any("aperture" in key for key in mi.traverse(sky).properties)
+    half = compat.sun_half_angle(sky)
+    assert half == pytest.approx(np.radians(1.25), rel=1e-5)
+
+    def light_at(angle):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        towards = np.arctan2(0.6, 0.8) + angle
+        si.wi = -mi.Vector3f(0, float(np.sin(towards)), float(np.cos(towards)))
+        return float(dr.max(sky.eval(si))[0])
+
+    assert light_at(0.99 * half) > 0 and light_at(1.01 * half) == 0
+
+
 # --------------------------------------------------------------------------------------------- indices, sides, spectra
 
 

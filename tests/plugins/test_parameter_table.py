@@ -72,9 +72,10 @@ MOVES = [
     ("orthographic", "to_world", "LS", "sensor"),
     ("thinlens", "to_world x_fov aperture_radius focus_distance", "LS", "sensor"),
     ("point", "position", "LS", "emitter"),
-    ("spot projector directional envmap sunsky timed_sunsky", "to_world", "LS", "emitter"),
+    ("spot projector directional envmap sunsky sunsky_at_a_time timed_sunsky", "to_world", "LS", "emitter"),
+    ("sunsky sunsky_at_a_time", "sun_direction", "LS", "sun"),
     ("dielectric diff_dielectric", "eta", "LS", "index"),
-    ("principled", "specular", "LS", "index"),
+    ("principled", "specular", "L", "index"),
     ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
     ("delayed", "lifetime", "L", "delay"),
     ("heterogeneous", "data", "M", "medium"),
@@ -273,8 +274,9 @@ def test_reasons():
     assert effect_of(mi.load_dict({"type": "diff_dielectric"}), "eta").reason == SILHOUETTES
     stand_in = effect_of(mi.load_dict({"type": "dielectric"}), "eta").reason
     assert stand_in.startswith(SILHOUETTES) and "diff_dielectric" in stand_in
-    principled = effect_of(mi.load_dict({"type": "principled"}), "specular")
-    assert principled.biased and "docs/gradients.md" in principled.reason
+    coating = effect_of(mi.load_dict({"type": "roughplastic"}), "alpha")
+    assert not coating.biased and "diff_rough_plastic" in coating.reason
+    assert effect_of(mi.load_dict({"type": "principled"}), "specular").reason == CORRECT
 
 
 def test_no_moving_silhouette_is_called_correct(own_rows):

@@ -237,6 +237,23 @@ def test_indices_that_bend_nothing_keep_the_box(plugin):
     assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
 
 
+@pytest.mark.parametrize("key", ["alpha", "eta"])
+def test_rough_plastic_is_built_with_its_derivative(key):
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "twosided", "nested": {"type": "roughplastic", "alpha": 0.3}}
+    scene = tt.load(room, variant=VARIANT)
+    key = f"box.bsdf.brdf_0.{key}"
+    info = scene.parameters()[key]
+    assert info.differentiable and not info.biased and "diff_rough_plastic" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=64)
+    own = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=64)
+    image = renderer(seed=0).steady
+    # Values and random numbers are those of Mitsuba's, up to the rounding of the tables.
+    torch.testing.assert_close(image.detach(), own(seed=0).steady.detach(), rtol=1e-3, atol=1e-4 * float(image.max()))
+    image.sum().backward()
+    assert renderer.values[key].grad.abs() > 1e-4
+
+
 def test_table_of_a_scene_with_a_parameter_that_is_not_set():
     room = make_room()
     room["box"]["bsdf"] = {"type": "hair"}

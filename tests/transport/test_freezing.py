@@ -45,10 +45,14 @@ def scene_of(kind):
         result["sensor"]["film"]["rfilter"] = {"type": "gaussian"}
     if kind == "glass":
         result["small-box"] = small | {"bsdf": {"type": "diff_rough_dielectric", "alpha": 0.3}}
+    if kind == "coating":  # its tables are no parameters
+        result["small-box"] = small | {"bsdf": {"type": "diff_rough_plastic", "alpha": 0.3}}
     return result
 
 
-KINDS = ("surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture")
+KINDS = (
+    "surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture", "coating",
+)  # fmt: skip
 
 
 def render(scene, params, x, adjoint, seed):

@@ -78,6 +78,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.rough_plastic", (("bsdf", "diff_rough_plastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
     PluginModule(
         "torchtransient.plugins.bsdfs.thin_elements",

@@ -7,10 +7,14 @@ and what asks for it can go. Our own plugins are told by what they declare, neve
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from torchtransient.errors import SceneError
 
 WRITTEN_AGAINST = "3.9.1"
 
@@ -87,15 +91,26 @@ def is_bump_map(bsdf: Any) -> bool:
     return bool(bsdf.class_name() == "BumpMap")
 
 
-# Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
-# number for it, its rough dielectric detaches it where directions are sampled.
-DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+# Weights at which these skip a lobe, so that the derivative by the weight is zero there although its slope is not.
+SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
+    "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
+    "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
+}
+
+# Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric has a plain number for
+# the index, its rough dielectric detaches it where directions are sampled, and its rough plastic computes tables from
+# roughness and index outside of the graph.
+DIFFERENTIABLE_PLUGINS = {
+    "dielectric": "diff_dielectric",
+    "roughdielectric": "diff_rough_dielectric",
+    "roughplastic": "diff_rough_plastic",
+}
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
 # its conductor, dielectric, polarizer and retarder by the direction are NaN; its rough dielectric depolarises; its wave
 # plate jumps at oblique incidence.
 POLARIZED_PLUGINS = {
-    **DIFFERENTIABLE_PLUGINS,
-    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+    **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
+    "roughdielectric": "diff_rough_dielectric",
 }
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights
@@ -155,6 +170,14 @@ def attached_distance(pi: Any, si: Any, ray: Any, active: Any) -> Any:
     meets = active & (dr.detach(cosine) != 0)
     distance = dr.dot(si.p - ray.o, n) / dr.select(meets, cosine, 1)
     return dr.replace_grad(pi.t, dr.select(meets, distance, 0))
+
+
+def sun_half_angle(emitter: Any) -> float:
+    """Half the angle (radians) that the sun of a ``sunsky`` fills. Mitsuba shows it in the description alone."""
+    shown = re.search(r"Sun aperture = ([-+.\de]+)", str(emitter))
+    if shown is None:
+        raise SceneError(f"{emitter.class_name()}: expected 'Sun aperture' in its description, got {emitter}.")
+    return math.radians(float(shown[1])) / 2
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors

@@ -158,6 +158,22 @@ def thicken(key):
     return apply
 
 
+def flakes():
+    """Flakes that lie in no axis of the scene: how much light they stop depends on its direction."""
+    S = np.broadcast_to(np.float32([0.3, 0.6, 0.9, 0.05, -0.1, 0.08]), (2, 2, 2, 6))
+    return {"type": "sggx", "S": volume(S)}
+
+
+def turn_flakes(key):
+    """Change all six entries of the flakes' matrix."""
+
+    def apply(params, x):
+        change = np.tile(np.float32([0.5, -0.3, 0.4, 0.2, 0.1, -0.1]), 8)
+        params[key] = mi.TensorXf(params[key].array + mi.Float(change) * x, params[key].shape)
+
+    return apply
+
+
 def blended():
     parts = {"a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}
     return homogeneous() | {"phase": {"type": "blendphase", "weight": 0.4, **parts}}
@@ -175,6 +191,8 @@ BLOCKS = {
     "coloured": lambda: block(coloured()),
     "black": lambda: block(homogeneous(albedo=0.0)),
     "blended": lambda: block(blended()),
+    "flakes": lambda: block(homogeneous() | {"phase": flakes()}, depth=2),
+    "clouds of flakes": lambda: block(clouds(phase=flakes())),
     "clouds": lambda: block(clouds()),
     "sparse": lambda: block(clouds(sparse())),
     "albedo grid": lambda: block(clouds(albedo=volume(sparse()))),
@@ -234,6 +252,8 @@ CASES = [
     case("albedo_zero", "medium albedo", "black", set_color(ALBEDO), 0.0, 0.02),
     case("g", "phase function", "plain", set_color(PHASE + "g"), 0.4, 0.02),
     case("blend", "phase function", "blended", set_color(PHASE + "weight.value.value"), 0.4, 0.02, tags=SLOW),
+    case("flakes", "flakes (sggx)", "flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
+    case("flakes_in_clouds", "flakes (sggx)", "clouds of flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
     case("grid", "density and albedo grids", "clouds", scale_texture(GRID), 0.0, 0.02),
     case("grid_sparse", "density and albedo grids", "sparse", scale_texture(GRID), 0.0, 0.02),
     case(

@@ -14,7 +14,7 @@ from torchtransient.plugins.films.temporal_filter import check_name, check_stdde
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.launch import Pass, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
-from torchtransient.plugins.parameters import ParameterTracker, check_slope, moving_names
+from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
@@ -268,6 +268,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
             effects = self.parameters(scene).attached()
+        check_stand_ins(effects)
         check_slope(moving_names(effects), film.has_slope, film.response_name, film.slope_remedy)
         if self.max_depth == UNLIMITED:
             raise GradientError(

@@ -24,8 +24,8 @@ from torchtransient.plugins.transport.media_contents import media_of
 class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
-    ``bsdfs``: those that paths can meet. ``delta``: some BSDF has a delta lobe. ``instances``: those of shape groups
-    (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
+    ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
+    shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
     (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
     transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around the sensor
     (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``: masks and
@@ -43,6 +43,7 @@ class SceneContents:
         met, self.delays = delays_of(outermost)
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF)
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
+        self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
         self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None

@@ -52,6 +52,17 @@ class MediaContents:
                 "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
             )
 
+    @staticmethod
+    def check_sun(moves: bool) -> None:
+        """Raise ``GradientError`` where the direction of the sun has a derivative: the way of its light through a
+        medium changes with it, which is not followed.
+        """
+        if moves:
+            raise GradientError(
+                "transient_prbvolpath: 'sun_direction' has no derivative in a scene with media, expected a scene "
+                "without. Leave out the medium or the parameter; a moving 'point' light has one."
+            )
+
 
 class FlightSettings:
     """How the walks through media are made in one job: the contents, and what derivatives ask of them.

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
+from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     direction_to,
@@ -26,6 +27,8 @@ class EmitterSampled(Connection):
     def prepare(self, world):
         lights = world.contents.sphere_lights
         self.spheres = None if lights is None else lights.read(world.scene)
+        sky = None if world.wanted is None else world.wanted.sky
+        self.sun = None if sky is None else MovingSun(sky)
 
     def tables(self):
         return [] if self.spheres is None else [self.spheres.values]
@@ -85,12 +88,14 @@ class EmitterSampled(Connection):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def claims(self, world, emitter, wanted):
+    def claims(self, world, emitter, d, wanted):
         # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
-        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone.
-        if not wanted.sphere_lights:
-            return None
-        return self.spheres.lists(emitter)
+        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone. So is the sun.
+        claimed = self.spheres.lists(emitter) if wanted.sphere_lights else None
+        if self.sun is not None:
+            shines = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & self.sun.contains(d)
+            claimed = shines if claimed is None else claimed | shines
+        return claimed
 
     def numbers(self, recorded):
         return [recorded["u"].x, recorded["u"].y]
@@ -101,11 +106,13 @@ class EmitterSampled(Connection):
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
         d = mi.Vector3f(light.ds.d)
+        if self.sun is not None:
+            d = self.sun.followed(d, light.sun)
         if wanted.geometry:
             d = direction_to(si.p, light.p, light.near, d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
-        pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
+        pdf = dr.select(light.ds.delta | light.cone | light.sun, 0, dr.detach(towards.pdf))
         with dr.suspend_grad():
             mis = self.weight(world, dr.detach(si), light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
@@ -132,13 +139,15 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
-        light.cone, light.cone_weight = mi.Bool(False), None
+        light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
+        if self.sun is not None:
+            light.sun = far & self.sun.contains(ds.d)
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
             moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
             light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, dr.detach(moving.p)))
         if wanted.sphere_lights:
-            light.cone = surface & self.claims(world, ds.emitter, wanted)
+            light.cone = surface & self.claims(world, ds.emitter, ds.d, wanted)
             light.surface = surface & ~light.cone
             moving, light.cone_weight = self.sample(world, si, u, light.cone)
             light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))

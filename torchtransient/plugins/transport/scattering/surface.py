@@ -154,7 +154,8 @@ class Surface(Scattering):
         way = dr.norm(step.point - vertex.at.p)
         arrived = reached & (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
         pdf = dr.select(step.guided & ~arrived, 0, pdf)
-        step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
+        kept = step.guided | ~is_black(step.weight)
+        step.weight = dr.select(smooth, dr.select((pdf > 0) & kept, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
         wo = vertex.scattered_si.to_local(step.out)
         step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, vertex.scattered_si, wo), step.eta)
@@ -190,7 +191,7 @@ class Surface(Scattering):
     # ------------------------------------------------------------------------------------------------- record
 
     def fields(self, world):
-        fields = {"delta": mi.Bool}
+        fields = {"delta": mi.Bool} | ({"black": mi.Bool} if world.contents.glossy else {})
         if world.contents.delta:
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
@@ -200,7 +201,7 @@ class Surface(Scattering):
         return fields | ({"pdf": mi.Float} if self.guides else {})
 
     def record(self, step):
-        return vars(step)
+        return vars(step) | {"black": is_black(step.weight)}
 
     # ----------------------------------------------------------------------------------------------- attached
 
@@ -242,7 +243,12 @@ class Surface(Scattering):
             J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
-        inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
+        counts = smooth & (pdf > 0)
+        if world.contents.glossy:
+            # Some BSDFs throw samples away (the facet that was drawn mirrors to behind the surface): their weight is
+            # zero, though other lobes have a value and a density there.
+            counts &= ~r["black"] | is_black(towards.value)
+        inv_pdf = dr.select(counts, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
@@ -267,3 +273,8 @@ class Surface(Scattering):
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
         )
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
+
+
+def is_black(weight):
+    """Whether scattering by ``weight`` leaves nothing of the light."""
+    return dr.max(dr.detach(mi.unpolarized_spectrum(weight))) == 0
