@@ -5,7 +5,9 @@ through whichever integrator, sensor, copy or call values came in.
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
+import weakref
 
 import mitsuba as mi
 import numpy as np
@@ -210,3 +212,18 @@ def test_renderers_with_and_without_parameters_share_a_clock():
     bins = out.transient.double().sum((0, 2, 3))
     centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
     assert float(bins @ centers / bins.sum()) == pytest.approx(moved, abs=0.02)
+
+
+def test_a_film_on_the_only_shape_is_freed():
+    """The film keeps what the scene was like, and the shape keeps the film."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    meter = square(0, 0) | {"to_world": mi.ScalarTransform4f(), "meter": {"type": "irradiancemeter", "film": film()}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "transient_path"}, "meter": meter})
+    mi.traverse(scene)
+    scene.integrator().render(scene, spp=1)
+    gone = weakref.ref(scene.sensors()[0].film())
+    assert gone() is not None
+    del scene
+    gc.collect()
+    assert gone() is None

@@ -25,13 +25,14 @@ from torchtransient.plugins.sampling.distant import distant_reference
 
 class DescribedScene:
     """``reference``: the sphere around a scene as described. Told from other scenes by the addresses of the scene and
-    of its shapes; one shape is kept, so that no later scene can be taken for this one because it got the same ones.
+    of its shapes; one shape is kept, so that no later scene can be taken for this one because it got the same ones:
+    none that carries a sensor, whose film may keep this, and neither would ever be freed.
     """
 
     def __init__(self, scene: Any) -> None:
         self.reference = distant_reference(scene)
         self._key = _key_of(scene)
-        self._kept = scene.shapes()[:1]
+        self._kept = [shape for shape in scene.shapes() if not shape.is_sensor()][:1]
         self.is_finite = False
 
     def is_of(self, scene: Any) -> bool:

@@ -23,6 +23,8 @@ class SeenScene:
         self._described = described(scene, integrator)
         check_scene(scene, known=self._described)
         self.reference: DistantReference = self._described.reference
+        # So that no later scene can be taken for this one because it got the same addresses.
+        self._kept = scene.shapes()[:1]
         self._plugins: tuple[int, ...] = ()
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
