@@ -41,7 +41,7 @@ def test_a_stretch_begins_where_the_vertex_before_moves(follows):
     if follows == "ray":
         moved.o = start
     media = Media()
-    media.settings = Local(open_boundaries=False)
+    media.settings = Local(open_boundaries=False, surfaces=None)
     v = Local(t=mi.Float(0.25 * length), scatter=mi.Bool(True), pi=scene.ray_intersect_preliminary(ray), entry=None)
     t, stretch = media._attached_distance(v, Local(x=start), moved, Local(geometry=True))
     from_origin = dr.dot(moved(t) - ray.o, ray.d)
