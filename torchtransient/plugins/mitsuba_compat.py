@@ -81,6 +81,21 @@ def is_sphere(shape: Any) -> bool:
     return bool(shape.class_name() == "Sphere")
 
 
+# Their normal is the same everywhere.
+_FLAT = ("Rectangle", "Disk")
+
+
+def is_patterned(emitter: Any) -> bool:
+    """Whether the light that leaves a surface in a given direction differs from place to place: a texture, or what
+    counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
+    """
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+        return False
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+        return True
+    return emitter.class_name() != "AreaLight" and emitter.get_shape().class_name() not in _FLAT
+
+
 def bounds_of(shape: Any) -> Any:
     """The bounding box of a shape. Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's
     bounds lack it.

@@ -8,11 +8,15 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_sphere, is_two_sided
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_patterned, is_sphere, is_two_sided
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.media_contents import media_of
+
+
+# Points nearer than this share of the scene's radius slide along with the vertex that sees them, see `geometry_terms`.
+DAMPING = 0.01
 
 
 class SceneContents:
@@ -40,6 +44,8 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
+        self.damping_radius = DAMPING * max(1e-30, reference.radius)
+        self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:

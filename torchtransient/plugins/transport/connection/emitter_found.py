@@ -14,10 +14,11 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
-    direction_to,
+    displacement,
     distance,
     material_point,
-    solid_angle_over_area,
+    slid_point,
+    turned,
 )
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
 
@@ -93,10 +94,18 @@ class EmitterFound(Connection):
             if (claimed := self._claimed(world, hit.emitter(world.scene), wanted)) is not None:
                 lit &= ~claimed
         light, area = material_point(following.pi, following.ray, lit)
-        out = direction_to(si.p, light.p, lit, mi.Vector3f(following.ray.d))
-        light.wi = dr.select(lit, light.to_local(-out), dr.detach(light.wi))
-        J = dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, lit))
-        J *= dr.relative_grad(dr.select(lit, area, 1))
+        fixed = dr.detach(light)
+        δ = displacement(si.p, lit) - displacement(light.p, lit)
+        d, r = mi.Vector3f(following.ray.d), dr.detach(distance(si.p, light.p, lit))
+        turn = turned(δ, d, r, fixed.n, lit, world.contents.damping_radius)
+        J = turn.J * turn.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
+        light.p = light.p + turn.slide(fixed.n)
+        if world.contents.patterned_lights:
+            slid = slid_point(following.pi, following.ray, turn.drag, lit)
+            light.uv = light.uv + displacement(slid.uv, lit)
+            light.sh_frame.n = light.sh_frame.n + displacement(slid.sh_frame.n, lit)
+        out = turn.d
+        light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
         towards = world.scattering.evaluate(world, vertex, out, lit)
         Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))
         value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * J * mis) * Le

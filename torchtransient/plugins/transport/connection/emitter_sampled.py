@@ -8,10 +8,11 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
-    direction_to,
+    displacement,
     distance,
     material_point,
-    solid_angle_over_area,
+    slid_point,
+    turned,
 )
 from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
@@ -83,9 +84,7 @@ class EmitterSampled(Connection):
         r = v.of(self.name)
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
-        d = mi.Vector3f(light.ds.d)
-        if wanted.geometry:
-            d = direction_to(si.p, light.p, light.near, d)
+        d = self._turn(world, si, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
         pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
@@ -114,7 +113,8 @@ class EmitterSampled(Connection):
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
-        light.p, light.n, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Float(1)
+        light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
+        light.found = None
         light.cone, light.cone_weight = mi.Bool(False), None
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
@@ -130,28 +130,55 @@ class EmitterSampled(Connection):
         return light
 
     @staticmethod
-    def _follow_shape(world, si, light):
+    def _found(world, si, light):
+        """(the ray to the point of a light, its intersection, where it finds the light): what knows the shape."""
+        if light.found is None:
+            with dr.suspend_grad():
+                ray = dr.detach(si).spawn_ray(light.ds.d)
+                pi = world.segment.next_surface(world, ray, light.surface)
+                there = light.surface & pi.is_valid()
+                found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+                light.found = ray, pi, there & (found.emitter(world.scene) == light.ds.emitter)
+        return light.found
+
+    def _follow_shape(self, world, si, light):
         """Make the point a material one of the light's shape."""
-        ray = dr.detach(si).spawn_ray(light.ds.d)
-        with dr.suspend_grad():
-            pi = world.segment.next_surface(world, ray, light.surface)
-        found, area = material_point(pi, ray, light.surface & pi.is_valid())
-        there = light.surface & pi.is_valid() & (dr.detach(found).emitter(world.scene) == light.ds.emitter)
+        ray, pi, there = self._found(world, si, light)
+        found, area = material_point(pi, ray, there)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
         light.area = dr.relative_grad(dr.select(there, area, 1))
+
+    def _turn(self, world, si, light, wanted):
+        """The attached direction towards the point of a light, which slides like any other one that is near: points
+        that are found must move as those that are sampled.
+        """
+        ds, near, on_surface = light.ds, light.near, light.surface
+        δ = displacement(si.p, near) - displacement(light.p, near)
+        turn = turned(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, world.contents.damping_radius, ~on_surface)
+        light.J = turn.J
+        if wanted.emitter_shape:
+            light.J = light.J * turn.of_material(light.n, light.area)
+        light.J = dr.select(on_surface, light.J, 1)
+        light.p = light.p + dr.select(on_surface, turn.slide(ds.n), 0)
+        if world.contents.patterned_lights:
+            ray, pi, there = self._found(world, si, light)
+            slid = slid_point(pi, ray, turn.drag, there)
+            light.uv = light.uv + displacement(slid.uv, there)
+            light.n = light.n + displacement(slid.n, there)
+        return turn.d
 
     @staticmethod
     def _emission(world, si, light, d, lit, wanted):
         """Emission over density, with the derivative of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
         if wanted.geometry:
-            ds.p, ds.n, ds.d = light.p, light.n, d
+            ds.p, ds.n, ds.uv, ds.d = light.p, light.n, light.uv, d
             ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))
         inv_pdf = dr.select(light.ds.pdf > 0, dr.rcp(light.ds.pdf), 0)
         value = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
         if wanted.geometry:
-            value *= dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, light.surface)) * light.area
+            value *= light.J
         if wanted.sphere_lights:
             value = dr.select(light.cone, mi.unpolarized_spectrum(light.cone_weight), value)
         return dr.replace_grad(light.weight, value)

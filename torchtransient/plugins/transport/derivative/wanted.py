@@ -39,11 +39,11 @@ class Wanted:
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
         if self.geometry:
-            self.carried += ("slope", "w")
+            self.carried += ("slope", "w", "o")
         if self.geometry and contents.media is not None:
             self.carried += ("x",)
         if self.ray:
-            self.carried += ("o", "d")
+            self.carried += ("d",)
         if self.index:
             self.carried += ("η",)
         if contents.media is not None:
