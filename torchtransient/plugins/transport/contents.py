@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
@@ -15,8 +16,10 @@ from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.media_contents import media_of
 
 
-# Points nearer than this share of the scene's radius slide along with the vertex that sees them, see `geometry_terms`.
-DAMPING = 0.01
+# Derivatives let points slide along with the vertex that sees them where they are nearer than this share of the scene's
+# radius and of the path's first segment. Creases and edges so near are not followed: it is as small as the variance in
+# gaps of a millimetre allows.
+DAMPING = 0.005
 
 
 class SceneContents:
@@ -26,8 +29,9 @@ class SceneContents:
     groups. ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the transmissive rough BSDFs,
     which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
-    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere. Tables and
-    media are None where the scene has no such thing.
+    participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere.
+    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.turned`. ``patterned_lights``: what leaves some
+    surface differs from place to place. Tables and media are None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -44,7 +48,7 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
-        self.damping_radius = DAMPING * max(1e-30, reference.radius)
+        self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
         self._built = True
 

@@ -97,7 +97,7 @@ class EmitterFound(Connection):
         fixed = dr.detach(light)
         δ = displacement(si.p, lit) - displacement(light.p, lit)
         d, r = mi.Vector3f(following.ray.d), dr.detach(distance(si.p, light.p, lit))
-        turn = turned(δ, d, r, fixed.n, lit, world.contents.damping_radius)
+        turn = turned(δ, d, r, fixed.n, lit, vertex.damping_radius)
         J = turn.J * turn.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
         light.p = light.p + turn.slide(fixed.n)
         if world.contents.patterned_lights:

@@ -84,7 +84,7 @@ class EmitterSampled(Connection):
         r = v.of(self.name)
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
-        d = self._turn(world, si, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
+        d = self._turn(world, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
         pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
@@ -149,13 +149,13 @@ class EmitterSampled(Connection):
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
         light.area = dr.relative_grad(dr.select(there, area, 1))
 
-    def _turn(self, world, si, light, wanted):
+    def _turn(self, world, vertex, light, wanted):
         """The attached direction towards the point of a light, which slides like any other one that is near: points
         that are found must move as those that are sampled.
         """
-        ds, near, on_surface = light.ds, light.near, light.surface
+        si, ds, near, on_surface = vertex.scattered_si, light.ds, light.near, light.surface
         δ = displacement(si.p, near) - displacement(light.p, near)
-        turn = turned(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, world.contents.damping_radius, ~on_surface)
+        turn = turned(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, vertex.damping_radius, ~on_surface)
         light.J = turn.J
         if wanted.emitter_shape:
             light.J = light.J * turn.of_material(light.n, light.area)

@@ -37,7 +37,8 @@ class AttachedVertex(Local):
     """A recorded vertex with derivatives.
 
     ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
-    at the vertex), ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``,
+    at the vertex), ``slope`` (zero with the derivative of the optical length up to it), ``damping_radius`` (with
+    geometry: points nearer than that slide along). The scattering adds ``bsdf``,
     ``delay``, ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and
     ``scattered_opl`` (behind its delay) and ``rotation``.
     """

@@ -85,9 +85,10 @@ def turned(δ, d, r, n, active, radius, nailed=None):
     near = r < radius
     if nailed is not None:
         near &= ~nailed
-    s = dr.select(near, r * (1 / radius), 1)
+    inv_radius = dr.select(near, dr.rcp(radius), 0)
+    s = dr.select(near, r * inv_radius, 1)
     s2 = dr.square(s)
-    scale = dr.select(active & (r > 0), dr.select(near, s * (1 / radius), dr.rcp(r)), 0)
+    scale = dr.select(active & (r > 0), dr.select(near, s * inv_radius, dr.rcp(r)), 0)
     W, slope = (2 - s2) * scale, (2 - 3 * s2) * scale
     if nailed is not None:
         slope = dr.select(nailed, 0, slope)

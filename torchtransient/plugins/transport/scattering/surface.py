@@ -229,7 +229,7 @@ class Surface(Scattering):
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
             r = dr.norm(following.p - dr.detach(si.p))
-            volume, radius = world.segment.has_no_normal(following), world.contents.damping_radius
+            volume, radius = world.segment.has_no_normal(following), vertex.damping_radius
             turn = turned(displacement(si.p, ahead), out, r, following.n, ahead, radius, volume)
             out, J, drag = turn.d, turn.J, turn.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)

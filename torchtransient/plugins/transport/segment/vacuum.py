@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
 from torchtransient.plugins.transport.strategy import Segment, Vertex
 
@@ -119,6 +120,9 @@ class Vacuum(Segment):
         valid = vertex.sid.is_valid()
         vertex.end = VertexEnd(vertex.sid.p, vertex.sid.n, v.ray.d, valid)
         if wanted.geometry:
+            # Of what the path sees first, too: a floor without end says nothing of the things that stand on it.
+            first = v.first(self.name, "t") * DAMPING
+            vertex.damping_radius = dr.minimum(world.contents.damping_radius, first)
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
             length = length_to(world.contents, ray.o, si.p, valid, ray.d)
             if world.camera_unwarp:
