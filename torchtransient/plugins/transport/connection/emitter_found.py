@@ -96,7 +96,7 @@ class EmitterFound(Connection):
         light, area = material_point(following.pi, following.ray, lit)
         fixed = dr.detach(light)
         δ = displacement(si.p, lit) - displacement(light.p, lit)
-        d, r = mi.Vector3f(following.ray.d), dr.detach(distance(si.p, light.p, lit))
+        d, r = mi.Vector3f(following.ray.d), dr.norm(fixed.p - following.ray.o)
         turn = turned(δ, d, r, fixed.n, lit, vertex.damping_radius)
         J = turn.J * turn.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
         light.p = light.p + turn.slide(fixed.n)

@@ -228,10 +228,11 @@ class Surface(Scattering):
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            r = dr.norm(following.p - dr.detach(si.p))
+            # The ray starts a little off the surface: in a gap of a millimetre that matters.
+            far = dr.norm(following.p - vertex.sid.spawn_ray(following.d).o)
             volume, radius = world.segment.has_no_normal(following), vertex.damping_radius
-            turn = turned(displacement(si.p, ahead), out, r, following.n, ahead, radius, volume)
-            out, J, drag = turn.d, turn.J, turn.drag
+            turn = turned(displacement(si.p, ahead), out, far, following.n, ahead, radius, volume)
+            out, J, drag, slide = turn.d, turn.J, turn.drag, turn.slide(following.n)
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
@@ -252,8 +253,11 @@ class Surface(Scattering):
         η = dr.select(v.goes_on, vertex.carry.η * eta, 0)
         slope = vertex.scattered_slope
         if wanted.geometry:
-            # What the other end adds when it moves or slides is counted where it is attached.
-            length = dr.select(smooth, length_to(world.contents, si.p, following.p, following.valid, following.d), 0)
+            # What the other end adds when it moves or slides is counted where it is attached, along the ray: the length
+            # is that between hit points.
+            q = following.p + slide
+            length = length_to(world.contents, si.p, q, following.valid, following.d) - dr.dot(slide, following.d)
+            length = dr.select(smooth, length, 0)
             slope = slope + slope_only(dr.detach(η) * length)
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w

@@ -1,0 +1,143 @@
+"""Gradient cases with segments of some millimetres: gaps between plates, lights on a wall, corners. Points so near slide
+along with the vertex that sees them.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from support.gradient_cases.problem import Case
+from support.gradient_cases.scenes import camera, transform
+from support.gradient_cases.unknowns import move, move_vertices, rotate, stretch
+
+GAP = 5e-3
+DIFFUSE = {"type": "diffuse", "reflectance": 0.6}
+# Lets light through to every side, so that a gap can be seen and lit without an edge in it.
+PAPER = {"type": "principledthin", "base_color": 0.8, "diff_trans": 1.2, "roughness": 1.0, "spec_trans": 0.0}
+
+
+def scene_of(depth=4, integrator="transient_path", **parts):
+    """Shapes under a point light, unless they bring a ``light`` of their own."""
+    light = {"type": "point", "position": [0.5, 0.2, 4], "intensity": 10.0}
+    integrator = {"type": integrator, "max_depth": depth, "rr_depth": 100}
+    return {"type": "scene", "integrator": integrator, "light": light, **parts}
+
+
+def plane(pose, bsdf=None, **more):
+    return {"type": "rectangle", "to_world": pose.scale(2), "bsdf": bsdf or DIFFUSE, **more}
+
+
+def plates(wall=DIFFUSE, plate=PAPER, **arguments):
+    """A sheet of paper before a wall."""
+    near = plane(transform().translate([0, 0, GAP]), plate)
+    return scene_of(sensor=camera(fov=8.0), wall=plane(transform(), wall), plate=near, **arguments)
+
+
+def tilted():
+    """Plates, of which one turns about an axis beside the view."""
+    scene = plates()
+    scene["wall"]["to_world"] = transform().translate([0.5, 0, 0]).scale(2)
+    return scene
+
+
+def lamp(shape="rectangle", bsdf=PAPER, radiance=5.0, kind="area", pose=None, **arguments):
+    """A lamp behind a sheet of paper, wider than what is seen of it."""
+    pose = pose or transform().translate([0.05, 0.03, -GAP]).scale(0.3)
+    light = {"type": shape, "to_world": pose, "emitter": {"type": kind, "radiance": radiance, **arguments}}
+    view = camera(fov=4.0, start=3.5, bins=100, width=0.01)
+    return scene_of(3, sensor=view, wall=plane(transform(), bsdf), light=light)
+
+
+def stripes():
+    """Radiance that changes from place to place."""
+    u = np.linspace(0, 2 * np.pi, 16, endpoint=False, dtype=np.float32)
+    pixels = 5 + 4 * np.sin(u)[None, :, None] * np.ones((16, 1, 1), dtype=np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+
+
+def tube(**arguments):
+    """A lamp in the shape of a wide tube that nearly touches the paper along a line."""
+    pose = transform().translate([0.05, 0, -GAP - 0.3]).scale([0.3, 1, 0.3]).rotate([1, 0, 0], -90)
+    pose = pose.translate([0, 0, -0.5])
+    return lamp("cylinder", pose=pose, **arguments)
+
+
+def corner(**arguments):
+    """The moving wall close above the floor."""
+    pose = transform().look_at([3, 0, 1.5 * GAP], [0, 0, 1.5 * GAP], [0, 0, 1])
+    view = camera(fov=2 * float(np.degrees(np.arctan(GAP / 6))), start=3.5) | {"to_world": pose}
+    wall = plane(transform().rotate([0, 1, 0], 90))
+    light = {"type": "point", "position": [1.0, 0.2, 1.0], "intensity": 10.0}
+    return scene_of(sensor=view, wall=wall, floor=plane(transform()), light=light, **arguments)
+
+
+def curved():
+    """A ball that nearly touches the wall, lit through the paper before both."""
+    scene = plates()
+    scene["ball"] = {"type": "sphere", "center": [0, 0, -3 - GAP], "radius": 3.0, "bsdf": DIFFUSE}
+    scene["wall"]["bsdf"] = PAPER
+    return scene
+
+
+def smooth_mesh():
+    """A block with normals at its vertices instead of the paper's far wall."""
+    scene = plates()
+    pose = transform().translate([0, 0, -0.1 - GAP]).scale([2, 2, 0.1])
+    scene["block"] = {"type": "cube", "to_world": pose, "bsdf": DIFFUSE}
+    scene["wall"]["bsdf"] = PAPER
+    return scene
+
+
+def in_fog():
+    """The gap and all around it filled with a thin medium."""
+    scene = plates(integrator="transient_prbvolpath")
+    scene["fog"] = {"type": "homogeneous", "sigma_t": 0.1, "albedo": 0.7}
+    fog = {"type": "ref", "id": "fog"}
+    scene["sensor"]["medium"] = fog
+    for name in ("wall", "plate"):
+        scene[name]["interior"] = scene[name]["exterior"] = fog
+    return scene
+
+
+def with_mirror():
+    """A delta lobe in the scene: rays themselves are handed on."""
+    return plates(plate={"type": "mask", "opacity": 0.8, "nested": PAPER})
+
+
+AWAY = move("wall.to_world", (0, 0, 1))
+LAMP = move("light.to_world", (0.3, 0.1, 1))
+ROW, LIGHT = "shape to_world", "area light shape"
+STEP = GAP / 10
+
+
+def gap(name, scene, apply=AWAY, row=ROW, **more):
+    """A case of two surfaces that nearly touch."""
+    settings = {"value": 0.0, "step": STEP, "spp": 2048, "fd_spp": 8192} | more
+    return Case(f"gap_{name}", row, scene, apply, **settings)
+
+
+CASES = [
+    gap("plates", plates),
+    gap("plates_tilt", tilted, rotate("wall.to_world", (0, 1, 0)), step=0.02),
+    gap("corner", corner, move("wall.to_world", (1, 0, 0))),
+    gap("corner_floor", corner, move("floor.to_world", (0, 0, 1))),
+    gap("ball", curved),
+    gap("block", smooth_mesh),
+    gap("fog", in_fog),
+    gap("through_a_mask", with_mirror),
+    gap("polarized", lambda: plates({"type": "pplastic", "alpha": 0.4, "diffuse_reflectance": 0.6}), variant="llvm_ad_mono_polarized"),
+    gap("lamp", lamp),
+    gap("lamp_with_stripes", lambda: lamp(radiance=stripes())),
+    gap("lamp_with_a_cone", lambda: lamp(kind="angulararea", cutoff_angle=80.0, beam_width=5.0)),
+    gap("disk_lamp", lambda: lamp("disk")),
+    gap("tube", tube),
+    gap("tube_with_a_cone", lambda: tube(kind="angulararea", cutoff_angle=80.0, beam_width=5.0)),
+    gap("tube_with_stripes", lambda: tube(radiance=stripes())),
+    gap("lamp_moves", lamp, LAMP, LIGHT),
+    gap("lamp_with_stripes_moves", lambda: lamp(radiance=stripes()), LAMP, LIGHT),
+    gap("lamp_tilts", lamp, rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
+    gap("lamp_scales", lamp, stretch("light.to_world"), LIGHT, value=1.0, step=0.01),
+    gap("tube_moves", tube, LAMP, LIGHT),
+    gap("tube_with_a_cone_tilts", lambda: tube(kind="angulararea", cutoff_angle=80.0, beam_width=5.0), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
+]
