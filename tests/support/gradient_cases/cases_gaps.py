@@ -24,8 +24,8 @@ def scene_of(depth=4, integrator="transient_path", **parts):
     return {"type": "scene", "integrator": integrator, "light": light, **parts}
 
 
-def plane(pose, bsdf=None, **more):
-    return {"type": "rectangle", "to_world": pose.scale(2), "bsdf": bsdf or DIFFUSE, **more}
+def plane(pose, bsdf=None, size=2, **more):
+    return {"type": "rectangle", "to_world": pose.scale(size), "bsdf": bsdf or DIFFUSE, **more}
 
 
 def plates(wall=DIFFUSE, plate=PAPER, **arguments):
@@ -64,12 +64,12 @@ def tube(**arguments):
 
 
 def corner(**arguments):
-    """The moving wall close above the floor."""
+    """The wall close above the floor. Both end far away: their edges would be silhouettes when the floor moves."""
     pose = transform().look_at([3, 0, 1.5 * GAP], [0, 0, 1.5 * GAP], [0, 0, 1])
     view = camera(fov=2 * float(np.degrees(np.arctan(GAP / 6))), start=3.5) | {"to_world": pose}
-    wall = plane(transform().rotate([0, 1, 0], 90))
+    wall, floor = plane(transform().rotate([0, 1, 0], 90), size=50), plane(transform(), size=50)
     light = {"type": "point", "position": [1.0, 0.2, 1.0], "intensity": 10.0}
-    return scene_of(sensor=view, wall=wall, floor=plane(transform()), light=light, **arguments)
+    return scene_of(sensor=view, wall=wall, floor=floor, light=light, **arguments)
 
 
 def curved():
