@@ -1,5 +1,6 @@
-"""Gradient cases with segments of some millimetres: gaps between plates, lights on a wall, corners. Points so near slide
-along with the vertex that sees them.
+"""Gradient cases with segments of some millimetres: gaps between plates, lights on a wall, corners.
+
+Points so near slide along with the vertex that sees them.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ import numpy as np
 
 from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import camera, transform
-from support.gradient_cases.unknowns import move, move_vertices, rotate, stretch
+from support.gradient_cases.unknowns import move, rotate, stretch
 
 GAP = 5e-3
 DIFFUSE = {"type": "diffuse", "reflectance": 0.6}
 # Lets light through to every side, so that a gap can be seen and lit without an edge in it.
 PAPER = {"type": "principledthin", "base_color": 0.8, "diff_trans": 1.2, "roughness": 1.0, "spec_trans": 0.0}
+PLASTIC = {"type": "pplastic", "alpha": 0.4, "diffuse_reflectance": 0.6}
+CONE = {"kind": "angulararea", "cutoff_angle": 80.0, "beam_width": 5.0}
 
 
 def scene_of(depth=4, integrator="transient_path", **parts):
@@ -126,18 +129,18 @@ CASES = [
     gap("block", smooth_mesh),
     gap("fog", in_fog),
     gap("through_a_mask", with_mirror),
-    gap("polarized", lambda: plates({"type": "pplastic", "alpha": 0.4, "diffuse_reflectance": 0.6}), variant="llvm_ad_mono_polarized"),
+    gap("polarized", lambda: plates(PLASTIC), variant="llvm_ad_mono_polarized"),
     gap("lamp", lamp),
     gap("lamp_with_stripes", lambda: lamp(radiance=stripes())),
-    gap("lamp_with_a_cone", lambda: lamp(kind="angulararea", cutoff_angle=80.0, beam_width=5.0)),
+    gap("lamp_with_a_cone", lambda: lamp(**CONE)),
     gap("disk_lamp", lambda: lamp("disk")),
     gap("tube", tube),
-    gap("tube_with_a_cone", lambda: tube(kind="angulararea", cutoff_angle=80.0, beam_width=5.0)),
+    gap("tube_with_a_cone", lambda: tube(**CONE)),
     gap("tube_with_stripes", lambda: tube(radiance=stripes())),
     gap("lamp_moves", lamp, LAMP, LIGHT),
     gap("lamp_with_stripes_moves", lambda: lamp(radiance=stripes()), LAMP, LIGHT),
     gap("lamp_tilts", lamp, rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
     gap("lamp_scales", lamp, stretch("light.to_world"), LIGHT, value=1.0, step=0.01),
     gap("tube_moves", tube, LAMP, LIGHT),
-    gap("tube_with_a_cone_tilts", lambda: tube(kind="angulararea", cutoff_angle=80.0, beam_width=5.0), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
+    gap("tube_with_a_cone_tilts", lambda: tube(**CONE), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
 ]

@@ -9,12 +9,17 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_instance, is_patterned, is_sphere, is_two_sided
+from torchtransient.plugins.mitsuba_compat import (
+    hides_lobe_probability,
+    is_instance,
+    is_patterned,
+    is_sphere,
+    is_two_sided,
+)
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.media_contents import media_of
-
 
 # Derivatives let points slide along with the vertex that sees them where they are nearer than this share of the scene's
 # radius and of the path's first segment. Creases and edges so near are not followed: it is as small as the variance in
@@ -30,8 +35,8 @@ class SceneContents:
     which have an index. ``delays``: the BSDFs that scatter late. ``two_sided``: the two-sided BSDFs in polarized
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere.
-    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.turned`. ``patterned_lights``: what leaves some
-    surface differs from place to place. Tables and media are None where the scene has no such thing.
+    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
+    some surface differs from place to place. Tables and media are None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """

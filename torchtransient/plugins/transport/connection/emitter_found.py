@@ -14,11 +14,11 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
+    damped_motion,
     displacement,
     distance,
     material_point,
     slid_point,
-    turned,
 )
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
 
@@ -97,14 +97,14 @@ class EmitterFound(Connection):
         fixed = dr.detach(light)
         δ = displacement(si.p, lit) - displacement(light.p, lit)
         d, r = mi.Vector3f(following.ray.d), dr.norm(fixed.p - following.ray.o)
-        turn = turned(δ, d, r, fixed.n, lit, vertex.damping_radius)
-        J = turn.J * turn.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
-        light.p = light.p + turn.slide(fixed.n)
+        motion = damped_motion(δ, d, r, fixed.n, lit, vertex.damping_radius)
+        J = motion.J * motion.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
+        light.p = light.p + motion.slide(fixed.n)
         if world.contents.patterned_lights:
-            slid = slid_point(following.pi, following.ray, turn.drag, lit)
+            slid = slid_point(following.pi, following.ray, motion.drag, lit)
             light.uv = light.uv + displacement(slid.uv, lit)
             light.sh_frame.n = light.sh_frame.n + displacement(slid.sh_frame.n, lit)
-        out = turn.d
+        out = motion.d
         light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
         towards = world.scattering.evaluate(world, vertex, out, lit)
         Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))

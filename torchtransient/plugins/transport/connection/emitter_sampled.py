@@ -8,11 +8,11 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
+    damped_motion,
     displacement,
     distance,
     material_point,
     slid_point,
-    turned,
 )
 from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
@@ -84,7 +84,7 @@ class EmitterSampled(Connection):
         r = v.of(self.name)
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
-        d = self._turn(world, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
+        d = self._move(world, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
         pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
@@ -149,24 +149,24 @@ class EmitterSampled(Connection):
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
         light.area = dr.relative_grad(dr.select(there, area, 1))
 
-    def _turn(self, world, vertex, light, wanted):
+    def _move(self, world, vertex, light, wanted):
         """The attached direction towards the point of a light, which slides like any other one that is near: points
         that are found must move as those that are sampled.
         """
         si, ds, near, on_surface = vertex.scattered_si, light.ds, light.near, light.surface
         δ = displacement(si.p, near) - displacement(light.p, near)
-        turn = turned(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, vertex.damping_radius, ~on_surface)
-        light.J = turn.J
+        motion = damped_motion(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, vertex.damping_radius, ~on_surface)
+        light.J = motion.J
         if wanted.emitter_shape:
-            light.J = light.J * turn.of_material(light.n, light.area)
+            light.J = light.J * motion.of_material(light.n, light.area)
         light.J = dr.select(on_surface, light.J, 1)
-        light.p = light.p + dr.select(on_surface, turn.slide(ds.n), 0)
+        light.p = light.p + dr.select(on_surface, motion.slide(ds.n), 0)
         if world.contents.patterned_lights:
             ray, pi, there = self._found(world, si, light)
-            slid = slid_point(pi, ray, turn.drag, there)
+            slid = slid_point(pi, ray, motion.drag, there)
             light.uv = light.uv + displacement(slid.uv, there)
             light.n = light.n + displacement(slid.n, there)
-        return turn.d
+        return motion.d
 
     @staticmethod
     def _emission(world, si, light, d, lit, wanted):

@@ -38,9 +38,9 @@ class AttachedVertex(Local):
 
     ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
     at the vertex), ``slope`` (zero with the derivative of the optical length up to it), ``damping_radius`` (with
-    geometry: points nearer than that slide along). The scattering adds ``bsdf``,
-    ``delay``, ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and
-    ``scattered_opl`` (behind its delay) and ``rotation``.
+    geometry: points nearer than that slide along). The scattering adds ``bsdf``, ``delay``, ``scattered_si`` (``si``
+    with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind its delay) and
+    ``rotation``.
     """
 
 

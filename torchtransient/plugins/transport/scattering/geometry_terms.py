@@ -37,7 +37,6 @@ def material_point(pi, ray, active):
     return si, dr.norm(dr.cross(si.dp_du, si.dp_dv))
 
 
-
 def slid_point(pi, ray, drag, active):
     """Interaction that slides on its shape, held in place, as ``ray`` is shifted by ``drag``."""
     shifted = mi.Ray3f(ray)
@@ -51,9 +50,9 @@ def displacement(p, active):
     return dr.select(active, dr.replace_grad(zero, type(zero)(p)), zero)
 
 
-class Turned(Local):
-    """How the direction to a point follows its vertex: ``d`` (attached), ``J`` (one, with the derivative of the solid
-    angle), ``drag`` (zero, with how far the ray to the point is shifted sideways; the point slides on its surface).
+class DampedMotion(Local):
+    """How a connection to a point follows its vertex: direction ``d`` (attached), ``J`` (one, with the derivative of
+    the solid angle), ``drag`` (zero, with how far the ray to the point is shifted sideways).
     """
 
     def slide(self, n):
@@ -68,7 +67,7 @@ class Turned(Local):
         return 1 + self.stays * (area - 1 + turning)
 
 
-def turned(δ, d, r, n, active, radius, nailed=None):
+def damped_motion(δ, d, r, n, active, radius, nailed=None):
     """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``.
 
     Far away the point is nailed down: the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded
@@ -98,4 +97,4 @@ def turned(δ, d, r, n, active, radius, nailed=None):
     across = dr.select(active, δ - d * along, mi.Vector3f(0))
     J = 1 + dr.dot(δ, dr.select(active, slope * per_cos * n + (2 * W - slope) * d, mi.Vector3f(0)))
     stays = W * r
-    return Turned(d=d - W * across, J=J, drag=(1 - stays) * across, fixed=d, stays=stays, per_cos=per_cos)
+    return DampedMotion(d=d - W * across, J=J, drag=(1 - stays) * across, fixed=d, stays=stays, per_cos=per_cos)

@@ -16,7 +16,7 @@ from torchtransient.plugins.polarized import (
     scatter_unpolarized,
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement, turned
+from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement
 from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
@@ -231,8 +231,8 @@ class Surface(Scattering):
             # The ray starts a little off the surface: in a gap of a millimetre that matters.
             far = dr.norm(following.p - vertex.sid.spawn_ray(following.d).o)
             volume, radius = world.segment.has_no_normal(following), vertex.damping_radius
-            turn = turned(displacement(si.p, ahead), out, far, following.n, ahead, radius, volume)
-            out, J, drag, slide = turn.d, turn.J, turn.drag, turn.slide(following.n)
+            motion = damped_motion(displacement(si.p, ahead), out, far, following.n, ahead, radius, volume)
+            out, J, drag, slide = motion.d, motion.J, motion.drag, motion.slide(following.n)
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
