@@ -112,6 +112,5 @@ class EmitterFound(Connection):
         end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
         value = product(vertex.carry.β, dr.select(lit, value * T, 0))
-        length = step.carry.η * distance(si.p, light.p, lit)
-        slope = vertex.scattered_slope + slope_only(length)
+        slope = vertex.scattered_slope + slope_only(step.carry.η * distance(si.p, light.p, lit))
         return EventTerm(value=value, slope=slope, opl=following.τ, active=lit)

@@ -10,11 +10,9 @@ from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     damped_motion,
     displacement,
-    distance,
     material_point,
     slid_point,
 )
-from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
 
@@ -97,7 +95,7 @@ class EmitterSampled(Connection):
         value *= world.segment.attached_transmittance(world, vertex, end, lit)
         # Selected before the product: what an idle lane holds must not reach the adjoint of the throughput.
         value = product(vertex.carry.β, dr.select(lit, value, 0))
-        length = length_to(world.contents, si.p, light.p, light.near, d) * towards.eta
+        length = (self._length(world, si.p, light.ds) + light.longer) * towards.eta
         opl = vertex.scattered_opl + mi.Float64(dr.detach(length) * v.η)
         slope = vertex.scattered_slope
         if wanted.geometry:
@@ -114,7 +112,7 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
-        light.found = None
+        light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight = mi.Bool(False), None
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
@@ -161,6 +159,7 @@ class EmitterSampled(Connection):
             light.J = light.J * motion.of_material(light.n, light.area)
         light.J = dr.select(on_surface, light.J, 1)
         light.p = light.p + dr.select(on_surface, motion.slide(ds.n), 0)
+        light.longer = dr.select(near, motion.longer(ds.n), 0)
         if world.contents.patterned_lights:
             ray, pi, there = self._found(world, si, light)
             slid = slid_point(pi, ray, motion.drag, there)
@@ -173,8 +172,9 @@ class EmitterSampled(Connection):
         """Emission over density, with the derivative of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
         if wanted.geometry:
-            ds.p, ds.n, ds.uv, ds.d = light.p, light.n, light.uv, d
-            ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))
+            ds.d, ds.dist = d, light.ds.dist + light.longer
+            if wanted.emitter_shape or wanted.light or wanted.sphere_lights or world.contents.patterned_lights:
+                ds.p, ds.n, ds.uv = light.p, light.n, light.uv
         inv_pdf = dr.select(light.ds.pdf > 0, dr.rcp(light.ds.pdf), 0)
         value = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
         if wanted.geometry:

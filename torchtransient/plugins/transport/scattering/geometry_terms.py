@@ -59,6 +59,13 @@ class DampedMotion(Local):
         """Zero with the derivative of the point, on a surface with normal ``n``, held in place."""
         return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
 
+    def longer(self, n=None):
+        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` the slide of the point, too.
+        """
+        if n is None:
+            return -dr.dot(self.δ, self.fixed)
+        return -dr.dot(self.δ, self.stays * self.fixed + (1 - self.stays) * self.per_cos * n)
+
     def of_material(self, n, area):
         """The part of ``J`` that is due to the normal ``n`` and the element ``area`` (one, attached) of a material
         point: as far as it does not slide.
@@ -97,4 +104,5 @@ def damped_motion(δ, d, r, n, active, radius, nailed=None):
     across = dr.select(active, δ - d * along, mi.Vector3f(0))
     J = 1 + dr.dot(δ, dr.select(active, slope * per_cos * n + (2 * W - slope) * d, mi.Vector3f(0)))
     stays = W * r
-    return DampedMotion(d=d - W * across, J=J, drag=(1 - stays) * across, fixed=d, stays=stays, per_cos=per_cos)
+    drag = (1 - stays) * across
+    return DampedMotion(d=d - W * across, J=J, drag=drag, δ=δ, fixed=d, stays=stays, per_cos=per_cos)

@@ -17,7 +17,6 @@ from torchtransient.plugins.polarized import (
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement
-from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
 
@@ -228,11 +227,9 @@ class Surface(Scattering):
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            # The ray starts a little off the surface: in a gap of a millimetre that matters.
-            far = dr.norm(following.p - vertex.sid.spawn_ray(following.d).o)
-            volume, radius = world.segment.has_no_normal(following), vertex.damping_radius
-            motion = damped_motion(displacement(si.p, ahead), out, far, following.n, ahead, radius, volume)
-            out, J, drag, slide = motion.d, motion.J, motion.drag, motion.slide(following.n)
+            volume, δ = world.segment.has_no_normal(following), displacement(si.p, smooth)
+            motion = damped_motion(δ, out, following.t, following.n, ahead, vertex.damping_radius, volume)
+            out, J, drag = motion.d, motion.J, motion.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
@@ -253,12 +250,12 @@ class Surface(Scattering):
         η = dr.select(v.goes_on, vertex.carry.η * eta, 0)
         slope = vertex.scattered_slope
         if wanted.geometry:
-            # What the other end adds when it moves or slides is counted where it is attached, along the ray: the length
-            # is that between hit points.
-            q = following.p + slide
-            length = length_to(world.contents, si.p, q, following.valid, following.d) - dr.dot(slide, following.d)
-            length = dr.select(smooth, length, 0)
-            slope = slope + slope_only(dr.detach(η) * length)
+            # What the other end adds when it moves or slides is counted where it is attached.
+            longer = dr.select(ahead, motion.longer(), 0)
+            if world.contents.distant is not None:
+                far_away = slope_only(world.contents.distant.length(si.p, following.d))
+                longer = dr.select(smooth & ~ahead, far_away, longer)
+            slope = slope + dr.detach(η) * longer
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
         )

@@ -106,7 +106,7 @@ class Vacuum(Segment):
 
     def end(self, world, v):
         si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active)
-        return VertexEnd(si.p, si.n, v.ray.d, si.is_valid() & v.active)
+        return VertexEnd(si.t, si.n, v.ray.d, si.is_valid() & v.active)
 
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
@@ -118,13 +118,15 @@ class Vacuum(Segment):
         """The attached vertex at ``si``, behind the optical length of its segment."""
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
         valid = vertex.sid.is_valid()
-        vertex.end = VertexEnd(vertex.sid.p, vertex.sid.n, v.ray.d, valid)
+        vertex.end = VertexEnd(vertex.sid.t, vertex.sid.n, v.ray.d, valid)
         if wanted.geometry:
             # Of what the path sees first, too: a floor without end says nothing of the things that stand on it.
             first = v.first(self.name, "t") * DAMPING
             vertex.damping_radius = dr.minimum(world.contents.damping_radius, first)
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
-            length = length_to(world.contents, ray.o, si.p, valid, ray.d)
+            # Shifted sideways, a ray gets no longer.
+            origin = ray.o if wanted.ray else v.ray.o
+            length = length_to(world.contents, origin, si.p, valid, ray.d)
             if world.camera_unwarp:
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)
