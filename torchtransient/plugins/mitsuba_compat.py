@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 WRITTEN_AGAINST = "3.9.1"
 
@@ -83,6 +84,23 @@ def is_sphere(shape: Any) -> bool:
 
 # Their normal is the same everywhere.
 _FLAT = ("Rectangle", "Disk")
+# Meshes of more faces are not looked through.
+_LARGE_MESH = 10_000
+
+
+def is_flat(shape: Any) -> bool:
+    """Whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that it
+    merges them into have normals at their vertices: across the faces.
+    """
+    if not isinstance(shape, mi.Mesh):
+        return bool(shape.class_name() in _FLAT)
+    if not shape.has_vertex_normals():
+        return True
+    if shape.face_count() > _LARGE_MESH:
+        return False
+    corners = np.array(shape.faces_buffer()).reshape(-1, 3)
+    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)[corners]
+    return bool(np.ptp(normals, axis=1).max(initial=0) < 1e-5)
 
 
 def is_patterned(emitter: Any) -> bool:

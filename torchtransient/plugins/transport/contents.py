@@ -11,12 +11,13 @@ from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.mitsuba_compat import (
     hides_lobe_probability,
+    is_flat,
     is_instance,
     is_patterned,
     is_sphere,
     is_two_sided,
 )
-from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.media_contents import media_of
@@ -36,7 +37,8 @@ class SceneContents:
     variants. ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: some light is a sphere.
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
-    some surface differs from place to place. Tables and media are None where the scene has no such thing.
+    some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal. Tables
+    and media are None where the scene has no such thing.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -55,12 +57,22 @@ class SceneContents:
         self.sphere_lights = any(s.is_emitter() and is_sphere(s) for s in shapes)
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
+        self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in shapes)
+        self.patterned |= any(_is_patterned(bsdf) for bsdf in bsdfs_of_scene(scene))
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:
         if getattr(self, "_built", False):
             raise AttributeError(f"SceneContents does not change once built; tried to set {name!r}.")
         super().__setattr__(name, value)
+
+
+def _is_patterned(bsdf: Any) -> bool:
+    """Whether a BSDF may scatter otherwise at another place of a flat surface. What one of another library written in
+    Python asks for is not known.
+    """
+    own = type(bsdf).__module__.split(".")[0] in ("mitsuba", "torchtransient")
+    return not own or any(texture.is_spatially_varying() for texture in objects_below(bsdf, mi.Texture))
 
 
 def _two_sided(bsdfs: list[Any]) -> PointerTable | None:

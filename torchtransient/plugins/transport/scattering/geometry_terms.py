@@ -50,9 +50,18 @@ def displacement(p, active):
     return dr.select(active, dr.replace_grad(zero, type(zero)(p)), zero)
 
 
+def slide(drag, d, n, active):
+    """Where the point goes that a ray in direction ``d`` finds on a surface of normal ``n`` when it is shifted by
+    ``drag``, across its direction.
+    """
+    cos = dr.dot(n, d)
+    return drag - d * (dr.dot(n, drag) * dr.select(active & (cos != 0), dr.rcp(cos), 0))
+
+
 class DampedMotion(Local):
     """How a connection to a point follows its vertex: direction ``d`` (attached), ``J`` (one, with the derivative of
-    the solid angle), ``drag`` (zero, with how far the ray to the point is shifted sideways).
+    the solid angle), ``drag`` (zero, with how far the ray to the point is shifted
+    sideways).
     """
 
     def slide(self, n):
@@ -60,7 +69,7 @@ class DampedMotion(Local):
         return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
 
     def longer(self, n=None):
-        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` the slide of the point, too.
+        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point.
         """
         if n is None:
             return -dr.dot(self.δ, self.fixed)

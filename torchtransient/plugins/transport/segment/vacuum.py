@@ -9,6 +9,7 @@ from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement, slide
 from torchtransient.plugins.transport.strategy import Segment, Vertex
 
 # How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
@@ -110,8 +111,11 @@ class Vacuum(Segment):
 
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
-        ray.o, ray.d = carry.o, carry.d
+        if not wanted.plain:
+            ray.o, ray.d = carry.o, carry.d
         si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active)
+        if wanted.plain:  # an attached ray would have every shape differentiated
+            si.p = si.p + slide(displacement(carry.o, v.active), v.ray.d, dr.detach(si.n), v.active)
         return self.arrived(world, v, carry, ray, si, wanted)
 
     def arrived(self, world, v, carry, ray, si, wanted):
@@ -125,8 +129,8 @@ class Vacuum(Segment):
             vertex.damping_radius = dr.minimum(world.contents.damping_radius, first)
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
             # Shifted sideways, a ray gets no longer.
-            origin = ray.o if wanted.ray else v.ray.o
-            length = length_to(world.contents, origin, si.p, valid, ray.d)
+            o = ray.o if wanted.ray else v.ray.o
+            length = length_to(world.contents, o, si.p, valid, ray.d)
             if world.camera_unwarp:
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)
