@@ -437,6 +437,34 @@ def test_classes_of_shapes_and_sensors():
     assert [compat.is_instance(shape) for shape in scene.shapes()] == [True]
 
 
+def test_flat_shapes():
+    activate(RGB)
+    names = ("rectangle", "disk", "cube", "sphere", "cylinder")
+    flat = [compat.is_flat(mi.load_dict({"type": name})) for name in names]
+    assert flat == [True, True, True, False, False]
+    bent = mi.load_dict({"type": "cube"})
+    params = mi.traverse(bent)
+    params["vertex_normals"] = dr.ravel(dr.normalize(dr.unravel(mi.Point3f, params["vertex_positions"])))
+    params.update()
+    assert not compat.is_flat(bent)
+
+
+def test_patterned_lights():
+    activate(RGB)
+    board = {"type": "checkerboard"}
+
+    def light(shape, **emitter):
+        return compat.is_patterned(mi.load_dict({"type": shape, "emitter": emitter}).emitter())
+
+    assert not light("rectangle", type="area", radiance=1.0)
+    assert not light("cylinder", type="area", radiance=1.0)
+    assert light("rectangle", type="area", radiance=board)
+    assert not light("rectangle", type="angulararea", radiance=1.0)
+    assert light("rectangle", type="angulararea", radiance=board)
+    assert light("cylinder", type="angulararea", radiance=1.0)
+    assert not compat.is_patterned(mi.load_dict({"type": "point"}))
+
+
 BATCH = """
 import torchtransient  # finds an LLVM
 import drjit as dr, mitsuba as mi

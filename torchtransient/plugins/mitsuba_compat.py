@@ -13,6 +13,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.errors import SceneError
 
@@ -144,6 +145,38 @@ def leaves_hits_detached(shape: Any) -> bool:
     ray that moves.
     """
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
+
+
+# Their normal is the same everywhere.
+_FLAT = ("Rectangle", "Disk")
+# Meshes of more faces are not looked through.
+_LARGE_MESH = 10_000
+
+
+def is_flat(shape: Any) -> bool:
+    """Whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that it
+    merges them into have normals at their vertices: across the faces.
+    """
+    if not isinstance(shape, mi.Mesh):
+        return bool(shape.class_name() in _FLAT)
+    if not shape.has_vertex_normals():
+        return True
+    if shape.face_count() > _LARGE_MESH:
+        return False
+    corners = np.array(shape.faces_buffer()).reshape(-1, 3)
+    normals = np.array(shape.vertex_normals_buffer()).reshape(-1, 3)[corners]
+    return bool(np.ptp(normals, axis=1).max(initial=0) < 1e-5)
+
+
+def is_patterned(emitter: Any) -> bool:
+    """Whether the light that leaves a surface in a given direction differs from place to place: a texture, or what
+    counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
+    """
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+        return False
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+        return True
+    return emitter.class_name() != "AreaLight" and emitter.get_shape().class_name() not in _FLAT
 
 
 def bounds_of(shape: Any) -> Any:

@@ -39,6 +39,8 @@ class AngularAreaLight(mi.Emitter):
                 f"beam_width {self.beam_width} and cutoff_angle {self.cutoff_angle}."
             )
         self.m_flags = mi.EmitterFlags.Surface
+        if self.radiance.is_spatially_varying():
+            self.m_flags |= mi.EmitterFlags.SpatiallyVarying
 
     def traverse(self, cb: Any) -> None:
         super().traverse(cb)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_two_sided
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_flat, is_patterned, is_two_sided
 from torchtransient.plugins.mixtures import mixtures_of
-from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
@@ -19,6 +20,11 @@ from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import Instances
 from torchtransient.plugins.transport.media_contents import media_of
+
+# Derivatives let points slide along with the vertex that sees them where they are nearer than this share of the scene's
+# radius and of the path's first segment. Creases and edges so near are not followed: it is as small as the variance in
+# gaps of a millimetre allows.
+DAMPING = 0.005
 
 
 class SceneContents:
@@ -34,6 +40,9 @@ class SceneContents:
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). Tables, instances, surroundings, mixtures, media and lights are
     None where the scene has no such thing.
+
+    ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
+    some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -53,6 +62,10 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = SphereLights.of(scene)
+        self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
+        self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
+        self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
+        self.patterned |= any(_is_patterned(bsdf) for bsdf in outermost)
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
@@ -63,6 +76,14 @@ class SceneContents:
         if getattr(self, "_built", False):
             raise AttributeError(f"SceneContents does not change once built; tried to set {name!r}.")
         super().__setattr__(name, value)
+
+
+def _is_patterned(bsdf: Any) -> bool:
+    """Whether a BSDF may scatter otherwise at another place of a flat surface. What one of another library written in
+    Python asks for is not known.
+    """
+    own = type(bsdf).__module__.split(".")[0] in ("mitsuba", "torchtransient")
+    return not own or any(texture.is_spatially_varying() for texture in objects_below(bsdf, mi.Texture))
 
 
 def _two_sided(bsdfs: list[Any]) -> PointerTable | None:

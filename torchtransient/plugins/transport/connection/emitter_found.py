@@ -14,10 +14,11 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import first_column, product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
-    direction_to,
+    damped_motion,
+    displacement,
     distance,
     material_point,
-    solid_angle_over_area,
+    slid_point,
 )
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
 
@@ -96,16 +97,23 @@ class EmitterFound(Connection):
             if claimed is not None:
                 lit &= ~claimed
         light, area = material_point(following.pi, following.ray, lit)
-        out = direction_to(si.p, light.p, lit, mi.Vector3f(following.ray.d))
-        light.wi = dr.select(lit, light.to_local(-out), dr.detach(light.wi))
-        J = dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, lit))
-        J *= dr.relative_grad(dr.select(lit, area, 1))
+        fixed = dr.detach(light)
+        δ = displacement(si.p, lit) - displacement(light.p, lit)
+        d, r = mi.Vector3f(following.ray.d), dr.norm(fixed.p - following.ray.o)
+        motion = damped_motion(δ, d, r, fixed.n, lit, vertex.damping_radius)
+        J = motion.J * motion.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
+        light.p = light.p + motion.slide(fixed.n)
+        if world.contents.patterned_lights:
+            slid = slid_point(following.pi, following.ray, motion.drag, lit)
+            light.uv = light.uv + displacement(slid.uv, lit)
+            light.sh_frame.n = light.sh_frame.n + displacement(slid.sh_frame.n, lit)
+        out = motion.d
+        light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
         towards = world.scattering.evaluate(world, vertex, out, lit)
         Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))
         value = scatter_unpolarized(towards.value, vertex.rotation) * (step.inv_pdf * J * mis) * Le
         end = Local(p=light.p, d=following.ray.d, far=mi.Bool(False), ahead=True)
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
         value = product(vertex.carry.β, dr.select(lit, value * T, 0))
-        length = step.carry.η * distance(si.p, light.p, lit)
-        slope = vertex.scattered_slope + slope_only(length)
+        slope = vertex.scattered_slope + slope_only(step.carry.η * distance(si.p, light.p, lit))
         return EventTerm(value=value, slope=slope, opl=following.τ, active=lit)

@@ -9,12 +9,11 @@ from torchtransient.plugins.polarized import intensity, product, scatter_unpolar
 from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
-    direction_to,
-    distance,
+    damped_motion,
+    displacement,
     material_point,
-    solid_angle_over_area,
+    slid_point,
 )
-from torchtransient.plugins.transport.segment.vacuum import length_to
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
 
@@ -105,11 +104,9 @@ class EmitterSampled(Connection):
         r = v.of(self.name)
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
-        d = mi.Vector3f(light.ds.d)
+        d = self._move(world, vertex, light, wanted) if wanted.geometry else mi.Vector3f(light.ds.d)
         if self.sun is not None:
             d = self.sun.followed(d, light.sun)
-        if wanted.geometry:
-            d = direction_to(si.p, light.p, light.near, d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
         pdf = dr.select(light.ds.delta | light.cone | light.sun, 0, dr.detach(towards.pdf))
@@ -122,7 +119,7 @@ class EmitterSampled(Connection):
         value *= world.segment.attached_transmittance(world, vertex, end, lit)
         # Selected before the product: what an idle lane holds must not reach the adjoint of the throughput.
         value = product(vertex.carry.β, dr.select(lit, value, 0))
-        length = length_to(world.contents, si.p, light.p, light.near, d) * towards.eta
+        length = (self._length(world, si.p, light.ds) + light.longer) * towards.eta
         opl = vertex.scattered_opl + mi.Float64(dr.detach(length) * v.η)
         slope = vertex.scattered_slope
         if wanted.geometry:
@@ -139,6 +136,7 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
+        light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
         if self.sun is not None:
             light.sun = far & self.sun.contains(ds.d)
@@ -156,17 +154,45 @@ class EmitterSampled(Connection):
         return light
 
     @staticmethod
-    def _follow_shape(world, si, light):
+    def _found(world, si, light):
+        """(the ray to the point of a light, its intersection, where it finds the light): what knows the shape."""
+        if light.found is None:
+            with dr.suspend_grad():
+                ray = dr.detach(si).spawn_ray(light.ds.d)
+                pi = world.segment.next_surface(world, ray, light.surface)
+                there = light.surface & pi.is_valid()
+                found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+                light.found = ray, pi, there & (found.emitter(world.scene) == light.ds.emitter)
+        return light.found
+
+    def _follow_shape(self, world, si, light):
         """Make the point a material one of the light's shape."""
-        ray = dr.detach(si).spawn_ray(light.ds.d)
-        with dr.suspend_grad():
-            pi = world.segment.next_surface(world, ray, light.surface)
-        found, area = material_point(pi, ray, light.surface & pi.is_valid())
-        there = light.surface & pi.is_valid() & (dr.detach(found).emitter(world.scene) == light.ds.emitter)
+        ray, pi, there = self._found(world, si, light)
+        found, area = material_point(pi, ray, there)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
         light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
         light.area = dr.relative_grad(dr.select(there, area, 1))
+
+    def _move(self, world, vertex, light, wanted):
+        """The attached direction towards the point of a light, which slides like any other one that is near: points
+        that are found must move as those that are sampled.
+        """
+        si, ds, near, on_surface = vertex.scattered_si, light.ds, light.near, light.surface
+        δ = displacement(si.p, near) - displacement(light.p, near)
+        motion = damped_motion(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, vertex.damping_radius, ~on_surface)
+        light.J = motion.J
+        if wanted.emitter_shape:
+            light.J = light.J * motion.of_material(light.n, light.area)
+        light.J = dr.select(on_surface, light.J, 1)
+        light.p = light.p + dr.select(on_surface, motion.slide(ds.n), 0)
+        light.longer = dr.select(near, motion.longer(ds.n), 0)
+        if world.contents.patterned_lights:
+            ray, pi, there = self._found(world, si, light)
+            slid = slid_point(pi, ray, motion.drag, there)
+            light.uv = light.uv + displacement(slid.uv, there)
+            light.n = light.n + displacement(slid.n, there)
+        return motion.d
 
     @staticmethod
     def _emission(world, si, light, d, lit, wanted):
@@ -175,12 +201,13 @@ class EmitterSampled(Connection):
         if wanted.emitter_shape:  # a pattern that moves over the shape
             ds.uv = light.uv
         if wanted.geometry:
-            ds.p, ds.n, ds.d = light.p, light.n, d
-            ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))
+            ds.d, ds.dist = d, light.ds.dist + light.longer
+            if wanted.emitter_shape or wanted.light or wanted.sphere_lights or world.contents.patterned_lights:
+                ds.p, ds.n, ds.uv = light.p, light.n, light.uv
         inv_pdf = dr.select(light.ds.pdf > 0, dr.rcp(light.ds.pdf), 0)
         value = mi.unpolarized_spectrum(world.scene.eval_emitter_direction(si, ds, lit)) * inv_pdf
         if wanted.geometry:
-            value *= dr.relative_grad(solid_angle_over_area(si.p, light.p, light.n, light.surface)) * light.area
+            value *= light.J
         if wanted.sphere_lights:
             value = dr.select(light.cone, mi.unpolarized_spectrum(light.cone_weight), value)
         return dr.replace_grad(light.weight, value)

@@ -22,24 +22,25 @@ from torchtransient.plugins.transport.strategy import Local
 class VertexEnd:
     """Where a vertex lies, without derivatives: what the one before sees of it. Loop state of the reverse mode."""
 
-    p: Any      # Point3f
+    t: Any      # Float      distance along the ray that found it, which starts a little off the vertex before
     n: Any      # Normal3f   zero for points in a volume
-    d: Any      # Vector3f   direction of the ray that found it
+    d: Any      # Vector3f   direction of that ray
     valid: Any  # Bool       something was hit
 
     @staticmethod
     def nowhere() -> VertexEnd:
         """Behind the last vertex of a path."""
-        return VertexEnd(mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(False))
+        return VertexEnd(mi.Float(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(False))
 
 
 class AttachedVertex(Local):
     """A recorded vertex with derivatives.
 
     ``v`` (RecordedVertex), ``si`` (attached), ``sid`` (detached), ``end`` (VertexEnd), ``carry`` (with the throughput
-    at the vertex), ``slope`` (zero with the derivative of the optical length up to it). The scattering adds ``bsdf``,
-    ``delay``, ``scattered_si`` (``si`` with the wavelengths beyond the surface), ``scattered_slope`` and
-    ``scattered_opl`` (behind its delay) and ``rotation``.
+    at the vertex), ``slope`` (zero with the derivative of the optical length up to it), ``damping_radius`` (with
+    geometry: points nearer than that slide along). The scattering adds ``bsdf``, ``delay``, ``scattered_si`` (``si``
+    with the wavelengths beyond the surface), ``scattered_slope`` and ``scattered_opl`` (behind its delay) and
+    ``rotation``.
     """
 
 

@@ -17,8 +17,9 @@ class Wanted:
     ``geometry``: path lengths change. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun
     moves, or None. ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights
     are spheres. ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is
-    handed on, behind delta lobes or a sensor that moves. ``extinction``: that of a medium changes. ``carried``: the
-    fields of the :class:`~..carry.Carry` that derivatives go through.
+    handed on, behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but
+    its place changes. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry`
+    that derivatives go through.
 
     ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """
@@ -37,14 +38,16 @@ class Wanted:
         self.sensor |= any(node.ptr in carriers for node in moved("shape"))
         self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
+        bent = any(key.endswith(("vertex_normals", "vertex_positions")) for _, key, _ in effects)
+        self.plain = self.geometry and not (self.ray or bent or contents.patterned)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
         if self.geometry:
-            self.carried += ("slope", "w")
+            self.carried += ("slope", "w", "o")
         if self.geometry and contents.media is not None:
             self.carried += ("x",)
         if self.ray:
-            self.carried += ("o", "d")
+            self.carried += ("d",)
         if self.index:
             self.carried += ("η",)
         if contents.media is not None:

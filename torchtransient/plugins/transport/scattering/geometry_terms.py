@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.transport.strategy import Local
+
 
 def solid_angle_over_area(p, q, n, active, volume=None):
     """``|cos| / distance^2``, the solid angle at ``p`` of an area at ``q`` with normal ``n``; 1 where inactive. Where
@@ -33,3 +35,83 @@ def material_point(pi, ray, active):
     """Interaction that follows its shape, and the area element there (up to a constant)."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     return si, dr.norm(dr.cross(si.dp_du, si.dp_dv))
+
+
+def slid_point(pi, ray, drag, active):
+    """Interaction that slides on its shape, held in place, as ``ray`` is shifted by ``drag``."""
+    shifted = mi.Ray3f(ray)
+    shifted.o = shifted.o + dr.select(active, drag, 0)
+    return pi.compute_surface_interaction(shifted, mi.RayFlags.All | mi.RayFlags.DetachShape, active)
+
+
+def displacement(p, active):
+    """Zero with the derivative of the point or vector ``p`` where active."""
+    zero = dr.zeros(mi.Point2f if dr.size_v(p) == 2 else mi.Vector3f)
+    return dr.select(active, dr.replace_grad(zero, type(zero)(p)), zero)
+
+
+def slide(drag, d, n, active):
+    """Where the point goes that a ray in direction ``d`` finds on a surface of normal ``n`` when it is shifted by
+    ``drag``, across its direction.
+    """
+    cos = dr.dot(n, d)
+    return drag - d * (dr.dot(n, drag) * dr.select(active & (cos != 0), dr.rcp(cos), 0))
+
+
+class DampedMotion(Local):
+    """How a connection to a point follows its vertex: direction ``d`` (attached), ``J`` (one, with the derivative of
+    the solid angle), ``drag`` (zero, with how far the ray to the point is shifted
+    sideways).
+    """
+
+    def slide(self, n):
+        """Zero with the derivative of the point, on a surface with normal ``n``, held in place."""
+        return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
+
+    def longer(self, n=None):
+        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point.
+        """
+        if n is None:
+            return -dr.dot(self.δ, self.fixed)
+        return -dr.dot(self.δ, self.stays * self.fixed + (1 - self.stays) * self.per_cos * n)
+
+    def of_material(self, n, area):
+        """The part of ``J`` that is due to the normal ``n`` and the element ``area`` (one, attached) of a material
+        point: as far as it does not slide.
+        """
+        tilt = dr.dot(dr.replace_grad(mi.Vector3f(0), mi.Vector3f(n)), self.fixed) * self.per_cos
+        return 1 + self.stays * (area - 1 + tilt)
+
+
+def damped_motion(δ, d, r, n, active, radius, nailed=None):
+    """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``.
+
+    Far away the point is nailed down: the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded
+    variance. Nearer than ``radius`` the point slides along with the vertex by a share ``a``, and the direction moves by
+
+        -W δ_perp,    W = (1 - a) / r,    a = (1 - s^2)^2,    s = r / radius,
+
+    so that ``W`` and ``r W'`` are bounded and do not jump. The solid angle changes by the divergence of that field,
+
+        r W' (n.δ / n.d - d.δ) + 2 W d.δ.
+
+    ``nailed``: where the point never slides and the measure is no area: in a volume, or of a point light.
+    """
+    near = r < radius
+    if nailed is not None:
+        near &= ~nailed
+    inv_radius = dr.select(near, dr.rcp(radius), 0)
+    s = dr.select(near, r * inv_radius, 1)
+    s2 = dr.square(s)
+    scale = dr.select(active & (r > 0), dr.select(near, s * inv_radius, dr.rcp(r)), 0)
+    W, slope = (2 - s2) * scale, (2 - 3 * s2) * scale
+    if nailed is not None:
+        slope = dr.select(nailed, 0, slope)
+    cos = dr.dot(n, d)
+    per_cos = dr.select(active & (cos != 0), dr.rcp(cos), 0)
+    along = dr.dot(δ, d)
+    across = dr.select(active, δ - d * along, mi.Vector3f(0))
+    J = 1 + dr.dot(δ, dr.select(active, slope * per_cos * n + (2 * W - slope) * d, mi.Vector3f(0)))
+    stays = W * r
+    drag = (1 - stays) * across
+    return DampedMotion(d=d - W * across, J=J, drag=drag, δ=δ, fixed=d, stays=stays, per_cos=per_cos)

@@ -16,8 +16,7 @@ from torchtransient.plugins.polarized import (
     scatter_unpolarized,
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, solid_angle_over_area
-from torchtransient.plugins.transport.segment.vacuum import length_to
+from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
 
@@ -236,11 +235,11 @@ class Surface(Scattering):
         v, si, r, following = vertex.v, vertex.scattered_si, vertex.v.of(self.name), vertex.v.next
         smooth, mirrored = v.goes_on & ~r["delta"], v.goes_on & r["delta"]
         ahead = smooth & following.valid
-        out, J = mi.Vector3f(following.d), mi.Float(1)
+        out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            out = direction_to(si.p, following.p, ahead, out)
-            volume = world.segment.has_no_normal(following)
-            J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
+            volume, δ = world.segment.has_no_normal(following), displacement(si.p, smooth)
+            motion = damped_motion(δ, out, following.t, following.n, ahead, vertex.damping_radius, volume)
+            out, J, drag = motion.d, motion.J, motion.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
         counts = smooth & (pdf > 0)
@@ -252,7 +251,7 @@ class Surface(Scattering):
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
-        o, d, w = mi.Point3f(0), mi.Vector3f(0), dr.select(ahead, out, 0)
+        o, d, w = mi.Point3f(drag), mi.Vector3f(0), dr.select(ahead, out, 0)
         if world.contents.delta:
             bs, delta_weight = vertex.bsdf.sample(mi.BSDFContext(), si, r["u_lobe"], r["u_dir"], mirrored)
             delta_weight = self.correct_two_sided(world, vertex.bsdf, si, bs.wo, vertex.delay.scaled(delta_weight))
@@ -262,13 +261,16 @@ class Surface(Scattering):
             delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * (v.rr / self.own_share)
             weight = dr.select(mirrored, delta_weight, weight)
             eta = dr.select(mirrored, bs.eta, eta)
-            o, d, w = dr.select(mirrored, si.p, 0), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)
+            o, d, w = dr.select(mirrored, si.p, o), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)
         η = dr.select(v.goes_on, vertex.carry.η * eta, 0)
         slope = vertex.scattered_slope
         if wanted.geometry:
-            # The other end is nailed down here; what it adds when it moves is counted where it is attached.
-            length = dr.select(smooth, length_to(world.contents, si.p, following.p, following.valid, following.d), 0)
-            slope = slope + slope_only(dr.detach(η) * length)
+            # What the other end adds when it moves or slides is counted where it is attached.
+            longer = dr.select(ahead, motion.longer(), 0)
+            if world.contents.distant is not None:
+                far_away = slope_only(world.contents.distant.length(si.p, following.d))
+                longer = dr.select(smooth & ~ahead, far_away, longer)
+            slope = slope + dr.detach(η) * longer
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
         )

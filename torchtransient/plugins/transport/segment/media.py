@@ -129,9 +129,9 @@ class Media(Vacuum):
 
     def end(self, world, v):
         si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active & ~v.scatter)
-        p = dr.select(v.scatter, v.ray(v.t), si.p)
+        t = dr.select(v.scatter, v.t, si.t)
         n = dr.select(v.scatter, mi.Normal3f(0), si.n)
-        return VertexEnd(p, n, v.ray.d, v.active & (si.is_valid() | v.scatter))
+        return VertexEnd(t, n, v.ray.d, v.active & (si.is_valid() | v.scatter))
 
     def has_no_normal(self, end):
         return dr.all(end.n == 0)

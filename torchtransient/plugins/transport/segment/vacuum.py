@@ -7,8 +7,10 @@ import mitsuba as mi
 
 from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
 from torchtransient.plugins.transport.instances import surface_interaction
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement, slide
 from torchtransient.plugins.transport.strategy import Segment, Vertex
 
 # How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
@@ -106,22 +108,30 @@ class Vacuum(Segment):
 
     def end(self, world, v):
         si = v.pi.compute_surface_interaction(v.ray, mi.RayFlags.Minimal, v.active)
-        return VertexEnd(si.p, si.n, v.ray.d, si.is_valid() & v.active)
+        return VertexEnd(si.t, si.n, v.ray.d, si.is_valid() & v.active)
 
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
-        ray.o, ray.d = carry.o, carry.d
+        if not wanted.plain:
+            ray.o, ray.d = carry.o, carry.d
         si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, v.active)
+        if wanted.plain:  # an attached ray would have every shape differentiated
+            si.p = si.p + slide(displacement(carry.o, v.active), v.ray.d, dr.detach(si.n), v.active)
         return self.arrived(world, v, carry, ray, si, wanted)
 
     def arrived(self, world, v, carry, ray, si, wanted):
         """The attached vertex at ``si``, behind the optical length of its segment."""
         vertex = AttachedVertex(v=v, si=si, sid=dr.detach(si), carry=carry, slope=carry.slope)
         valid = vertex.sid.is_valid()
-        vertex.end = VertexEnd(vertex.sid.p, vertex.sid.n, v.ray.d, valid)
+        vertex.end = VertexEnd(vertex.sid.t, vertex.sid.n, v.ray.d, valid)
         if wanted.geometry:
+            # Of what the path sees first, too: a floor without end says nothing of the things that stand on it.
+            first = v.first(self.name, "t") * DAMPING
+            vertex.damping_radius = dr.minimum(world.contents.damping_radius, first)
             si.wi = dr.select(valid, si.to_local(-carry.w), -carry.w)
-            length = length_to(world.contents, ray.o, si.p, valid, ray.d)
+            # Shifted sideways, a ray gets no longer.
+            o = ray.o if wanted.ray else v.ray.o
+            length = length_to(world.contents, o, si.p, valid, ray.d)
             if world.camera_unwarp:
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)

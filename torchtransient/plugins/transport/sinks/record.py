@@ -111,6 +111,10 @@ class RecordedVertex(Local):
         flags = self.store["flags"].read(dr.maximum(self.k, 1) - 1, there)
         return ((self.k == 0) & mi.Bool(at_sensor)) | (there & self.layout.mask(flags, name, field))
 
+    def first(self, name, field):
+        """A number that the strategy ``name`` recorded at the first vertex of the path."""
+        return self.store[f"{name}.{field}"].read(mi.UInt32(0), self.active)
+
     def after(self):
         """The next vertex, where the path goes on."""
         return RecordedVertex(self.layout, self.store, self.k + 1, self.goes_on, self.primary_ray)

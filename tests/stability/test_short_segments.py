@@ -1,0 +1,61 @@
+"""Segments of millimetres between a wall that moves and what it nearly touches: gradients of bounded variance."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from support.gradient_cases.cases_gaps import corner, lamp, plates
+from support.gradient_cases.problem import Case, Problem
+from support.gradient_cases.unknowns import move
+from torchtransient.plugins.transport import contents
+
+SCENES = {"plates": (plates, (0, 0, 1)), "corner": (corner, (1, 0, 0)), "lamp": (lamp, (0, 0, 1))}
+GAPS = (1e-2, 1e-3, 1e-4)
+
+
+def problem(name, gap, spp=1024, step=1e-4):
+    make, direction = SCENES[name]
+    apply = move("wall.to_world", direction)
+    return Problem(Case(name, "", functools.partial(make, gap=gap), apply, 0.0, step, spp=spp))
+
+
+def gradients(name, gap, seeds, spp=1024):
+    posed = problem(name, gap, spp)
+    return np.array([posed.reverse(seed) for seed in range(seeds)])
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_variance_is_bounded(name):
+    """Guards against the derivative of a direction by the place of its vertex, which grows as one over the distance."""
+    widths = {gap: gradients(name, gap, 16).std(ddof=1) for gap in GAPS}
+    # Nailed down, it grows tenfold with each row. A width of 16 numbers is good to 18 %.
+    assert max(widths[1e-3], widths[1e-4]) < 2.0 * widths[1e-2]
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_a_tenth_of_the_variance_at_a_millimetre(name, monkeypatch):
+    damped = gradients(name, 1e-3, 16).var(ddof=1)
+    monkeypatch.setattr(contents, "DAMPING", 0.0)
+    assert 10 * damped < gradients(name, 1e-3, 16).var(ddof=1)
+
+
+@pytest.mark.parametrize("name", ["plates", "corner"])
+def test_mean_at_a_millimetre(name):
+    """Guards against distances measured from the surface where the ray starts 2e-4 m off it, a fifth of the gap."""
+    posed = problem(name, 1e-3, spp=16384)
+    found = np.array([posed.reverse(100 + seed) for seed in range(16)])
+    step = posed.case.step
+    slopes = np.array([(posed.loss(step, seed) - posed.loss(-step, seed)) / (2 * step) for seed in range(8)])
+    error = np.hypot(found.std(ddof=1) / 4, slopes.std(ddof=1) / np.sqrt(8))
+    assert abs(found.mean() - slopes.mean()) < 3 * error
+    assert error < 0.05 * abs(slopes.mean())
+
+
+def test_plain_surfaces_are_no_special_case(monkeypatch):
+    """Guards against a slide of flat plain surfaces that is not that of a ray which is shifted."""
+    plain = problem("plates", 5e-3).reverse(1)
+    monkeypatch.setattr(contents, "is_flat", lambda shape: False)
+    assert problem("plates", 5e-3).reverse(1) == pytest.approx(plain, rel=1e-4)
