@@ -147,6 +147,11 @@ def leaves_hits_detached(shape: Any) -> bool:
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
+def has_vertices(shape: Any) -> bool:
+    """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
+    return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
+
+
 # Their normal is the same everywhere.
 _FLAT = ("Rectangle", "Disk")
 # Meshes of more faces are not looked through.

@@ -68,11 +68,6 @@ PATTERN_AND_NORMALS = replace(NORMAL_COORDINATES, role="shape")
 _STEPS = "biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else"
 SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
 NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
-RIGID_ONLY = replace(
-    SHAPE,
-    biased=True,
-    reason="rigid motion only: the area of an emitting mesh is not differentiated",
-)
 
 
 def index_by_stand_in(plugin: str) -> ParameterEffect:
@@ -90,11 +85,6 @@ def index_by_stand_in(plugin: str) -> ParameterEffect:
 
 
 # ---------------------------------------------------------------------------------------------------------- conditions
-
-
-def _emits_from_vertices(site: Site) -> bool:
-    shape = site.node
-    return bool(shape.is_emitter() and shape.is_mesh() and not shape.has_vertex_texcoords())
 
 
 def _turns_delta_lobes(bsdf: object) -> bool:
@@ -181,15 +171,13 @@ AT_ZERO = Row(SKIPPED, _skips_a_lobe, "the weight of a lobe of principled or pri
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
-_EMITTING = Row(RIGID_ONLY, _emits_from_vertices, "an emitting mesh without texture coordinates")
-
 declare_effects("Shape", {"to_world": SHAPE})
 declare_effects(
     "Mesh",
     {
-        "to_world": (_EMITTING, Row(SHAPE)),
-        "vertex_positions": (_EMITTING, Row(SHAPE)),
-        "vertex_normals": (_EMITTING, Row(SHAPE)),
+        "to_world": SHAPE,
+        "vertex_positions": SHAPE,
+        "vertex_normals": SHAPE,
         "vertex_texcoords": (
             Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
             Row(SLOPES, _places_slopes, "another bump map"),

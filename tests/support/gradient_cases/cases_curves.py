@@ -87,28 +87,43 @@ f 1/1 3/3 4/4
 """
 
 
-def patterned_light():
-    """The room lit by a mesh with a smooth pattern."""
-    y, x = np.mgrid[0:8, 0:8] / 8
-    pixels = (1 + 0.8 * np.sin(3 * x + 1) * np.cos(2 * y)).astype(np.float32)[..., None]
+BARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
+
+
+def lit_by_mesh(text, emitter, name):
+    """The room lit by a mesh of two triangles."""
     light = {
         "type": "obj",
-        "filename": file_of("quad.obj", QUAD),
+        "filename": file_of(name, text),
         "to_world": transform().translate([1.2, 0.2, 1.5]).rotate([0, 1, 0], 200).scale(0.5),
-        "emitter": {
-            "type": "area",
-            "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True},
-        },
+        "emitter": emitter,
     }
     scene = room(light=light, depth=3, sensor=camera(start=4.5))
     del scene["side"]
     return scene
 
 
-def shift_pattern(params, x):
-    along("light.vertex_texcoords", (1.0, 0.4))(params, x)
-    # Mitsuba keeps the map by which it samples patterns until positions change; the renderer tells it that they have.
-    params["light.vertex_positions"] = params["light.vertex_positions"] + 1e-7
+def patterned_light():
+    """One with a smooth pattern."""
+    y, x = np.mgrid[0:8, 0:8] / 8
+    pixels = (1 + 0.8 * np.sin(3 * x + 1) * np.cos(2 * y)).astype(np.float32)[..., None]
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    return lit_by_mesh(QUAD, {"type": "area", "radiance": radiance}, "quad.obj")
+
+
+def bare_light(kind="area", **arguments):
+    """One without texture coordinates."""
+    return lit_by_mesh(BARE, {"type": kind, "radiance": 3.0, **arguments}, "bare.obj")
+
+
+def change_pattern(direction):
+    def apply(params, x):
+        along("light.vertex_texcoords", direction)(params, x)
+        # Mitsuba keeps the map by which it samples patterns until positions change; the renderer tells it that they
+        # have.
+        params["light.vertex_positions"] = params["light.vertex_positions"] + 1e-7
+
+    return apply
 
 
 def shift_and_move(params, x):
@@ -119,6 +134,9 @@ def shift_and_move(params, x):
 MOVED = (0.3, 0, 1, 0, 0, 0, 0, 0, 0, 0)
 TURNED = (0, 0, 0, 0.3, 0.2, 1, 0.3, 1, 0.5, 0)
 BENT = (0.1, 0, 1, 0.2, 0.3, 0.1, -0.5, 0.1, -0.2, 0, 0.7, 0, 0, 0.2, 0.4, -0.1, 0.3, 0, 0.2, 0.1)
+
+# Of four corners, none as its neighbours.
+GROWS = (-0.3, 0.1, 0, 0.6, 0, 0.1, 0.5, 0.4, 0, 0, 0.8, -0.1)
 
 CASES = [
     Case("ellipsoid_changes", ELLIPSOIDS, lambda: seen_wall(ellipsoid()), along("wall.data", TURNED), 0.0, 2e-4),
@@ -172,7 +190,7 @@ CASES = [
         "pattern_shifts",
         "texture coordinates of a light",
         patterned_light,
-        shift_pattern,
+        change_pattern((1.0, 0.4)),
         0.0,
         2e-2,
         spp=4096,
@@ -187,5 +205,34 @@ CASES = [
         1e-2,
         spp=4096,
         fd_spp=32768,
+    ),
+    # The area element is not that of the coordinates: these grow on a shape that stays.
+    Case(
+        "pattern_grows",
+        "texture coordinates of a light",
+        patterned_light,
+        change_pattern((0, 0, 1, 0, 1, 0.6, 0, 0.6)),
+        0.0,
+        2e-2,
+        spp=4096,
+        fd_spp=65536,
+    ),
+    Case(
+        "bare_light_grows",
+        "area light shape",
+        bare_light,
+        along("light.vertex_positions", GROWS),
+        0.0,
+        1e-2,
+        spp=4096,
+    ),
+    Case(
+        "bare_light_with_a_cone_grows",
+        "area light shape",
+        lambda: bare_light("angulararea", cutoff_angle=80.0, beam_width=5.0),
+        along("light.vertex_positions", GROWS),
+        0.0,
+        1e-2,
+        spp=4096,
     ),
 ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import area_light, room, transform
-from support.gradient_cases.unknowns import move, move_point, scale_texture, set_color
+from support.gradient_cases.unknowns import move, move_point, move_vertices, scale_texture, set_color
 
 
 def homogeneous(sigma_t=0.8, albedo=0.7, g=0.4, **arguments):
@@ -203,6 +203,9 @@ BLOCKS = {
     "fog and lamp": lambda: fog(homogeneous(0.1), **wide_lamp()),
     "fog and ball": lambda: fog(homogeneous(0.3), **lamp("sphere")),
     "ball": lambda: ball(homogeneous(1.0, 0.9), depth=2),
+    "dense": lambda: block(homogeneous(1.5, 0.9, 0.0)),
+    "dense and narrow": lambda: block(homogeneous(1.5, 0.9, 0.7)),
+    "dense clouds": lambda: block(clouds(3.0)),
     "ball and lamp": lambda: ball(homogeneous(1.0, 0.9), **lamp()),
     "column and lamp": lambda: ball(homogeneous(1.0, 0.9), COLUMN, **lamp()),
     "ball of clouds": lambda: ball(clouds(), **lamp()),
@@ -289,6 +292,10 @@ CASES = [
     lengths(
         "polar_wall", "metal", move("wall.to_world", FORWARD), variant="llvm_ad_mono_polarized", spp=4096,
         fd_spp=4096, tags=SLOW,
+    ),
+    # Vertices in a moving medium see each other at any distance.
+    lengths(
+        "block_moves", "dense", move_vertices("block.vertex_positions", FORWARD), step=8e-3, spp=32768, tags=SLOW
     ),
     lengths("boundary", "plain", thicken("block.vertex_positions"), step=2e-2, tags=SLOW),
 ]  # fmt: skip

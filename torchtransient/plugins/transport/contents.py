@@ -10,7 +10,13 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, is_flat, is_patterned, is_two_sided
+from torchtransient.plugins.mitsuba_compat import (
+    has_vertices,
+    hides_lobe_probability,
+    is_flat,
+    is_patterned,
+    is_two_sided,
+)
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
 from torchtransient.plugins.pointer_table import PointerTable
@@ -38,8 +44,8 @@ class SceneContents:
     blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
-    (:class:`~..sampling.sphere_lights.SphereLights`). Tables, instances, surroundings, mixtures, media and lights are
-    None where the scene has no such thing.
+    (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own. Tables,
+    instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
     some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
@@ -62,6 +68,7 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = SphereLights.of(scene)
+        self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())

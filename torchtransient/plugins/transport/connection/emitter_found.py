@@ -18,7 +18,7 @@ from torchtransient.plugins.transport.scattering.geometry_terms import (
     displacement,
     distance,
     material_point,
-    slid_point,
+    slide_on_shape,
 )
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, mis_weight
 
@@ -96,18 +96,16 @@ class EmitterFound(Connection):
             claimed = self._claimed(world, hit.emitter(world.scene), following.ray.d, wanted)
             if claimed is not None:
                 lit &= ~claimed
-        light, area = material_point(following.pi, following.ray, lit)
-        fixed = dr.detach(light)
-        δ = displacement(si.p, lit) - displacement(light.p, lit)
-        d, r = mi.Vector3f(following.ray.d), dr.norm(fixed.p - following.ray.o)
-        motion = damped_motion(δ, d, r, fixed.n, lit, vertex.damping_radius)
-        J = motion.J * motion.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
-        light.p = light.p + motion.slide(fixed.n)
-        if world.contents.patterned_lights:
-            slid = slid_point(following.pi, following.ray, motion.drag, lit)
-            light.uv = light.uv + displacement(slid.uv, lit)
-            light.sh_frame.n = light.sh_frame.n + displacement(slid.sh_frame.n, lit)
-        out = motion.d
+        light, area = material_point(following.pi, following.ray, lit, world.contents.emitting_meshes)
+        fixed, out, J = dr.detach(light), mi.Vector3f(following.ray.d), mi.Float(1)
+        if wanted.geometry:
+            δ, r = displacement(si.p, lit) - displacement(light.p, lit), dr.norm(fixed.p - following.ray.o)
+            motion = damped_motion(δ, out, r, fixed.n, lit, vertex.damping_radius)
+            out, J = motion.d, motion.J * motion.of_material(light.n, dr.relative_grad(dr.select(lit, area, 1)))
+            light.p = light.p + motion.slide(fixed.n)
+            if world.contents.patterned_lights:
+                slide = slide_on_shape(following.pi, following.ray, motion.drag, lit)
+                light.uv, light.sh_frame.n = light.uv + slide.uv, light.sh_frame.n + slide.sh_n
         light.wi = dr.select(lit, light.to_local(-out), fixed.wi)
         towards = world.scattering.evaluate(world, vertex, out, lit)
         Le = mi.unpolarized_spectrum(dr.detach(light).emitter(world.scene).eval(light, lit))

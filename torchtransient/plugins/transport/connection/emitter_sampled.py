@@ -12,7 +12,7 @@ from torchtransient.plugins.transport.scattering.geometry_terms import (
     damped_motion,
     displacement,
     material_point,
-    slid_point,
+    slide_on_shape,
 )
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
@@ -168,7 +168,7 @@ class EmitterSampled(Connection):
     def _follow_shape(self, world, si, light):
         """Make the point a material one of the light's shape."""
         ray, pi, there = self._found(world, si, light)
-        found, area = material_point(pi, ray, there)
+        found, area = material_point(pi, ray, there, world.contents.emitting_meshes)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
         light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
@@ -189,9 +189,8 @@ class EmitterSampled(Connection):
         light.longer = dr.select(near, motion.longer(ds.n), 0)
         if world.contents.patterned_lights:
             ray, pi, there = self._found(world, si, light)
-            slid = slid_point(pi, ray, motion.drag, there)
-            light.uv = light.uv + displacement(slid.uv, there)
-            light.n = light.n + displacement(slid.n, there)
+            slide = slide_on_shape(pi, ray, motion.drag, there)
+            light.uv, light.n = light.uv + slide.uv, light.n + slide.n
         return motion.d
 
     @staticmethod

@@ -31,17 +31,35 @@ def distance(p, q, active):
     return dr.norm(dr.select(active, q - p, mi.Vector3f(0, 0, 1)))
 
 
-def material_point(pi, ray, active):
-    """Interaction that follows its shape, and the area element there (up to a constant)."""
+def material_point(pi, ray, active, meshes=None):
+    """Interaction that follows its shape, and the area element there (up to a constant).
+
+    ``meshes`` (PointerTable or None): the emitting ones. Their derivatives by texture coordinates change with these, or
+    are made up where there are none; the area is that of the triangle.
+    """
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    return si, dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    area = dr.cross(si.dp_du, si.dp_dv)
+    if meshes is not None:
+        with dr.suspend_grad():
+            on_mesh = active & meshes.lists(si.shape)
+        mesh = mi.MeshPtr(dr.select(on_mesh, si.shape, dr.zeros(mi.ShapePtr)))
+        a, b, c = (mesh.vertex_position(i, on_mesh) for i in mesh.face_indices(pi.prim_index, on_mesh))
+        area = dr.select(on_mesh, dr.cross(b - a, c - a), area)
+    return si, dr.norm(dr.select(active, area, mi.Vector3f(0, 0, 1)))
 
 
-def slid_point(pi, ray, drag, active):
-    """Interaction that slides on its shape, held in place, as ``ray`` is shifted by ``drag``."""
+def slide_on_shape(pi, ray, drag, active):
+    """What changes where a point slides on its shape, held in place, as ``ray`` is shifted by ``drag``: ``uv, n`` and
+    ``sh_n``, the shading normal, each zero with the derivative.
+    """
     shifted = mi.Ray3f(ray)
     shifted.o = shifted.o + dr.select(active, drag, 0)
-    return pi.compute_surface_interaction(shifted, mi.RayFlags.All | mi.RayFlags.DetachShape, active)
+    # The difference, since the normal of a face that moves stays attached, whatever the flags say.
+    here, there = (
+        pi.compute_surface_interaction(r, mi.RayFlags.All | mi.RayFlags.DetachShape, active) for r in (ray, shifted)
+    )
+    uv, n, sh_n = there.uv - here.uv, there.n - here.n, there.sh_frame.n - here.sh_frame.n
+    return Local(uv=displacement(uv, active), n=displacement(n, active), sh_n=displacement(sh_n, active))
 
 
 def displacement(p, active):
@@ -83,7 +101,7 @@ class DampedMotion(Local):
         return 1 + self.stays * (area - 1 + tilt)
 
 
-def damped_motion(δ, d, r, n, active, radius, nailed=None):
+def damped_motion(δ, d, r, n, active, radius, nailed=None, volume=None):
     """The direction ``d`` to a point at distance ``r`` on a surface of normal ``n``, when its vertex moves by ``δ``.
 
     Far away the point is nailed down: the direction moves by ``-δ_perp / r``. In corners and gaps that has no bounded
@@ -95,7 +113,9 @@ def damped_motion(δ, d, r, n, active, radius, nailed=None):
 
         r W' (n.δ / n.d - d.δ) + 2 W d.δ.
 
-    ``nailed``: where the point never slides and the measure is no area: in a volume, or of a point light.
+    ``nailed``: where the point never slides and the measure is no area: that of a point light. ``volume``: where the
+    point lies in a volume. Its distance is a coordinate of its own there, ``W`` is the same in all directions, and the
+    divergence is ``2 W d.δ``.
     """
     near = r < radius
     if nailed is not None:
@@ -105,8 +125,9 @@ def damped_motion(δ, d, r, n, active, radius, nailed=None):
     s2 = dr.square(s)
     scale = dr.select(active & (r > 0), dr.select(near, s * inv_radius, dr.rcp(r)), 0)
     W, slope = (2 - s2) * scale, (2 - 3 * s2) * scale
-    if nailed is not None:
-        slope = dr.select(nailed, 0, slope)
+    for unbound in (nailed, volume):
+        if unbound is not None:
+            slope = dr.select(unbound, 0, slope)
     cos = dr.dot(n, d)
     per_cos = dr.select(active & (cos != 0), dr.rcp(cos), 0)
     along = dr.dot(δ, d)

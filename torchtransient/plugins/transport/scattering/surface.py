@@ -238,7 +238,8 @@ class Surface(Scattering):
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
             volume, δ = world.segment.has_no_normal(following), displacement(si.p, smooth)
-            motion = damped_motion(δ, out, following.t, following.n, ahead, vertex.damping_radius, volume)
+            radius = vertex.damping_radius
+            motion = damped_motion(δ, out, following.t, following.n, ahead, radius, volume=volume)
             out, J, drag = motion.d, motion.J, motion.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)

@@ -17,6 +17,7 @@ from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
 from torchtransient.plugins.transport.instances import distance_to, surface_interaction
 from torchtransient.plugins.transport.media_contents import FlightSettings
+from torchtransient.plugins.transport.scattering.geometry_terms import displacement
 from torchtransient.plugins.transport.segment.free_flight import (
     closed_surface,
     medium_interaction,
@@ -139,7 +140,7 @@ class Media(Vacuum):
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
-        si, mei, stretch = self._surface_or_medium(v, carry, ray, wanted)
+        si, mei, stretch = self._surface_or_medium(world, v, carry, ray, wanted)
         vertex = self.arrived(world, v, carry, ray, si, wanted)
         vertex.scatter, vertex.mei = v.scatter, mei
         far = ~vertex.sid.is_valid()
@@ -150,14 +151,23 @@ class Media(Vacuum):
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
         return vertex
 
-    def _surface_or_medium(self, v, carry, ray, wanted):
+    def _surface_or_medium(self, world, v, carry, ray, wanted):
         """(interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
 
         Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
         """
         si = surface_interaction(self.settings.surfaces, v.pi, ray, mi.RayFlags.All, v.active & ~v.scatter)
-        t, stretch = self._attached_distance(v, carry, ray, wanted)
-        mei = medium_interaction(ray, v.end, t)
+        along, dragged = ray, mi.Bool(False)
+        if wanted.geometry:
+            # How far a vertex slides sideways depends on its distance: where it divides the stretch must not depend on
+            # that again.
+            dragged = v.scatter & ~v.before(world.scattering.name, "delta", at_sensor=True)
+            along = mi.Ray3f(ray)
+            along.o = dr.select(dragged, v.ray.o, ray.o)
+        t, stretch = self._attached_distance(v, carry, along, wanted)
+        mei = medium_interaction(along, v.end, t)
+        if wanted.geometry:
+            mei.p = mei.p + displacement(ray.o, dragged)
         mei.wi = -carry.w
         mei.sh_frame = mi.Frame3f(-carry.w)
         si.t = dr.select(v.scatter, t, si.t)
