@@ -11,10 +11,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 
 from .fresnel import fresnel
-from .ior import opaque, optional_texture, relative_index, textured
-
-# Both lobes are drawn at least this often where one of them is black: its slope is not zero.
-LEAST_WEIGHT = 0.25
+from .ior import opaque, optional_texture, relative_index, specular_share, textured
 
 
 class DiffPlastic(mi.BSDF):
@@ -38,18 +35,7 @@ class DiffPlastic(mi.BSDF):
         front = mi.BSDFFlags.FrontSide
         self.m_components = [mi.BSDFFlags.DeltaReflection | front, mi.BSDFFlags.DiffuseReflection | front]
         self.m_flags = self.m_components[0] | self.m_components[1]
-        self._specular_weight = None
-        self._prepare()
-
-    def _prepare(self) -> None:
-        """Share of the mirror lobe among the samples, by the lobes' mean reflectances."""
-        with dr.suspend_grad():
-            d = self.diffuse_reflectance.mean()
-            s = mi.Float(1) if self.specular_reflectance is None else self.specular_reflectance.mean()
-            weight = s / dr.select(d + s > 0, d + s, 1)
-            one_is_black = (d <= 0) | (s <= 0)
-            clipped = dr.clip(weight, LEAST_WEIGHT, 1 - LEAST_WEIGHT)
-            self._specular_weight = opaque(mi.Float(dr.select(one_is_black, clipped, weight)))
+        self.parameters_changed()
 
     def traverse(self, cb: Any) -> None:
         cb.put("eta", self.eta, +mi.ParamFlags.Differentiable)
@@ -57,9 +43,9 @@ class DiffPlastic(mi.BSDF):
         if self.specular_reflectance is not None:
             cb.put("specular_reflectance", self.specular_reflectance, +mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: Any) -> None:
+    def parameters_changed(self, keys: Any = ()) -> None:
         opaque(self.eta)
-        self._prepare()
+        self._specular_weight = specular_share(self.specular_reflectance, self.diffuse_reflectance)
 
     # ------------------------------------------------------------------------------------------------------- lobes
 
@@ -88,9 +74,9 @@ class DiffPlastic(mi.BSDF):
         p = self._mirror_probability(f_i.reflectance) if has_mirror and has_diffuse else mi.Float(has_mirror)
         mirror = sample1 < p
         reflected = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z)
-        scattered = mi.warp.square_to_cosine_hemisphere(sample2)
-        bs.wo = dr.select(mirror, reflected, scattered)
-        bs.pdf = dr.select(mirror, p, (1 - p) * mi.warp.square_to_cosine_hemisphere_pdf(scattered)) & active
+        onwards = mi.warp.square_to_cosine_hemisphere(sample2)
+        bs.wo = dr.select(mirror, reflected, onwards)
+        bs.pdf = dr.select(mirror, p, (1 - p) * mi.warp.square_to_cosine_hemisphere_pdf(onwards)) & active
         bs.eta = mi.Float(1)
         bs.sampled_component = dr.select(mirror, mi.UInt32(0), mi.UInt32(1))
         kinds = (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DiffuseReflection)
@@ -99,7 +85,7 @@ class DiffPlastic(mi.BSDF):
         value = dr.select(
             mirror,
             textured(f_i.reflectance, self.specular_reflectance, si, active & mirror),
-            self._diffuse(si, scattered.z, f_i, active & ~mirror),
+            self._diffuse(si, onwards.z, f_i, active & ~mirror),
         )
         value *= dr.select(chance > 0, dr.rcp(chance), 0)
         return bs, depolarizing(value) & active
