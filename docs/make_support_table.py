@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
 NOT_SUPPORTED = (
     (
-        "`alpha`, `eta` of Mitsuba's own `roughplastic`",
-        "taken over by `diff_rough_plastic` when the key is asked for",
+        "`alpha`, `eta` and reflectances of Mitsuba's own `plastic`, `roughplastic`",
+        "taken over by `diff_plastic`, `diff_rough_plastic` when the key is asked for",
     ),
     (
         "eta of Mitsuba's own `dielectric`, `roughdielectric`",
@@ -44,10 +44,7 @@ def measure(case):
     problem = Problem(case)
     reverse = np.array([problem.reverse(100 + s) for s in range(case.seeds)])
     forward = problem.forward(100)
-    h = case.step
-    fd = np.array(
-        [(problem.loss(case.value + h, s) - problem.loss(case.value - h, s)) / (2 * h) for s in range(case.seeds)]
-    )
+    fd = np.array([problem.difference(s) for s in range(case.seeds)])
     root = np.sqrt(case.seeds)
     return reverse.mean(), reverse.std(ddof=1) / root, fd.mean(), fd.std(ddof=1) / root, forward / reverse[0]
 

@@ -224,6 +224,24 @@ def test_a_lobe_of_weight_zero_is_skipped():
     assert 0 in compat.SKIPPED_AT["Principled"]["clearcoat"]
 
 
+@pytest.mark.parametrize("cls", compat.PLASTICS)
+@pytest.mark.parametrize("black", [0, 1])
+def test_black_lobes_of_plastics_are_never_sampled(cls, black):
+    activate(RGB)
+    lobes = ("specular_reflectance", "diffuse_reflectance")
+    samples = {}
+    for plugin in (compat.PLASTICS[cls], compat.DIFFERENTIABLE_PLUGINS[compat.PLASTICS[cls]]):
+        colours = {name: {"type": "uniform", "value": float(i != black)} for i, name in enumerate(lobes)}
+        bsdf = mi.load_dict({"type": plugin, **colours})
+        si = dr.zeros(mi.SurfaceInteraction3f, 1000)
+        si.wi = unit(0.3, 0.1, 0.9)
+        u = dr.linspace(mi.Float, 0, 1, 1000, endpoint=False)
+        samples[plugin], _ = bsdf.sample(mi.BSDFContext(), si, u, mi.Point2f(0.3, 0.6))
+    theirs, ours = (np.mean(np.array(bs.sampled_component) == black) for bs in samples.values())
+    assert theirs == 0 and ours > 0.01
+    assert compat.never_samples_black(mi.load_dict({"type": compat.PLASTICS[cls]}), lobes[black])
+
+
 def test_rough_plastic_has_no_derivative_through_its_tables():
     activate(RGB)
     context = mi.BSDFContext()

@@ -77,6 +77,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     ),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.plastic", (("bsdf", "diff_plastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_plastic", (("bsdf", "diff_rough_plastic"),)),

@@ -98,14 +98,28 @@ SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
     "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
 
-# Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric has a plain number for
-# the index, its rough dielectric detaches it where directions are sampled, and its rough plastic computes tables from
-# roughness and index outside of the graph.
+# Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
+# plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
+# computes tables from roughness and index outside of the graph.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
+    "plastic": "diff_plastic",
     "roughplastic": "diff_rough_plastic",
 }
+# Class names of the plastics. They never sample a lobe whose mean reflectance is exactly zero, and so lose the
+# derivative by that reflectance.
+PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic"}
+_LOBES_OF_PLASTICS = ("diffuse_reflectance", "specular_reflectance")
+
+
+def never_samples_black(bsdf: Any, slot: str) -> bool:
+    """Whether the texture that a BSDF holds under the name ``slot`` is the reflectance of a lobe that Mitsuba never
+    samples while it is black.
+    """
+    return bsdf.class_name() in PLASTICS and slot in _LOBES_OF_PLASTICS
+
+
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
 # its conductor, dielectric, polarizer and retarder by the direction are NaN; its rough dielectric depolarises; its wave
 # plate jumps at oblique incidence.

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, SKIPPED_AT, is_bump_map, normal_texture
-from torchtransient.plugins.node_walk import objects_below, shown_by
+from torchtransient.plugins.mitsuba_compat import (
+    DIFFERENTIABLE_PLUGINS,
+    PLASTICS,
+    SKIPPED_AT,
+    is_bump_map,
+    never_samples_black,
+    normal_texture,
+)
+from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
     CORRECT,
@@ -54,6 +63,11 @@ COATING = ParameterEffect(
     "tables of its coating",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["roughplastic"],
+)
+VARNISH = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
+    trusted=True,
+    stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
 )
 SKIPPED = ParameterEffect(
     biased=True,
@@ -164,6 +178,32 @@ def _skips_a_lobe(site: Site) -> bool:
     return any(bool(dr.any(entries == value, axis=None)) for value in values)
 
 
+def _is_lobe_of(plastic: str, site: Site) -> bool:
+    """Whether a texture is the reflectance of a lobe of a plastic of Mitsuba, of the class ``plastic``."""
+    return any(holder.class_name() == plastic and never_samples_black(holder, name) for holder, name in site.owners)
+
+
+def _is_black_lobe_of(plastic: str, site: Site) -> bool:
+    """Whether it is one that is black now."""
+    lobes = [
+        dict(objects_of(holder))[name]
+        for holder, name in site.owners
+        if holder.class_name() == plastic and never_samples_black(holder, name)
+    ]
+    with dr.suspend_grad():
+        return any(dr.all(mi.Float(lobe.mean()) <= 0) for lobe in lobes)
+
+
+def _rows_of_lobes() -> Iterator[Row]:
+    """The rows of the reflectances of plastics, those of black lobes first."""
+    for is_lobe, needed, words in ((_is_black_lobe_of, True, "a black lobe"), (_is_lobe_of, False, "another lobe")):
+        for cls, plugin in PLASTICS.items():
+            twin = DIFFERENTIABLE_PLUGINS[plugin]
+            reason = f"{CORRECT}; built as {twin} when asked for, which samples its lobes where they are black, too"
+            effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=needed)
+            yield Row(effect, partial(is_lobe, cls), f"the reflectance of {words} of {plugin}")
+
+
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
@@ -219,9 +259,10 @@ declare_effects("Principled", {"eta": PRINCIPLED_INDEX, "specular": PRINCIPLED_I
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
 declare_effects("Hair", {"eta": VALUE})
+declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO)})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO, *_rows_of_lobes())})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -44,7 +44,8 @@ class ParameterEffect:
     derivative, it begins with ``SILHOUETTES``, which is put there when a row does not say it.
 
     ``trusted``: the derivative is right although Mitsuba marks the parameter as not differentiable. ``stand_in``: name
-    of the plugin that is built in place of Mitsuba's when the derivative is asked for.
+    of the plugin that is built in place of Mitsuba's when the derivative is asked for; of a texture, in place of the
+    plugin that holds it. ``stand_in_needed``: Mitsuba's has not the right derivative as it is now.
     """
 
     moves_length: bool = False
@@ -56,6 +57,7 @@ class ParameterEffect:
     reason: str = CORRECT
     trusted: bool = False
     stand_in: str = ""
+    stand_in_needed: bool = True
 
     def __post_init__(self) -> None:
         if self.moves_silhouette and self.supported and SILHOUETTES not in self.reason:

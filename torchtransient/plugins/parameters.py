@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
-from torchtransient.plugins.mitsuba_compat import keeps_coefficients
+from torchtransient.plugins.mitsuba_compat import keeps_coefficients, never_samples_black
 from torchtransient.plugins.node_walk import ShownValue, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
@@ -115,6 +115,15 @@ class ParameterTracker:
         """As the function of this name, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
 
+    def stood_in_for(self, node: Any) -> list[Any]:
+        """The plugins that are built as others where the derivative by a parameter of ``node`` is asked for, if there
+        is a ``stand_in``: itself, or the holders of a texture.
+        """
+        if isinstance(node, mi.BSDF):
+            return [node]
+        holders = owners_of(node, self._holders)
+        return [holder for holder, name in holders if never_samples_black(holder, name)]
+
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]
         for node, inherited in self._shown_anew:
@@ -153,7 +162,7 @@ def check_stand_ins(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> None
     is wrong and for which another one has to be built.
     """
     for node, key, effect in effects:
-        if effect.stand_in:
+        if effect.stand_in and effect.stand_in_needed:
             raise GradientError(
                 f"{f'{node.id()}.{key}'.lstrip('.')!r}: Mitsuba's {node.class_name()} does not have the whole "
                 f"derivative of this parameter. Describe the plugin as '{effect.stand_in}', which takes the same "

@@ -31,7 +31,8 @@ class ParameterInfo:
 
     ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
     visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
-    boundary term of moving silhouettes, which is missing. ``reason`` says why.
+    boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: names of the materials
+    that are built as others when the key is asked for.
     """
 
     key: str
@@ -41,7 +42,7 @@ class ParameterInfo:
     differentiable: bool
     moves_path_length: bool
     reason: str
-    substitute: str | None = None
+    substitute: frozenset[str] = frozenset()
     moves_silhouette: bool = False
     moves_medium: bool = False
     biased: bool = False
@@ -139,6 +140,8 @@ def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node:
 
 
 def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
+    import mitsuba as mi
+
     # Not by `built.params[key]`, which fails for parameters that are not set, such as the absorption of hair.
     handle, cpptype, _, _ = built.params.properties[key]
     current = ShownValue(key, handle, 0, cpptype).read(node)
@@ -148,9 +151,12 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     value = read_value(current, shape) if few else None
     effect = tracker.effect_of(node, name, built.params.flags(key))
     if effect.stand_in:
-        # What stands in for the plugin has a number there, whatever Mitsuba's has.
-        effect = tracker.effect_of(node, name)
-        return replace(_info(key, "number", (), float(np.reshape(value, ())), effect), substitute=node.id())
+        if isinstance(node, mi.BSDF):
+            # What stands in for the plugin has a number there, whatever Mitsuba's has.
+            kind, shape, value = "number", (), float(np.reshape(value, ()))
+            effect = tracker.effect_of(node, name)
+        exchanged = frozenset(plugin.id() for plugin in tracker.stood_in_for(node))
+        return replace(_info(key, kind, shape, value, effect), substitute=exchanged)
     if kind == "plain":
         effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")
     elif kind == "integer":

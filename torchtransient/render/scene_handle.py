@@ -100,8 +100,7 @@ class Scene:
                 raise SceneError(unknown_key(key, list(table)))
             if not info.differentiable:
                 raise GradientError(f"parameter {key!r} has no derivative: {info.reason}.")
-            if info.substitute is not None:
-                substitute.add(info.substitute)
+            substitute |= info.substitute
         return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:

@@ -105,8 +105,8 @@ def bsdfs() -> dict[str, dict[str, Any]]:
     plain = (
         "diffuse", "dielectric", "thindielectric", "roughdielectric", "conductor", "roughconductor", "plastic",
         "roughplastic", "pplastic", "hair", "polarizer", "retarder", "circular", "diff_dielectric",
-        "diff_rough_dielectric", "diff_rough_plastic", "diff_conductor", "diff_polarizer", "diff_retarder",
-        "diff_circular",
+        "diff_rough_dielectric", "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_polarizer",
+        "diff_retarder", "diff_circular",
     )  # fmt: skip
     return {
         **{name: {"type": name} for name in plain},

@@ -32,6 +32,12 @@ def thin_sheet():
     }  # fmt: skip
 
 
+def plastic(kind, **reflectances):
+    """A room with a wall of plastic; of the lobes that are not named, the reflectance is that of the plugin."""
+    lobes = {name: {"type": "uniform", "value": value} for name, value in reflectances.items()}
+    return room(bsdf={"type": kind, **lobes}, light=area_light())
+
+
 CASES = [
     Case("diffuse_albedo", "diffuse albedo", room, set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
     Case(
@@ -103,6 +109,47 @@ CASES = [
         1.49,
         # Mitsuba's quadrature of the internal reflectance is rough on smaller scales.
         0.04,
+        spp=4096,
+    ),
+    Case(
+        "smooth_plastic_index",
+        "index of a smooth plastic",
+        lambda: plastic("diff_plastic"),
+        set_color("wall.bsdf.eta"),
+        1.49,
+        0.02,
+        spp=4096,
+    ),
+    Case(
+        "black_mirror_of_a_plastic",
+        "reflectance of a black lobe of a plastic",
+        lambda: plastic("diff_plastic", specular_reflectance=0.0),
+        set_color("wall.bsdf.specular_reflectance.value"),
+        0.0,
+        0.2,
+        side=1,
+        spp=16384,
+        fd_spp=65536,
+    ),
+    Case(
+        "black_base_of_a_plastic",
+        "reflectance of a black lobe of a plastic",
+        lambda: plastic("diff_plastic", diffuse_reflectance=0.0),
+        set_color("wall.bsdf.diffuse_reflectance.value"),
+        0.0,
+        0.1,
+        side=1,
+        spp=4096,
+        fd_spp=65536,
+    ),
+    Case(
+        "black_base_of_a_rough_plastic",
+        "reflectance of a black lobe of a plastic",
+        lambda: plastic("diff_rough_plastic", diffuse_reflectance=0.0),
+        set_color("wall.bsdf.diffuse_reflectance.value"),
+        0.0,
+        0.05,
+        side=1,
         spp=4096,
     ),
     Case(

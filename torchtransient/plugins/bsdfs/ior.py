@@ -1,4 +1,4 @@
-"""Properties that the dielectric plugins read: the relative index and the textures of the two lobes."""
+"""Properties that the dielectric plugins read: the relative index, and the textures and shares of the two lobes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+
+# Each of two lobes is drawn at least this often where one of them is black: its slope is not zero.
+LEAST_SHARE = 0.25
 
 
 def relative_index(props: Any, plugin: str, default: str = "bk7") -> Any:
@@ -30,6 +33,16 @@ def relative_index(props: Any, plugin: str, default: str = "bk7") -> Any:
 def optional_texture(props: Any, name: str) -> Any | None:
     """The texture of a lobe, or None (a factor of one) when the scene does not give it."""
     return props.get_texture(name) if name in props else None
+
+
+def specular_share(specular: Any | None, diffuse: Any) -> Any:
+    """Detached share of the specular lobe among the samples, by the mean reflectances of both lobes' textures."""
+    with dr.suspend_grad():
+        d = mi.Float(diffuse.mean())
+        s = mi.Float(1) if specular is None else mi.Float(specular.mean())
+        share = s / dr.select(d + s > 0, d + s, 1)
+        one_is_black = (d <= 0) | (s <= 0)
+        return opaque(dr.select(one_is_black, dr.clip(share, LEAST_SHARE, 1 - LEAST_SHARE), share))
 
 
 def opaque(value: Any) -> Any:

@@ -12,7 +12,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 
 from .fresnel import fresnel
-from .ior import opaque, optional_texture, relative_index, textured
+from .ior import opaque, optional_texture, relative_index, specular_share, textured
 from .microfacet import half_vector, normal_density, smith_g1_over_cos
 from .rough_coating import external_transmittance, internal_reflectance, look_up
 
@@ -66,9 +66,7 @@ class DiffRoughPlastic(mi.BSDF):
             cb.put("specular_reflectance", self.specular_reflectance, +mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any = ()) -> None:
-        specular = 1.0 if self.specular_reflectance is None else dr.detach(self.specular_reflectance.mean())
-        diffuse = dr.detach(self.diffuse_reflectance.mean())
-        self.specular_share = opaque(mi.Float(specular / (diffuse + specular)))
+        self.specular_share = specular_share(self.specular_reflectance, self.diffuse_reflectance)
         opaque(self.eta)
         opaque(self.alpha)
         if not keys or "alpha" in keys or "eta" in keys:

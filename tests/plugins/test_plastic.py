@@ -1,0 +1,158 @@
+"""``diff_plastic`` against Mitsuba's ``plastic``, and plastics with black lobes."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.gradient_cases.scenes import area_light, room
+from torchtransient import plugins
+from torchtransient.errors import GradientError
+
+CASES = [
+    {"int_ior": 1.5},
+    {"int_ior": 1.3, "nonlinear": True},
+    {"int_ior": 0.7, "specular_reflectance": 0.5},
+    {"ext_ior": 1.33},
+]
+LOBES = ("diffuse_reflectance", "specular_reflectance")
+VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized")
+
+
+def activate(variant):
+    if variant not in mi.variants():
+        pytest.skip(f"{variant} is not installed")
+    mi.set_variant(variant)
+    plugins.sync()
+
+
+@pytest.fixture(autouse=True)
+def mono():
+    activate("llvm_ad_mono")
+
+
+def directions(count):
+    rng = mi.PCG32(count)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    si.wavelengths = mi.Spectrum(500.0) if mi.is_spectral and not mi.is_polarized else si.wavelengths
+    return si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("settings", CASES, ids=str)
+def test_values_densities_and_samples_are_those_of_mitsuba(settings, variant):
+    activate(variant)
+    theirs, ours = (
+        mi.load_dict({"type": name, "diffuse_reflectance": 0.6, **settings}) for name in ("plastic", "diff_plastic")
+    )
+    si, u, v = directions(20000)
+    for component in (None, 0, 1):
+        ctx = mi.BSDFContext()
+        if component is not None:
+            ctx.component = component
+        (a, weight_a), (b, weight_b) = (bsdf.sample(ctx, si, u, v) for bsdf in (theirs, ours))
+        (value_a, pdf_a), (value_b, pdf_b) = (bsdf.eval_pdf(ctx, si, a.wo) for bsdf in (theirs, ours))
+        same = np.array(a.sampled_component) == np.array(b.sampled_component)
+        # Random numbers next to the border between the lobes fall to either side of it.
+        assert same.mean() > 0.999
+        pairs = [(weight_a, weight_b), (value_a, value_b), (pdf_a, pdf_b), (a.pdf, b.pdf), (a.wo, b.wo)]
+        for one, other in pairs:
+            one, other = (np.array(dr.select(mi.Bool(same), x, 0)) for x in (one, other))
+            np.testing.assert_allclose(other, one, rtol=2e-4, atol=1e-5)
+
+
+def scene_with(kind, bare=False, **bsdf):
+    """A room with a wall of plastic. A bare one was not described by this library."""
+    lobes = {name: {"type": "uniform", "value": 0.5} for name in LOBES}
+    description = room(bsdf={"type": kind, **lobes, **bsdf}, light=area_light())
+    return mi.load_dict(description, optimize=False) if bare else tt.load(description, variant="llvm_ad_mono")
+
+
+def black(name):
+    return {name: {"type": "uniform", "value": 0.0}}
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+def test_a_black_lobe_has_its_slope(kind, lobe):
+    scene = scene_with(kind, **black(lobe))
+    key = f"wall.bsdf.{lobe}.value"
+    info = scene.parameters()[key]
+    assert info.differentiable and not info.biased and "diff_" in info.reason and info.shape == ()
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16384)
+
+    def brightness(x, seed):
+        return renderer(values={key: torch.tensor(float(x))}, seed=seed).steady.double().sum()
+
+    found, expected = [], []
+    for seed in range(4):
+        x = torch.zeros((), requires_grad=True)
+        renderer(values={key: x}, seed=seed).steady.double().sum().backward()
+        found.append(float(x.grad))
+        with torch.no_grad():
+            # Brightness is linear in the mirror's reflectance, and nearly so in the base's.
+            here, near, far = (brightness(0.1 * k, 10 + seed) for k in range(3))
+        expected.append(float(4 * near - 3 * here - far) / 0.2)
+    found, expected = np.array(found), np.array(expected)
+    error = np.sqrt((found.var(ddof=1) + expected.var(ddof=1)) / 4)
+    assert abs(found.mean() - expected.mean()) < 4 * error
+    assert error < 0.1 * expected.mean()
+
+
+def test_the_index_of_a_described_plastic():
+    scene = scene_with("plastic")
+    info = scene.parameters()["wall.bsdf.eta"]
+    assert info.differentiable and not info.biased and not info.moves_path_length and "diff_plastic" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=["wall.bsdf.eta"], spp=64)
+    renderer(seed=0).steady.sum().backward()
+    assert abs(float(renderer.values["wall.bsdf.eta"].grad)) > 1e-4
+
+
+def test_a_textured_plastic_is_built_anew_wherever_it_is():
+    image = {"type": "bitmap", "raw": True, "data": np.zeros((3, 2, 1), dtype=np.float32), "filter_type": "nearest"}
+    pattern = {"type": "checkerboard", "color0": image, "color1": 0.0}
+    plastic = {"type": "plastic", "diffuse_reflectance": pattern}
+    nested = {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "nested": plastic}}
+    scene = tt.load(room(bsdf=nested, light=area_light()), variant="llvm_ad_mono")
+    key = next(key for key in scene.parameters() if key.endswith("color0.data"))
+    assert scene.parameters()[key].shape == (3, 2, 1)
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=256)
+    renderer(seed=0).steady.sum().backward()
+    gradient = renderer.values[key].grad
+    assert gradient.min() >= 0 and gradient.sum() > 1e-2
+
+
+def attached(scene, key):
+    params = mi.traverse(scene)
+    value = type(params[key])(params[key])
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    return params, value
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+def test_black_lobes_of_mitsubas_own_are_refused(kind, lobe):
+    scene = scene_with(kind, bare=True, **black(lobe))
+    params, _ = attached(scene, f"wall.bsdf.{lobe}.value")
+    adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
+    with pytest.raises(GradientError, match="diff_"):
+        scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)
+
+
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+def test_lobes_of_mitsubas_own_that_are_not_black(kind):
+    """Their derivatives are right as they are, and so are those of the other lobe."""
+    scene = scene_with(kind, bare=True, **black("specular_reflectance"))
+    params, value = attached(scene, "wall.bsdf.diffuse_reflectance.value")
+    adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
+    scene.integrator().render_backward(scene, params, (None, adjoint), spp=16)
+    dr.enqueue(dr.ADMode.Backward, params["wall.bsdf.diffuse_reflectance.value"])
+    dr.traverse(dr.ADMode.Backward)
+    assert float(dr.grad(value)[0]) > 0

@@ -1,0 +1,127 @@
+"""``diff_plastic``: Mitsuba's smooth ``plastic`` with an index of refraction and black lobes that have derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import VALUE, declare_effects
+
+from .fresnel import fresnel
+from .ior import opaque, optional_texture, relative_index, specular_share, textured
+
+
+class DiffPlastic(mi.BSDF):
+    """Smooth dielectric coating over a diffuse base, parameters and values as Mitsuba's ``plastic``.
+
+    ``int_ior`` ("polypropylene"), ``ext_ior`` ("air") (number or material name), ``diffuse_reflectance`` (0.5),
+    ``specular_reflectance`` (textures), ``nonlinear`` (false: the base's colour does not saturate by internal
+    scattering). Differentiable: ``eta`` (inside over outside index) and the textures.
+
+    Lobes are chosen with detached probabilities, and weights are a lobe's value over them; ``bs.pdf`` is detached.
+    The mirror lobe leaves the surface as it came, so that ``eta`` moves nothing. The diffuse Fresnel reflectance
+    is Mitsuba's polynomial (``mi.fresnel_diffuse_reflectance``), good to some 1e-3; so is its derivative.
+    """
+
+    def __init__(self, props: Any) -> None:
+        mi.BSDF.__init__(self, props)
+        self.eta = relative_index(props, "diff_plastic", "polypropylene")
+        self.diffuse_reflectance = props.get_texture("diffuse_reflectance", 0.5)
+        self.specular_reflectance = optional_texture(props, "specular_reflectance")
+        self.nonlinear = bool(props.get("nonlinear", False))
+        front = mi.BSDFFlags.FrontSide
+        self.m_components = [mi.BSDFFlags.DeltaReflection | front, mi.BSDFFlags.DiffuseReflection | front]
+        self.m_flags = self.m_components[0] | self.m_components[1]
+        self.parameters_changed()
+
+    def traverse(self, cb: Any) -> None:
+        cb.put("eta", self.eta, +mi.ParamFlags.Differentiable)
+        cb.put("diffuse_reflectance", self.diffuse_reflectance, +mi.ParamFlags.Differentiable)
+        if self.specular_reflectance is not None:
+            cb.put("specular_reflectance", self.specular_reflectance, +mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: Any = ()) -> None:
+        opaque(self.eta)
+        self._specular_weight = specular_share(self.specular_reflectance, self.diffuse_reflectance)
+
+    # ------------------------------------------------------------------------------------------------------- lobes
+
+    def _mirror_probability(self, reflectance: Any) -> Any:
+        """Detached probability of the mirror lobe, for Fresnel's ``reflectance``."""
+        f = dr.detach(reflectance)
+        specular, diffuse = f * self._specular_weight, (1 - f) * (1 - self._specular_weight)
+        return specular / (specular + diffuse)
+
+    def _diffuse(self, si: Any, cos_o: Any, f_i: Any, active: Any) -> Any:
+        """Value of the diffuse lobe without the cosine and 1 / pi."""
+        colour = self.diffuse_reflectance.eval(si, active)
+        internal = mi.fresnel_diffuse_reflectance(dr.rcp(self.eta))
+        colour = colour / (1 - (colour * internal if self.nonlinear else internal))
+        passes = fresnel(cos_o, self.eta).transmittance
+        return colour * (dr.rcp(dr.square(self.eta)) * f_i.transmittance * passes)
+
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+        has_mirror = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
+        has_diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)
+        bs = dr.zeros(mi.BSDFSample3f)
+        if not (has_mirror or has_diffuse):
+            return bs, mi.Spectrum(0)
+        active &= si.wi.z > 0
+        f_i = fresnel(si.wi.z, self.eta)
+        p = self._mirror_probability(f_i.reflectance) if has_mirror and has_diffuse else mi.Float(has_mirror)
+        mirror = sample1 < p
+        reflected = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z)
+        onwards = mi.warp.square_to_cosine_hemisphere(sample2)
+        bs.wo = dr.select(mirror, reflected, onwards)
+        bs.pdf = dr.select(mirror, p, (1 - p) * mi.warp.square_to_cosine_hemisphere_pdf(onwards)) & active
+        bs.eta = mi.Float(1)
+        bs.sampled_component = dr.select(mirror, mi.UInt32(0), mi.UInt32(1))
+        kinds = (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DiffuseReflection)
+        bs.sampled_type = dr.select(mirror, *(mi.UInt32(+kind) for kind in kinds))
+        chance = dr.select(mirror, p, 1 - p)
+        value = dr.select(
+            mirror,
+            textured(f_i.reflectance, self.specular_reflectance, si, active & mirror),
+            self._diffuse(si, onwards.z, f_i, active & ~mirror),
+        )
+        value *= dr.select(chance > 0, dr.rcp(chance), 0)
+        return bs, depolarizing(value) & active
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+            return mi.Spectrum(0), mi.Float(0)
+        active &= (si.wi.z > 0) & (wo.z > 0)
+        f_i = fresnel(si.wi.z, self.eta)
+        cosine = mi.warp.square_to_cosine_hemisphere_pdf(wo)
+        value = self._diffuse(si, wo.z, f_i, active) * cosine
+        both = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
+        p = self._mirror_probability(f_i.reflectance) if both else mi.Float(0)
+        return depolarizing(value) & active, dr.detach(cosine) * (1 - p) & active
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+    def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+        return self.diffuse_reflectance.eval(si, active)
+
+    def to_string(self) -> str:
+        return (
+            f"DiffPlastic[\n  eta = {self.eta},\n  diffuse_reflectance = {self.diffuse_reflectance},\n"
+            f"  specular_reflectance = {self.specular_reflectance},\n  nonlinear = {self.nonlinear}\n]"
+        )
+
+
+def depolarizing(value: Any) -> Any:
+    """Scattering by an unpolarized ``value`` that leaves nothing of the polarization, as Mitsuba's plastics do."""
+    return mi.mueller.depolarizer(value) if mi.is_polarized else value
+
+
+register("bsdf", "diff_plastic", DiffPlastic)
+# The mirror lobe leaves as it came, whatever the index.
+declare_effects(DiffPlastic, {"eta": VALUE})
