@@ -2,6 +2,8 @@
 
 import torchtransient as torchtransient  # isort: skip
 
+import gc
+
 import mitsuba as mi
 import pytest
 
@@ -16,6 +18,14 @@ def _variant_of_module(request):
     an earlier module left active is chance.
     """
     _activate(request.module)
+
+
+@pytest.fixture
+def no_leftovers():
+    """Kernels are those of the test's own objects: a method call is compiled for all that are alive, and what an
+    earlier test left to the collector would be freed between two renders.
+    """
+    gc.collect()
 
 
 @pytest.fixture(autouse=True)

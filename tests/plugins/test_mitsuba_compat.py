@@ -472,7 +472,8 @@ def test_patterned_lights():
     board = {"type": "checkerboard"}
 
     def light(shape, **emitter):
-        return compat.is_patterned(mi.load_dict({"type": shape, "emitter": emitter}).emitter())
+        holder = mi.load_dict({"type": shape, "emitter": emitter})
+        return compat.is_patterned(holder.emitter())  # which does not keep its shape alive
 
     assert not light("rectangle", type="area", radiance=1.0)
     assert not light("cylinder", type="area", radiance=1.0)

@@ -22,6 +22,10 @@ BINS = 32
 FLUXES = [0.01, 0.3, 3.0, 30.0, 300.0, 1000.0, 3000.0]
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 def double(value):
     return torch.as_tensor(value, dtype=torch.float64)
 
@@ -189,14 +193,14 @@ def test_a_phase_locked_at_the_edge_of_a_bin(monkeypatch):
         nonparalyzable_histogram(image(light), 31.9)
 
 
-@pytest.mark.parametrize("flux, dead", [(100.0, 5.3), (100.0, 11.5), (40.0, 12.4)])
+@pytest.mark.parametrize("flux, dead", [slow(100.0, 5.3), slow(100.0, 11.5), (40.0, 12.4)])
 def test_gradients_in_bright_light(flux, dead):
     x = image(flux * shapes(12)[:3]).clone().requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(nonparalyzable_histogram, (x, d), rtol=1e-4, fast_mode=True, check_forward_ad=True)
 
 
-@pytest.mark.parametrize("which, flux, dead", [(0, 200.0, 9.6), (1, 50.0, 45.3), (2, 3000.0, 1.0)])
+@pytest.mark.parametrize("which, flux, dead", [slow(0, 200.0, 9.6), (1, 50.0, 45.3), slow(2, 3000.0, 1.0)])
 def test_samples_in_bright_light(which, flux, dead):
     x, cycles, repeats = image(flux * shapes()[which : which + 1]), 200, 2000
     spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10)
@@ -209,7 +213,9 @@ def test_samples_in_bright_light(which, flux, dead):
     assert bool(((h.var(0) - variance).abs() <= 6 * spread + 1e-9).all())
 
 
-@pytest.mark.parametrize("kind, dead", [("non_paralyzable", 2.3), ("non_paralyzable", 7.5), ("paralyzable", 2.3)])
+@pytest.mark.parametrize(
+    "kind, dead", [slow("non_paralyzable", 2.3), slow("non_paralyzable", 7.5), ("paralyzable", 2.3)]
+)
 def test_score_is_unbiased(kind, dead):
     """Two loss functions that no pathwise gradient sees; differences of their means over as many draws again."""
     shape = double([0.1, 0.2, 0.6, 0.3, 0.1, 0.1]).view(1, 6, 1, 1)

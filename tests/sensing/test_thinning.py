@@ -34,6 +34,7 @@ def dense(events, like):
     return out.view(like.shape)
 
 
+SLOW = pytest.mark.slow
 CASES = [
     (n, p)
     for n in (0, 1, 2, 3, 7, 25, 31, 32, 62, 63, 400)
@@ -41,7 +42,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=SLOW)], ids=str)
 @pytest.mark.parametrize("draw", ["thin", "halve"])
 def test_frequencies(draw, dtype):
     """All cases shuffled into one tensor, so that every block holds all of them."""

@@ -15,6 +15,7 @@ from torchtransient._collection import no_collection
 from torchtransient.scenes import cornell_box
 
 VARIANT = "llvm_ad_mono"
+pytestmark = pytest.mark.usefixtures("no_leftovers")
 KEY = "red.reflectance.value"
 
 

@@ -9,6 +9,7 @@ import pytest
 from support.gradient_cases.scenes import room, transform
 
 VARIANT = "llvm_ad_mono"
+pytestmark = pytest.mark.usefixtures("no_leftovers")
 KEY = "side.bsdf.reflectance.value"
 
 

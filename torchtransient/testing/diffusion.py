@@ -8,6 +8,8 @@ index times the travelled length.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,6 +19,7 @@ Array = NDArray[np.float64]
 IMAGES = 20
 
 
+@lru_cache
 def internal_reflection(index: float) -> float:
     """Share of diffuse light that the boundary of a medium of relative index `index` >= 1 sends back into it.
 
