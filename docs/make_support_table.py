@@ -28,10 +28,6 @@ NOT_SUPPORTED = (
         "derivatives of Mitsuba's own `conductor`, `polarizer`, `retarder`, `circular` in polarized variants",
         "`tt.load` builds `diff_conductor`, `diff_polarizer`, ... in their place, see docs/polarization.md",
     ),
-    (
-        "vertices of light-emitting meshes without texture coordinates",
-        "rigid motion only: the area element is not differentiated",
-    ),
     ("any path length through an explicit box filter", "not supported: `GradientError`"),
     ("second derivatives; unlimited depth (`max_depth=-1`)", "not supported: `GradientError`"),
 )

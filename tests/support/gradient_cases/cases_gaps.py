@@ -129,6 +129,8 @@ CASES = [
     near("lamp_with_stripes_moves", lambda: lamp(radiance=stripes()), LAMP, LIGHT),
     near("lamp_tilts", lamp, rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1),
     near("tube_moves", tube, LAMP, LIGHT),
-    near("lamp_with_a_cone_tilts", lambda: lamp(**CONE), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1, spp=65536),
+    near(
+        "lamp_with_a_cone_tilts", lambda: lamp(**CONE), rotate("light.to_world", (0, 1, 0)), LIGHT, step=0.1, spp=65536
+    ),
     near("tube_with_a_cone_moves", lambda: tube(**CONE), LAMP, LIGHT),
 ]

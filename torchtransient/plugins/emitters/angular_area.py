@@ -21,7 +21,7 @@ class AngularAreaLight(mi.Emitter):
     the two. The radiance is a radiance: along a ray it does not depend on the distance. Samples the shape by solid
     angle, as ``area`` does with a uniform radiance.
 
-    Differentiable: ``radiance``, and the shape by rigid motion and scaling. Raises SceneError for angles outside
+    Differentiable: ``radiance``, and the shape. Raises SceneError for angles outside
     ``0 <= beam_width <= cutoff_angle <= 90``. Not supported: importance sampling of a textured radiance, emission of
     rays (``sample_ray``).
     """
