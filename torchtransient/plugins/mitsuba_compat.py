@@ -154,6 +154,13 @@ def samples_its_shape(emitter: Any) -> bool:
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
 
 
+def is_never_met(emitter: Any) -> bool:
+    """Whether paths from a sensor never meet an emitter's light: Mitsuba's ``directionalarea`` has no value for the one
+    direction that it shines in, connections do not look for it, and it cannot be asked for the light in a direction.
+    """
+    return bool(emitter.class_name() == "DirectionalArea")
+
+
 def leaves_hits_detached(shape: Any) -> bool:
     """Whether the interactions of a shape lie at a detached distance along the ray: they follow neither the shape nor a
     ray that moves.

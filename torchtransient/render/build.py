@@ -17,7 +17,7 @@ from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.described_scene import check_scene
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, is_never_met
 from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
@@ -85,7 +85,8 @@ class BuiltScene:
     def findings(self) -> dict[str, str]:
         """What is unphysical in the description, by key."""
         if self._findings is None:
-            self._findings = scene_findings(described_shares(self.params), self.to_world)
+            dark = [emitter.id() for emitter in self.scene.emitters() if is_never_met(emitter)]
+            self._findings = scene_findings(described_shares(self.params), self.to_world, dark)
         return self._findings
 
     _findings: dict[str, str] | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +90,11 @@ class PhysicsWatch:
             )
 
 
-def scene_findings(shares: Any, transforms: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """What is unphysical in a description, by key. ``shares``: (key, smallest, largest)."""
-    found = {}
+def scene_findings(shares: Any, transforms: Mapping[str, np.ndarray], dark: Iterable[str] = ()) -> dict[str, str]:
+    """What is unphysical in a description, by key. ``shares``: (key, smallest, largest). ``dark``: names of the lights
+    that no path meets.
+    """
+    found = {name: dark_message(name) for name in dark}
     for key, low, high in shares:
         if low < -_SLACK or high > 1 + _SLACK:
             found[key] = outside_message(key, low, high)
@@ -100,6 +102,14 @@ def scene_findings(shares: Any, transforms: Mapping[str, np.ndarray]) -> dict[st
         if is_singular(matrix):
             found[key] = singular_message(key)
     return found
+
+
+def dark_message(name: str) -> str:
+    """The message for a light that paths from a sensor never meet."""
+    return (
+        f"{name!r} is black here: a directionalarea shines in one direction alone, which no path from a sensor ever "
+        "meets. Describe it as an 'angulararea' with a small cutoff_angle, or as a 'directional' light."
+    )
 
 
 def outside_message(key: str, low: float, high: float) -> str:

@@ -275,6 +275,12 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
                 "finite number, for instance to where the remaining throughput no longer matters."
             )
+        if contents.never_met:
+            raise GradientError(
+                f"{contents.never_met[0]!r}: paths from a sensor never meet the light of a directionalarea, and "
+                "Mitsuba cannot trace derivatives through its class. Leave it out, or describe it as an 'angulararea' of a "
+                "small cutoff_angle."
+            )
         return contents, Wanted(effects, sensor, contents)
 
     def _record(self, world, film, rays):
