@@ -278,8 +278,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         if contents.never_met:
             raise GradientError(
                 f"{contents.never_met[0]!r}: paths from a sensor never meet the light of a directionalarea, and "
-                "Mitsuba cannot trace derivatives through its class. Leave it out, or describe it as an 'angulararea' of a "
-                "small cutoff_angle."
+                "Mitsuba cannot trace derivatives through its class. Leave it out, or describe it as an 'angulararea' "
+                "of a small cutoff_angle."
             )
         return contents, Wanted(effects, sensor, contents)
 

@@ -62,19 +62,19 @@ class EmitterSampled(Connection):
         value *= mi.unpolarized_spectrum(proposal.weight)
         if not zeros:  # shadow rays only where they can matter; the derivative of a zero may matter
             active = active & (dr.max(dr.abs(intensity(value))) > 0)
-        length = self._length(world, vertex.at.p, ds) * (vertex.η * answer.eta)
+        length = self._length(world, vertex.at.p, ds, ds.d) * (vertex.η * answer.eta)
         opl = vertex.scattered_τ + mi.Float64(length)
         active = world.counted(active, opl)
         active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
     @staticmethod
-    def _length(world, p, ds):
-        """Length of the connection from ``p`` to a sampled point or direction of a light."""
+    def _length(world, p, ds, d):
+        """Length of the connection from ``p`` to a sampled point of a light, or to a distant one in direction ``d``."""
         if world.contents.distant is None:
             return ds.dist
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        return dr.select(far, world.contents.distant.length(p, ds.d), ds.dist)
+        return dr.select(far, world.contents.distant.length(p, d), ds.dist)
 
     # ------------------------------------------------------------------------------------------------- record
 
@@ -119,7 +119,7 @@ class EmitterSampled(Connection):
         value *= world.segment.attached_transmittance(world, vertex, end, lit)
         # Selected before the product: what an idle lane holds must not reach the adjoint of the throughput.
         value = product(vertex.carry.β, dr.select(lit, value, 0))
-        length = (self._length(world, si.p, light.ds) + light.longer) * towards.eta
+        length = (self._length(world, si.p, light.ds, d) + light.longer) * towards.eta
         opl = vertex.scattered_opl + mi.Float64(dr.detach(length) * v.η)
         slope = vertex.scattered_slope
         if wanted.geometry:
