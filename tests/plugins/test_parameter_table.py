@@ -76,6 +76,7 @@ MOVES = [
     ("sunsky sunsky_at_a_time", "sun_direction", "LS", "sun"),
     ("dielectric diff_dielectric", "eta", "LS", "index"),
     ("principled", "specular", "L", "index"),
+    ("diff_principled", "specular", "L", "index"),
     ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
     ("delayed", "lifetime", "L", "delay"),
     ("heterogeneous", "data", "M", "medium"),

@@ -39,8 +39,11 @@ def test_flakes_are_part_of_the_extinction(medium, phase, attenuates):
     assert (effect.moves_medium, effect.role) == (attenuates, "medium" if attenuates else "value")
 
 
-@pytest.mark.parametrize(("weight", "biased"), [(0.0, True), (0.3, False)])
-def test_a_lobe_of_weight_zero_has_no_derivative(weight, biased):
+@pytest.mark.parametrize(("weight", "lost"), [(0.0, True), (0.3, False)])
+def test_a_lobe_of_weight_zero_needs_another_plugin(weight, lost):
     ball = {"type": "sphere", "bsdf": {"type": "principled", "clearcoat": weight, "metallic": weight}}
-    assert effect_in(ball, "clearcoat.value").biased == biased
-    assert not effect_in(ball, "metallic.value").biased
+    for key, needed in (("clearcoat.value", lost), ("metallic.value", False)):
+        effect = effect_in(ball, key)
+        assert effect.stand_in == "diff_principled" and not effect.biased
+        assert effect.stand_in_needed == needed
+    assert effect_in(ball, "base_color.value").stand_in == ""

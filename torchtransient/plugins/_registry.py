@@ -81,6 +81,9 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_plastic", (("bsdf", "diff_rough_plastic"),)),
+    PluginModule(
+        "torchtransient.plugins.bsdfs.principled", (("bsdf", "diff_principled"), ("bsdf", "diff_principled_thin"))
+    ),
     PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
     PluginModule(
         "torchtransient.plugins.bsdfs.thin_elements",

@@ -91,33 +91,32 @@ def is_bump_map(bsdf: Any) -> bool:
     """
     return bool(bsdf.class_name() == "BumpMap")
 
-
-# Weights at which these skip a lobe, so that the derivative by the weight is zero there although its slope is not.
-SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
-    "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
-    "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
-}
-
 # Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
 # plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
-# computes tables from roughness and index outside of the graph.
+# computes tables from roughness and index outside of the graph. Plastics and principled surfaces lose lobes, see below.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
     "plastic": "diff_plastic",
     "roughplastic": "diff_rough_plastic",
+    "principled": "diff_principled",
+    "principledthin": "diff_principled_thin",
 }
-# Class names of the plastics. They never sample a lobe whose mean reflectance is exactly zero, and so lose the
-# derivative by that reflectance.
+# Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
+# and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
+# texture; plastics go by its mean.
 PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic"}
-_LOBES_OF_PLASTICS = ("diffuse_reflectance", "specular_reflectance")
+LOSING = PLASTICS | {"Principled": "principled", "PrincipledThin": "principledthin"}
+LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
+    **{name: {"diffuse_reflectance": (0,), "specular_reflectance": (0,)} for name in PLASTICS},
+    "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
+    "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2)},
+}
 
 
-def never_samples_black(bsdf: Any, slot: str) -> bool:
-    """Whether the texture that a BSDF holds under the name ``slot`` is the reflectance of a lobe that Mitsuba never
-    samples while it is black.
-    """
-    return bsdf.class_name() in PLASTICS and slot in _LOBES_OF_PLASTICS
+def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
+    """The values at which a BSDF loses a lobe whose weight is the texture that it holds under the name ``slot``."""
+    return LOST_AT.get(bsdf.class_name(), {}).get(slot, ())
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of

@@ -12,10 +12,10 @@ import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
+    LOSING,
     PLASTICS,
-    SKIPPED_AT,
     is_bump_map,
-    never_samples_black,
+    lost_at,
     normal_texture,
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
@@ -68,10 +68,6 @@ VARNISH = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
-)
-SKIPPED = ParameterEffect(
-    biased=True,
-    reason="biased: Mitsuba skips a lobe whose weight is exactly zero, and its derivative with it; start from 1e-6",
 )
 # Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
 _EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
@@ -163,51 +159,40 @@ def _attenuates(medium: Any, name: str) -> bool:
     return name != "albedo"
 
 
-def _skips_a_lobe(site: Site) -> bool:
-    """Whether a texture is the weight of a lobe and has, somewhere, exactly the value at which a lobe is skipped."""
-    if not site.owners:
-        return False
-    holder, name = site.owners[0]
-    values = SKIPPED_AT.get(holder.class_name(), {}).get(name, ())
-    if not values:
-        return False
-    shown = dr.detach(mi.traverse(site.node)[site.key])
-    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
-        return False
-    entries = shown.array if dr.is_tensor_v(shown) else shown
-    return any(bool(dr.any(entries == value, axis=None)) for value in values)
+def _is_weight_in(cls: str, site: Site) -> bool:
+    """Whether a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
+    return any(holder.class_name() == cls and lost_at(holder, name) for holder, name in site.owners)
 
 
-def _is_lobe_of(plastic: str, site: Site) -> bool:
-    """Whether a texture is the reflectance of a lobe of a plastic of Mitsuba, of the class ``plastic``."""
-    return any(holder.class_name() == plastic and never_samples_black(holder, name) for holder, name in site.owners)
-
-
-def _is_black_lobe_of(plastic: str, site: Site) -> bool:
-    """Whether it is one that is black now."""
-    lobes = [
-        dict(objects_of(holder))[name]
-        for holder, name in site.owners
-        if holder.class_name() == plastic and never_samples_black(holder, name)
-    ]
+def _is_lost_in(cls: str, site: Site) -> bool:
+    """Whether one is lost now."""
+    held = [(holder, name) for holder, name in site.owners if holder.class_name() == cls and lost_at(holder, name)]
     with dr.suspend_grad():
-        return any(dr.all(mi.Float(lobe.mean()) <= 0) for lobe in lobes)
+        if cls in PLASTICS:
+            textures = [dict(objects_of(holder))[name] for holder, name in held]
+            return any(dr.all(mi.Float(texture.mean()) <= 0) for texture in textures)
+        shown = mi.traverse(site.node)[site.key] if held else None
+        if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
+            return False
+        entries = shown.array if dr.is_tensor_v(shown) else shown
+        ends = {end for holder, name in held for end in lost_at(holder, name)}
+        return any(bool(dr.any(entries == end, axis=None)) for end in ends)
 
 
-def _rows_of_lobes() -> Iterator[Row]:
-    """The rows of the reflectances of plastics, those of black lobes first."""
-    for is_lobe, needed, words in ((_is_black_lobe_of, True, "a black lobe"), (_is_lobe_of, False, "another lobe")):
-        for cls, plugin in PLASTICS.items():
+def _rows_of_weights() -> Iterator[Row]:
+    """The rows of the weights of lobes, those of lost ones first."""
+    for condition, now in ((_is_lost_in, True), (_is_weight_in, False)):
+        for cls, plugin in LOSING.items():
             twin = DIFFERENTIABLE_PLUGINS[plugin]
-            reason = f"{CORRECT}; built as {twin} when asked for, which samples its lobes where they are black, too"
-            effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=needed)
-            yield Row(effect, partial(is_lobe, cls), f"the reflectance of {words} of {plugin}")
+            reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives of lobes of weight zero"
+            effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=now)
+            words = f"the weight of a lobe of {plugin}" + (", where one is zero" if now else "")
+            yield Row(effect, partial(condition, cls), words)
 
 
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
-AT_ZERO = Row(SKIPPED, _skips_a_lobe, "the weight of a lobe of principled or principledthin, where a lobe vanishes")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -262,7 +247,7 @@ declare_effects("Hair", {"eta": VALUE})
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO, *_rows_of_lobes())})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights())})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
-from torchtransient.plugins.mitsuba_compat import keeps_coefficients, never_samples_black
+from torchtransient.plugins.mitsuba_compat import keeps_coefficients, lost_at
 from torchtransient.plugins.node_walk import ShownValue, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
@@ -122,7 +122,7 @@ class ParameterTracker:
         if isinstance(node, mi.BSDF):
             return [node]
         holders = owners_of(node, self._holders)
-        return [holder for holder, name in holders if never_samples_black(holder, name)]
+        return [holder for holder, name in holders if lost_at(holder, name)]
 
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]

@@ -108,10 +108,12 @@ def bsdfs() -> dict[str, dict[str, Any]]:
         "diff_rough_dielectric", "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_polarizer",
         "diff_retarder", "diff_circular",
     )  # fmt: skip
+    thick = {"metallic": 0.1, "clearcoat": 0.1, "clearcoat_gloss": 0.1, **_PRINCIPLED}
+    thin = {"diff_trans": 0.1, **_PRINCIPLED}
     return {
         **{name: {"type": name} for name in plain},
-        "principled": {"type": "principled", "metallic": 0.1, "clearcoat": 0.1, "clearcoat_gloss": 0.1, **_PRINCIPLED},
-        "principledthin": {"type": "principledthin", "diff_trans": 0.1, **_PRINCIPLED},
+        **{name: {"type": name, **thick} for name in ("principled", "diff_principled")},
+        **{name: {"type": name, **thin} for name in ("principledthin", "diff_principled_thin")},
         "blendbsdf": {"type": "blendbsdf", "a": paint, "b": mirror, "weight": 0.5},
         "mask": {"type": "mask", "nested": paint, "opacity": 0.5},
         "twosided": {"type": "twosided", "nested": paint},

@@ -32,6 +32,27 @@ def thin_sheet():
     }  # fmt: skip
 
 
+def principled(kind, around, slot, value, **settings):
+    """A scene made by ``around`` with a principled surface of which one weight is at its end."""
+    weight = {slot: {"type": "uniform", "value": value}}
+    return around({"type": kind, "roughness": 0.5, "base_color": 0.7, **weight, **settings})
+
+
+def coated_wall(bsdf):
+    return room(bsdf=bsdf, light=area_light())
+
+
+def sheet(bsdf):
+    return glass_slab(bsdf, "rectangle")
+
+
+def at_an_end(name, scene, key, value, step, **arguments):
+    """A case of a weight where a lobe is lost in Mitsuba's plugin."""
+    row = "weight of a lobe of a principled surface, where a lobe vanishes"
+    side = -1 if value else 1
+    return Case(name, row, scene, set_color(f"{key}.value"), value, step, side=side, **arguments)
+
+
 def plastic(kind, **reflectances):
     """A room with a wall of plastic; of the lobes that are not named, the reflectance is that of the plugin."""
     lobes = {name: {"type": "uniform", "value": value} for name, value in reflectances.items()}
@@ -244,5 +265,58 @@ CASES = [
         0.8,
         0.02,
         "llvm_ad_spectral",
+    ),
+    at_an_end(
+        "no_clearcoat",
+        lambda: principled("diff_principled", coated_wall, "clearcoat", 0.0),
+        "wall.bsdf.clearcoat",
+        0.0,
+        0.2,
+        spp=4096,
+        fd_spp=16384,
+    ),
+    at_an_end(
+        "all_metal",
+        lambda: principled("diff_principled", coated_wall, "metallic", 1.0),
+        "wall.bsdf.metallic",
+        1.0,
+        0.05,
+        spp=4096,
+    ),
+    at_an_end(
+        "no_transmission",
+        lambda: principled("diff_principled", sheet, "spec_trans", 0.0, eta=1.4),
+        "slab.bsdf.spec_trans",
+        0.0,
+        0.1,
+        spp=8192,
+        fd_spp=65536,
+    ),
+    at_an_end(
+        "all_transmission",
+        lambda: principled("diff_principled", glass_slab, "spec_trans", 1.0, eta=1.4),
+        "slab.bsdf.spec_trans",
+        1.0,
+        0.05,
+        spp=4096,
+        fd_spp=16384,
+    ),
+    at_an_end(
+        "no_transmission_of_a_sheet",
+        lambda: principled("diff_principled_thin", sheet, "spec_trans", 0.0, eta=1.4, diff_trans=0.7),
+        "slab.bsdf.spec_trans",
+        0.0,
+        0.05,
+        spp=8192,
+        fd_spp=65536,
+    ),
+    at_an_end(
+        "no_light_through_paper",
+        lambda: principled("diff_principled_thin", sheet, "diff_trans", 0.0, eta=1.4),
+        "slab.bsdf.diff_trans",
+        0.0,
+        0.1,
+        spp=8192,
+        fd_spp=65536,
     ),
 ]
