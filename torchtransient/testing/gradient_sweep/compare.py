@@ -1,0 +1,155 @@
+"""One case of the sweep: how many samples a parameter calls for, and whether derivative and differences agree."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchtransient.testing.gradient_sweep.measure import Array, Subject, Tangent
+
+# The scale beside which an error is small: a part of the loss with absolute weights, for a change of the parameter by
+# its own size (a pose: by a metre or a fifth of a radian).
+SCALE = 0.1
+# A case counts as checked below this standard error, relative to the larger of |finite difference| and scale.
+RESOLVED = 0.02
+# A contradiction: more standard errors, and more of the larger of the two, than this.
+SIGMAS, TOLERANCE = 3.5, 0.01
+# Forward and reverse mode use the same paths and add float32 terms in another order.
+ROUNDING = 2e-3
+FIRST_SPP, MOST_SPP = 2048, 131072
+SEEDS, CONFIRMING_SEEDS = 6, 12
+
+
+@dataclass
+class Result:
+    """What the sweep found for one parameter of one scene along one direction."""
+
+    setting: str
+    key: str
+    tangent: str
+    verdict: str
+    reverse: float = float("nan")
+    reverse_error: float = float("nan")
+    forward: float = float("nan")
+    differences: float = float("nan")
+    differences_error: float = float("nan")
+    scale: float = float("nan")
+    spp: int = 0
+    seconds: float = 0.0
+    note: str = ""
+    table: str = ""
+    signature: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON, with six figures."""
+        return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in asdict(self).items()}
+
+
+@dataclass
+class Runs:
+    """Independent runs: derivative and difference of each seed."""
+
+    reverse: Array
+    differences: Array
+    scale: float
+
+    @property
+    def larger(self) -> float:
+        """The larger of |finite difference| and scale, beside which errors are small."""
+        return max(abs(float(self.differences.mean())), self.scale)
+
+    @staticmethod
+    def error_of(values: Array) -> float:
+        return float(values.std(ddof=1) / np.sqrt(len(values)))
+
+    @property
+    def worst_error(self) -> float:
+        """The larger one of the two standard errors, relative."""
+        return max(self.error_of(self.reverse), self.error_of(self.differences)) / self.larger
+
+    @property
+    def gap(self) -> float:
+        return float(self.reverse.mean() - self.differences.mean())
+
+    @property
+    def contradicts(self) -> bool:
+        """Seed by seed, since both are of the same paths."""
+        error = self.error_of(self.reverse - self.differences)
+        return abs(self.gap) > SIGMAS * error and abs(self.gap) > TOLERANCE * self.larger
+
+
+def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float) -> Runs:
+    """Derivatives and differences of some seeds."""
+    direction = tangent.direction.double().reshape(-1).numpy()
+    reverse, differences, scales = [], [], []
+    for seed in seeds:
+        reverse.append(float(subject.reverse(seed, spp) @ direction))
+        difference, scale = subject.difference(tangent, seed, spp, step)
+        differences.append(difference)
+        scales.append(scale)
+    return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)))
+
+
+def resolved_runs(subject: Subject, tangent: Tangent, deadline: float, spp: int) -> tuple[Runs, int]:
+    """More and more samples, until errors are small or time is over."""
+    while True:
+        started = time.monotonic()
+        runs = run(subject, tangent, range(SEEDS), spp, tangent.step)
+        lasted = time.monotonic() - started
+        if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED:
+            return runs, spp
+        factor = 2 ** int(np.ceil(np.log2(min(max(1.5 * (runs.worst_error / RESOLVED) ** 2, 2), 16))))
+        if spp * factor > MOST_SPP or time.monotonic() + 0.5 * lasted * factor > deadline:
+            return runs, spp
+        spp *= factor
+
+
+def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_SPP) -> Result:
+    """Compare the derivative of a parameter along a direction with finite differences."""
+    started = time.monotonic()
+    runs, spp = resolved_runs(subject, tangent, started + seconds, spp)
+    note = ""
+    if runs.contradicts:
+        # With fresh seeds, and with what the length of the step does taken away.
+        seeds = range(100, 100 + CONFIRMING_SEEDS)
+        whole, half = (run(subject, tangent, seeds, spp, step) for step in (tangent.step, tangent.step / 2))
+        extrapolated = (4 * half.differences - whole.differences) / 3
+        if not Runs(whole.reverse, extrapolated, whole.scale).contradicts and whole.contradicts:
+            note = "differences extrapolated to a step of zero"
+            whole = Runs(whole.reverse, extrapolated, whole.scale)
+        runs = whole
+    forward = subject.forward(tangent.direction, 0, spp)
+    reverse = float(subject.reverse(0, spp) @ tangent.direction.double().reshape(-1).numpy())
+    return Result(
+        setting="",
+        key=subject.key,
+        tangent=tangent.name,
+        verdict=verdict(runs, forward, reverse),
+        reverse=float(runs.reverse.mean()),
+        reverse_error=runs.error_of(runs.reverse),
+        forward=forward - reverse + float(runs.reverse.mean()),
+        differences=float(runs.differences.mean()),
+        differences_error=runs.error_of(runs.differences),
+        scale=runs.scale,
+        spp=spp,
+        seconds=time.monotonic() - started,
+        note=note,
+    )
+
+
+def verdict(runs: Runs, forward: float, reverse: float) -> str:
+    """agree, contradict, modes differ, unresolved, or no effect where the parameter does not matter in the scene."""
+    if not np.isfinite([runs.gap, forward, reverse]).all():
+        return "not finite"
+    if runs.contradicts:
+        return "contradict"
+    if abs(forward - reverse) > ROUNDING * max(runs.larger, abs(reverse)):
+        return "modes differ"
+    if runs.worst_error >= RESOLVED:
+        return "unresolved"
+    if abs(runs.differences.mean()) < 3 * runs.error_of(runs.differences) or not runs.differences.any():
+        return "no effect"
+    return "agree"

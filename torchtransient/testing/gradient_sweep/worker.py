@@ -1,0 +1,58 @@
+"""One process of the sweep: settings in, results out."""
+
+from __future__ import annotations
+
+import gc
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torchtransient.errors import TorchTransientError
+from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.scene_handle import load
+from torchtransient.testing.gradient_sweep.compare import Result, judge
+from torchtransient.testing.gradient_sweep.measure import Subject, quiet
+from torchtransient.testing.gradient_sweep.settings import Setting
+
+# Time for one parameter along one direction, in seconds.
+PATIENCE = 30.0
+
+
+def results_of(setting: Setting, folder: Path, patience: float = PATIENCE) -> Iterator[Result]:
+    """Everything that the sweep finds in one scene."""
+    import mitsuba as mi
+
+    from torchtransient import plugins
+
+    if mi.variant() != setting.variant:
+        mi.set_variant(setting.variant)
+    plugins.sync()
+    with quiet():
+        scene = load(setting.make(folder), variant=setting.variant)
+        for key, info in scene.parameters().items():
+            if setting.takes(key) and info.shape is not None and info.kind not in ("plain", "integer"):
+                for result in _results_of_key(scene, key, info, patience):
+                    result.setting = setting.name
+                    yield result
+    del scene
+    gc.collect()
+
+
+def _results_of_key(scene: Any, key: str, info: ParameterInfo, patience: float) -> Iterator[Result]:
+    if not info.differentiable:
+        yield Result("", key, "", "refused", table=info.reason)
+        return
+    started = time.monotonic()
+    try:
+        subject = Subject(scene, key)
+        for tangent in subject.tangents():
+            result = judge(subject, tangent, patience)
+            result.table = info.reason
+            yield result
+    except TorchTransientError as error:
+        seconds = time.monotonic() - started
+        yield Result("", key, "", "error", table=info.reason, note=f"{type(error).__name__}: {error}", seconds=seconds)
+    except Exception:  # noqa: BLE001  one parameter that fails must not end the sweep
+        yield Result("", key, "", "error", table=info.reason, note=traceback.format_exc(limit=3))
