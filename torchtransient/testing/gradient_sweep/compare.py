@@ -41,7 +41,8 @@ class Result:
     seconds: float = 0.0
     note: str = ""
     table: str = ""
-    signature: list[str] = field(default_factory=list)
+    biased: bool = False
+    place: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON, with six figures."""

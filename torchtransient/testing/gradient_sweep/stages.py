@@ -93,34 +93,86 @@ def plate_pose(tilt: float = 8.0) -> Matrix:
     return turn(1, tilt) @ stretch(30.0)
 
 
+def fading(value: float, texels: int = 16) -> Description:
+    """A texture that fades to nothing at its rim: an edge that nobody sees, in whichever mirror it stands."""
+    along = np.linspace(-1.0, 1.0, texels) ** 2
+    data = value * np.outer(1 - along, 1 - along)[..., None].astype(np.float32)
+    return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+
+
 def shining_wall(pose: Matrix, radiance: float) -> Description:
-    emitter = {"type": "area", "radiance": radiance}
-    return {"type": "rectangle", "to_world": pose, "bsdf": matte(), "emitter": emitter}
+    """A wall that shines and scatters, most in its middle."""
+    emitter = {"type": "area", "radiance": fading(radiance)}
+    return {
+        "type": "rectangle",
+        "to_world": pose @ stretch(5.0),
+        "bsdf": {"type": "diffuse", "reflectance": fading(0.6)},
+        "emitter": emitter,
+    }
 
 
 # ------------------------------------------------------------------------------------------------------------ scenes
+
+
+_FRONT, _BACK = move(0.4, 0.2, 5.0) @ turn(1, 180), move(-0.3, -0.2, -2.0)
 
 
 def between_lights(bsdf: Description, depth: int = 4) -> Description:
     """A tilted plate without a rim in reach between two shining walls: it matters what it reflects and what it lets
     through, in whichever direction.
     """
-    front, back = move(0.4, 0.2, 5.0) @ turn(1, 180) @ stretch(5.0), move(-0.3, -0.2, -2.0) @ stretch(5.0)
     return {
         "type": "scene",
         "integrator": path(depth),
         "sensor": camera(),
         "lamp": {"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0},
-        "front": shining_wall(front, 1.0),
-        "back": shining_wall(back, 0.7),
+        "front": shining_wall(_FRONT, 1.0),
+        "back": shining_wall(_BACK, 0.7),
         "plate": {"type": "rectangle", "to_world": plate_pose(), "bsdf": bsdf},
     }
 
 
-def in_a_group(bsdf: Description, depth: int = 4) -> Description:
-    """The same plate as the copy of a group."""
-    scene = between_lights(bsdf, depth)
-    plate = scene.pop("plate") | {"to_world": stretch(30.0)}
+def in_a_group(bsdf: Description, plate: Description | None = None) -> Description:
+    """The same plate, or another shape, as the copy of a group."""
+    scene = between_lights(bsdf)
+    pose = np.eye(4)
+    if plate is None:
+        plate, pose = scene["plate"] | {"to_world": stretch(30.0)}, turn(1, 8)
+    del scene["plate"]
     group = {"type": "shapegroup", "plate": plate}
-    copy = {"type": "instance", "to_world": turn(1, 8), "group": {"type": "ref", "id": "group"}}
-    return {**scene, "group": group, "copy": copy}
+    return {**scene, "group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
+
+
+def lit_by(lamp: Description, start: float = 3.0) -> Description:
+    """A plate under a lamp, and a panel beside it that both light."""
+    panel = move(1.6, 0.0, 1.2) @ turn(1, -60) @ stretch(0.4)
+    return {
+        "type": "scene",
+        "integrator": path(4),
+        "sensor": camera(start=start, bins=500),
+        "panel": {"type": "rectangle", "to_world": panel, "bsdf": matte(0.7)},
+        "plate": {"type": "rectangle", "to_world": plate_pose(), "bsdf": matte()},
+        "lamp": lamp,
+    }
+
+
+def seen_by(sensor: Description) -> Description:
+    """A plate under a lamp, before some sensor."""
+    scene = lit_by({"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0})
+    del scene["panel"]
+    return {**scene, "sensor": sensor}
+
+
+def filled(medium: Description) -> Description:
+    """A slab of medium, wider than the view, between a plate and a camera with a lamp and a shining wall behind it."""
+    scene = lit_by({"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0})
+    del scene["panel"]
+    scene["integrator"] = {"type": "transient_prbvolpath", "max_depth": 4, "rr_depth": 100}
+    scene["front"] = shining_wall(_FRONT, 1.0)
+    scene["slab"] = {
+        "type": "cube",
+        "to_world": move(0.0, 0.0, 1.25) @ stretch(20.0, 20.0, 0.75),
+        "bsdf": {"type": "null"},
+        "interior": medium,
+    }
+    return scene

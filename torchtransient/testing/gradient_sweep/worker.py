@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import gc
-import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import TorchTransientError
+from torchtransient.plugins.swept_parameters import UNCHECKED
 from torchtransient.render.parameters import ParameterInfo
 from torchtransient.render.scene_handle import load
 from torchtransient.testing.gradient_sweep.compare import Result, judge
@@ -41,18 +41,22 @@ def results_of(setting: Setting, folder: Path, patience: float = PATIENCE) -> It
 
 
 def _results_of_key(scene: Any, key: str, info: ParameterInfo, patience: float) -> Iterator[Result]:
+    for result in _judgements(scene, key, info, patience):
+        result.table = info.reason.removesuffix(f"; {UNCHECKED}")
+        result.biased = info.biased
+        result.place = list(info.place)
+        yield result
+
+
+def _judgements(scene: Any, key: str, info: ParameterInfo, patience: float) -> Iterator[Result]:
     if not info.differentiable:
-        yield Result("", key, "", "refused", table=info.reason)
+        yield Result("", key, "", "refused")
         return
-    started = time.monotonic()
     try:
         subject = Subject(scene, key)
         for tangent in subject.tangents():
-            result = judge(subject, tangent, patience)
-            result.table = info.reason
-            yield result
+            yield judge(subject, tangent, patience)
     except TorchTransientError as error:
-        seconds = time.monotonic() - started
-        yield Result("", key, "", "error", table=info.reason, note=f"{type(error).__name__}: {error}", seconds=seconds)
+        yield Result("", key, "", "error", note=f"{type(error).__name__}: {error}")
     except Exception:  # noqa: BLE001  one parameter that fails must not end the sweep
-        yield Result("", key, "", "error", table=info.reason, note=traceback.format_exc(limit=3))
+        yield Result("", key, "", "error", note=traceback.format_exc(limit=3))
