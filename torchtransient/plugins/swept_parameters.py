@@ -17,7 +17,7 @@ from torchtransient.plugins.parameter_effect import Site, lineage
 FILE = Path(__file__).with_name("swept_parameters.json")
 UNCHECKED = "unchecked: not compared with finite differences there"
 # These call what they hold by the names that the scene gives.
-_NAMED_BY_USERS = ("ShapeGroup", "BatchSensor")
+_NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
 def place_of(site: Site) -> tuple[str, ...]:

@@ -157,7 +157,7 @@ def _motions(pose: Array, rng: np.random.Generator, rigid: bool) -> list[Tangent
     shift = np.zeros((4, 4))
     shift[:3, 3] = rng.normal(size=3) * 0.3 + [0.0, 0.0, 0.8]
     shift[:3, 3] /= np.linalg.norm(shift[:3, 3])
-    axis = rng.normal(size=3)
+    axis = np.array([0.8, 0.9, 0.3]) + 0.3 * rng.normal(size=3)
     x, y, z = 0.2 * axis / np.linalg.norm(axis)
     turn = np.zeros((4, 4))
     turn[:3, :3] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) + (0.0 if rigid else 0.1) * np.eye(3)

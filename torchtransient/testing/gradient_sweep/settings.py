@@ -20,6 +20,8 @@ from torchtransient.testing.gradient_sweep.stages import (
 RGB, SPECTRAL, POLARIZED = "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"
 GROUP = ("group.", "copy.")
 PLATE, LAMP, SENSOR, MEDIUM = ("plate.",), ("lamp.",), ("sensor.",), ("slab.interior_medium.",)
+# What a plugin is inside of that cannot stand alone.
+BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinction", "constvolume as albedo")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
 
 
@@ -41,6 +43,11 @@ class Setting:
         """What messages and results call it."""
         words = f"{self.kind} {self.plugin}" + (f" in {self.inside}" if self.inside else "")
         return words if self.variant == RGB else f"{words}, {self.variant.removeprefix('llvm_ad_')}"
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether it stands for its plugin alone, in the simplest place that it can be in."""
+        return self.inside in BARE and (self.variant == RGB or self.kind == "spectrum")
 
     def takes(self, key: str) -> bool:
         """Whether a parameter is to be looked at."""

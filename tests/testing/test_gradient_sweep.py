@@ -1,0 +1,206 @@
+"""The sweep of gradients: it misses no plugin, its page is what was measured, and nothing called correct is wrong."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.plugins import _registry
+from torchtransient.plugins.swept_parameters import FILE, is_checked
+from torchtransient.testing.gradient_sweep import compare
+from torchtransient.testing.gradient_sweep.compare import Runs, judge
+from torchtransient.testing.gradient_sweep.measure import Subject, Tangent, tangents_of
+from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept
+from torchtransient.testing.gradient_sweep.settings import all_settings
+from torchtransient.testing.gradient_sweep.stages import between_lights, matte
+from torchtransient.testing.gradient_sweep.worker import results_of
+
+DOCS = Path(__file__).parents[2] / "docs"
+SETTINGS = {setting.name: setting for setting in all_settings()}
+# Verdicts that a parameter with a right derivative cannot have.
+WRONG = ("contradict", "modes differ", "not finite", "error")
+# Integrators, films, samplers and reconstruction filters have no parameters of light transport.
+NO_PART_OF_A_SCENE = {
+    "aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "hdrfilm", "specfilm",
+    "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent", "gaussian", "mitchell",
+    "catmullrom", "lanczos",
+}  # fmt: skip
+# Listed as unchecked: their data come in files of their own, or there is nothing to load.
+NOT_SWEPT = {"measured", "measured_polarized", "serialized", "blender"}
+# Go by another name in a dictionary (`srgb` is `rgb`), or are made by Mitsuba itself.
+BY_ANOTHER_NAME = {"srgb", "merge"}
+
+
+def plugins_in(description):
+    """The types of a description and of what it holds."""
+    if isinstance(description, dict):
+        if "type" in description:
+            yield description["type"]
+        for value in description.values():
+            yield from plugins_in(value)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sweep")
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return read_rows(DOCS)
+
+
+# ------------------------------------------------------------------------------------------------- nothing is left out
+
+
+def test_no_plugin_is_forgotten(folder):
+    """Of Mitsuba, a later one that brings more too, and of this library."""
+    installed = {path.stem for path in (Path(mi.__file__).parent / "plugins").glob("*.so")}
+    kinds = ("bsdf", "emitter", "medium", "phase", "sensor", "shape", "texture")
+    ours = {name for module in _registry.PLUGIN_MODULES for kind, name in module.plugins if kind in kinds}
+    met = {plugin for setting in SETTINGS.values() for plugin in plugins_in(setting.make(folder))}
+    missing = installed | ours
+    assert missing - met - NO_PART_OF_A_SCENE - NOT_SWEPT - BY_ANOTHER_NAME == set()
+
+
+def test_every_surface_is_nested_in_every_holder():
+    inside = {}
+    for setting in SETTINGS.values():
+        if setting.kind == "bsdf":
+            inside.setdefault(setting.plugin, set()).add(setting.inside)
+    assert inside["diffuse"] == {"", "mask", "blendbsdf", "bumpmap", "normalmap", "twosided", "instance"}
+    assert inside["dielectric"] == inside["diffuse"] - {"twosided"}
+
+
+def offered(setting, folder):
+    """The keys of a scene that the sweep has to list."""
+    mi.set_variant(setting.variant)
+    table = tt.load(setting.make(folder), variant=setting.variant).parameters()
+    numeric = [key for key, info in table.items() if info.shape is not None and info.kind not in ("plain", "integer")]
+    return {key for key in numeric if setting.takes(key)}
+
+
+def listed(rows):
+    keys = {}
+    for row in rows:
+        keys.setdefault(row["setting"], set()).add(row["key"])
+    return keys
+
+
+@pytest.mark.parametrize("name", random.Random(11).sample(sorted(SETTINGS), 12))
+def test_keys_listed_are_keys_offered(rows, folder, name):
+    assert listed(rows).get(name, set()) == offered(SETTINGS[name], folder)
+
+
+@pytest.mark.slow
+def test_all_keys_listed_are_keys_offered(rows, folder):
+    found = listed(rows)
+    for name, setting in SETTINGS.items():
+        assert found.get(name, set()) == offered(setting, folder), name
+    assert set(found) <= set(SETTINGS)
+
+
+# ------------------------------------------------------------------------------------------------- what the page says
+
+
+def test_page_and_table_are_those_of_the_data(rows):
+    assert (DOCS / PAGE).read_text(encoding="utf-8") == page(rows)
+    assert json.loads(FILE.read_text(encoding="utf-8")) == swept(rows)
+
+
+def test_nothing_called_correct_contradicts(rows):
+    assert [row for row in rows if row["verdict"] in WRONG and not row["biased"]] == []
+
+
+def test_hardly_anything_is_unresolved(rows):
+    compared = [row for row in rows if row["verdict"] != "refused"]
+    assert sum(row["verdict"] in ("unresolved", "no effect") for row in compared) <= 0.05 * len(compared)
+
+
+def test_what_is_not_checked_is_said():
+    scene = tt.load(between_lights({"type": "roughplastic", "alpha": 0.2}), variant="llvm_ad_rgb")
+    for info in scene.parameters().values():
+        assert info.checked == (not info.differentiable or is_checked(info.place))
+        assert info.checked != ("unchecked" in info.reason)
+    assert not is_checked(("NewBSDF.colour", "Rectangle.bsdf"))
+
+
+# ------------------------------------------------------------------------------------------ what is compared, and how
+
+
+def runs(reverse, differences, noise=0.0, scale=0.1, seeds=8):
+    rng = np.random.default_rng(1)
+    return Runs(reverse + noise * rng.normal(size=seeds), differences + noise * rng.normal(size=seeds), scale)
+
+
+@pytest.mark.parametrize(
+    ("reverse", "differences", "noise", "expected"),
+    [
+        (1.0, 1.0, 1e-3, "agree"),
+        (1.0, -1.0, 1e-3, "contradict"),
+        (0.0, 1.0, 1e-3, "contradict"),
+        (1.02, 1.0, 1e-3, "contradict"),
+        (1.005, 1.0, 1e-3, "agree"),
+        (1.0, 1.0, 0.1, "unresolved"),
+        (0.0, 0.0, 1e-4, "no effect"),
+        (0.0, 0.0, 0.0, "no effect"),
+        (float("nan"), 1.0, 0.0, "not finite"),
+    ],
+)
+def test_verdicts(reverse, differences, noise, expected):
+    assert compare.verdict(runs(reverse, differences, noise), reverse, reverse) == expected
+
+
+def test_modes_that_differ():
+    assert compare.verdict(runs(1.0, 1.0, 1e-3), 1.01, 1.0) == "modes differ"
+
+
+class Doubled(Subject):
+    """A subject with twice the right derivative."""
+
+    def reverse(self, seed, spp):
+        return 2 * super().reverse(seed, spp)
+
+
+def test_a_wrong_derivative_is_found():
+    scene = tt.load(between_lights(matte(0.3)), variant="llvm_ad_rgb")
+    key = "plate.bsdf.reflectance.value"
+    (tangent,) = tangents_of(key, "number", torch.tensor(0.3))
+    assert judge(Subject(scene, key), tangent, 0.0, spp=512).verdict in ("agree", "unresolved")
+    assert judge(Doubled(scene, key), tangent, 0.0, spp=512).verdict == "contradict"
+
+
+def test_directions():
+    """Poses move and turn, colours and grids change in each entry, and the same key has the same directions."""
+    names = [t.name for t in tangents_of("a.to_world", "transform", torch.eye(4))]
+    assert names == ["translation", "rotation and growth"]
+    grid = torch.full((2, 2, 2, 1), 0.5)
+    (first,), (again,) = (tangents_of("a.data", "tensor", grid) for _ in range(2))
+    assert isinstance(first, Tangent) and torch.equal(first.direction, again.direction)
+    assert first.direction.square().mean().sqrt() == pytest.approx(0.5)
+    assert len(tangents_of("lamp.position", "vector", torch.zeros(3))) == 2
+
+
+# ------------------------------------------------------------------------------------------------------ the sweep itself
+
+
+def sample():
+    """Every bare plugin, and some of what is inside others."""
+    bare = [setting for setting in SETTINGS.values() if setting.is_bare]
+    nested = [setting for setting in SETTINGS.values() if not setting.is_bare]
+    return [*bare, *random.Random(3).sample(nested, 12)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", sample(), ids=lambda s: s.name)
+def test_against_finite_differences(setting, folder):
+    """One round of few samples: what it cannot decide, the whole sweep does."""
+    wrong = [r for r in results_of(setting, folder, patience=0.0) if r.verdict in WRONG and not r.biased]
+    assert wrong == []
