@@ -17,13 +17,16 @@ TEXELS = 16
 @dataclass(frozen=True)
 class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
-    be inside others. ``polarizes``: to be swept in a polarized variant too.
+    be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be swept in a polarized variant too. ``grazing``: its parameters
+    matter at grazing angles.
     """
 
     make: Callable[[], Description]
     transmits: bool = False
     outermost: bool = False
+    bare_only: bool = False
     polarizes: bool = False
+    grazing: bool = False
 
 
 def picture(channels: int = 3, low: float = 0.3, high: float = 0.7, seed: int = 5) -> Description:
@@ -73,15 +76,16 @@ def surfaces() -> dict[str, Surface]:
         "plastic (nonlinear)": one("plastic", {**PLASTIC, "nonlinear": True}),
         "roughplastic": one("roughplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "pplastic": one("pplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
-        "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}),
+        "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}, grazing=True),
+        "principled (without lobes)": one("principled", {"roughness": 0.5, "specular": 0.6}, bare_only=True, grazing=True),
         "principled (transmitting)": one(
-            "principled", {**PRINCIPLED, "metallic": 0.2, "spec_trans": 0.6, "eta": 1.4}, transmits=True
+            "principled", {**PRINCIPLED, **COATED, "spec_trans": 0.6, "eta": 1.4}, transmits=True, grazing=True
         ),
         "principledthin": one(
-            "principledthin", {**PRINCIPLED, "spec_trans": 0.4, "diff_trans": 0.7, "eta": 1.4}, transmits=True
+            "principledthin", {**PRINCIPLED, "spec_trans": 0.4, "diff_trans": 0.7, "eta": 1.4}, transmits=True, grazing=True,
         ),
         "hair": one("hair", {}, transmits=True),
-        "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True),
+        "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
         "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **thin),
         "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
         "circular": one("circular", {"transmittance": 0.8}, **thin),

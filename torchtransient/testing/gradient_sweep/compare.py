@@ -15,6 +15,8 @@ from torchtransient.testing.gradient_sweep.measure import Array, Subject, Tangen
 SCALE = 0.1
 # A case counts as checked below this standard error, relative to the larger of |finite difference| and scale.
 RESOLVED = 0.02
+# Below that part of the scale, an effect is weak: errors then count beside this many times the effect itself.
+WEAK = 5.0
 # A contradiction: more standard errors, and more of the larger of the two, than this.
 SIGMAS, TOLERANCE = 3.5, 0.01
 # Forward and reverse mode use the same paths and add float32 terms in another order.
@@ -59,8 +61,11 @@ class Runs:
 
     @property
     def larger(self) -> float:
-        """The larger of |finite difference| and scale, beside which errors are small."""
-        return max(abs(float(self.differences.mean())), self.scale)
+        """The larger of |finite difference| and scale, beside which errors are small. What hardly has an effect is
+        compared with itself, lest everything agrees.
+        """
+        effect = max(abs(float(self.differences.mean())), abs(float(self.reverse.mean())))
+        return max(abs(float(self.differences.mean())), self.scale) if effect > RESOLVED * self.scale else WEAK * effect
 
     @staticmethod
     def error_of(values: Array) -> float:
@@ -69,7 +74,8 @@ class Runs:
     @property
     def worst_error(self) -> float:
         """The larger one of the two standard errors, relative."""
-        return max(self.error_of(self.reverse), self.error_of(self.differences)) / self.larger
+        worst = max(self.error_of(self.reverse), self.error_of(self.differences))
+        return worst / self.larger if self.larger else 0.0
 
     @property
     def gap(self) -> float:
@@ -142,15 +148,13 @@ def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_S
 
 
 def verdict(runs: Runs, forward: float, reverse: float) -> str:
-    """agree, contradict, modes differ, unresolved, or no effect where the parameter does not matter in the scene."""
+    """agree, contradict, modes differ, not finite, unresolved, or no effect where nothing changes at all."""
     if not np.isfinite([runs.gap, forward, reverse]).all():
         return "not finite"
     if runs.contradicts:
         return "contradict"
     if abs(forward - reverse) > ROUNDING * max(runs.larger, abs(reverse)):
         return "modes differ"
-    if runs.worst_error >= RESOLVED:
-        return "unresolved"
-    if abs(runs.differences.mean()) < 3 * runs.error_of(runs.differences) or not runs.differences.any():
+    if not runs.differences.any():
         return "no effect"
-    return "agree"
+    return "agree" if runs.worst_error < RESOLVED else "unresolved"

@@ -32,11 +32,14 @@ STOKES = (0.2, 1.0, -0.7, 1.3)
 
 @dataclass(frozen=True)
 class Tangent:
-    """A direction in the entries of a parameter. ``step``: of the differences, in units of the direction's length."""
+    """A direction in the entries of a parameter. ``step``: of the differences, in units of the direction's length.
+    ``one_sided``: the parameter is at the lower end of its range.
+    """
 
     name: str
     direction: torch.Tensor
     step: float
+    one_sided: bool = False
 
 
 class Subject:
@@ -78,7 +81,12 @@ class Subject:
         return float((response.double().sum((0, 1)) * self._weights).sum())
 
     def difference(self, tangent: Tangent, seed: int, spp: int, step: float) -> tuple[float, float]:
-        """The central difference along a direction, and the loss of absolute weights."""
+        """The difference along a direction, to second order in the step, and the loss of absolute weights."""
+        if tangent.one_sided:
+            here, scale = self.losses(self.value, seed, spp)
+            near, _ = self.losses(self.value + step * tangent.direction, seed, spp)
+            far, _ = self.losses(self.value + 2 * step * tangent.direction, seed, spp)
+            return (4 * near - 3 * here - far) / (2 * step), scale
         above, scale = self.losses(self.value + step * tangent.direction, seed, spp)
         below, _ = self.losses(self.value - step * tangent.direction, seed, spp)
         return (above - below) / (2 * step), scale
@@ -116,6 +124,8 @@ _SIZES = {
 
 # What poses turn about, seen from the origin of the object: turned about its middle, a plate hardly changes.
 _PIVOT = np.array([0.7, -0.5, 0.4])
+# Numbers that may be negative; of all others zero is the least.
+_SIGNED = ("g", "theta", "delta", "scale_tilt", *_SIZES)
 _PLACES = ("position", "sun_direction")
 
 
@@ -143,7 +153,9 @@ def tangents_of(key: str, kind: str, value: torch.Tensor) -> list[Tangent]:
     size = float(value.double().square().mean().sqrt()) or 1.0
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
     direction *= size / np.sqrt(np.mean(direction**2))
-    return [Tangent("relative change" if value.numel() == 1 else "random", _tensor(direction), _VALUE_STEP)]
+    words = "relative change" if value.numel() == 1 else "random"
+    at_zero = not value.any() and name not in _SIGNED
+    return [Tangent(f"{words}, from zero" if at_zero else words, _tensor(direction), _VALUE_STEP, at_zero)]
 
 
 def _tensor(array: Array) -> torch.Tensor:

@@ -58,11 +58,15 @@ def bsdf_settings() -> Iterator[Setting]:
     """Surfaces, bare and in others."""
     for name, surface in bsdfs.surfaces().items():
         for variant in (RGB, POLARIZED) if surface.polarizes else (RGB,):
-            yield Setting("bsdf", name, "", lambda _, s=surface: between_lights(s.make()), PLATE, variant)
+            yield Setting("bsdf", name, "", lambda _, s=surface: between_lights(s.make(), s.grazing), PLATE, variant)
+        if surface.bare_only:
+            continue
         for holder, wrap in bsdfs.HOLDERS.items():
             if not (surface.outermost or (holder == "twosided" and surface.transmits)):
-                yield Setting("bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make())), PLATE)
-        yield Setting("bsdf", name, "instance", lambda _, s=surface: in_a_group(s.make()), GROUP)
+                yield Setting(
+                    "bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make()), s.grazing), PLATE
+                )
+        yield Setting("bsdf", name, "instance", lambda _, s=surface: in_a_group(s.make(), None, s.grazing), GROUP)
 
 
 def shape_settings() -> Iterator[Setting]:

@@ -117,24 +117,24 @@ def shining_wall(pose: Matrix, radiance: float) -> Description:
 _FRONT, _BACK = move(0.4, 0.2, 5.0) @ turn(1, 180), move(-0.3, -0.2, -2.0)
 
 
-def between_lights(bsdf: Description, depth: int = 4) -> Description:
+def between_lights(bsdf: Description, grazing: bool = False) -> Description:
     """A tilted plate without a rim in reach between two shining walls: it matters what it reflects and what it lets
-    through, in whichever direction.
+    through, in whichever direction. ``grazing``: seen and lit from opposite sides at grazing angles.
     """
     return {
         "type": "scene",
-        "integrator": path(depth),
-        "sensor": camera(),
-        "lamp": {"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0},
+        "integrator": path(4),
+        "sensor": camera((2.9, 0.0, 1.2), fov=4.0) if grazing else camera(),
+        "lamp": {"type": "point", "position": [-2.9, 0.3, 0.8] if grazing else [0.8, 0.5, 3.0], "intensity": 10.0},
         "front": shining_wall(_FRONT, 1.0),
         "back": shining_wall(_BACK, 0.7),
         "plate": {"type": "rectangle", "to_world": plate_pose(), "bsdf": bsdf},
     }
 
 
-def in_a_group(bsdf: Description, plate: Description | None = None) -> Description:
+def in_a_group(bsdf: Description, plate: Description | None = None, grazing: bool = False) -> Description:
     """The same plate, or another shape, as the copy of a group."""
-    scene = between_lights(bsdf)
+    scene = between_lights(bsdf, grazing)
     pose = np.eye(4)
     if plate is None:
         plate, pose = scene["plate"] | {"to_world": stretch(30.0)}, turn(1, 8)
