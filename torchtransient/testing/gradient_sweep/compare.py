@@ -21,7 +21,9 @@ WEAK = 5.0
 SIGMAS, TOLERANCE = 3.5, 0.01
 # Forward and reverse mode use the same paths and add float32 terms in another order.
 ROUNDING = 2e-3
-FIRST_SPP, MOST_SPP = 2048, 131072
+# Samples per pixel for a film of so many pixels, more of smaller ones.
+FIRST_SPP, FILM = 2048, 16
+MOST_PATHS = 2**21
 SEEDS, CONFIRMING_SEEDS = 6, 12
 
 
@@ -78,6 +80,13 @@ class Runs:
         return worst / self.larger if self.larger else 0.0
 
     @property
+    def is_nothing(self) -> bool:
+        """Whether there is no effect, up to a small part of the scale."""
+        error = self.error_of(self.differences)
+        small = max(abs(float(self.reverse.mean())), error) < RESOLVED * self.scale
+        return small and abs(float(self.differences.mean())) <= 3 * error + ROUNDING * RESOLVED * self.scale
+
+    @property
     def gap(self) -> float:
         return float(self.reverse.mean() - self.differences.mean())
 
@@ -106,10 +115,10 @@ def resolved_runs(subject: Subject, tangent: Tangent, deadline: float, spp: int)
         started = time.monotonic()
         runs = run(subject, tangent, range(SEEDS), spp, tangent.step)
         lasted = time.monotonic() - started
-        if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED:
+        if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED or runs.is_nothing:
             return runs, spp
         factor = 2 ** int(np.ceil(np.log2(min(max(1.5 * (runs.worst_error / RESOLVED) ** 2, 2), 16))))
-        if spp * factor > MOST_SPP or time.monotonic() + 0.5 * lasted * factor > deadline:
+        if spp * factor * subject.pixels > MOST_PATHS or time.monotonic() + 0.5 * lasted * factor > deadline:
             return runs, spp
         spp *= factor
 
@@ -117,6 +126,7 @@ def resolved_runs(subject: Subject, tangent: Tangent, deadline: float, spp: int)
 def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_SPP) -> Result:
     """Compare the derivative of a parameter along a direction with finite differences."""
     started = time.monotonic()
+    spp *= max(1, FILM // subject.pixels)
     runs, spp = resolved_runs(subject, tangent, started + seconds, spp)
     note = ""
     if runs.contradicts:
@@ -148,13 +158,13 @@ def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_S
 
 
 def verdict(runs: Runs, forward: float, reverse: float) -> str:
-    """agree, contradict, modes differ, not finite, unresolved, or no effect where nothing changes at all."""
+    """agree, contradict, modes differ, not finite, unresolved, or no effect."""
     if not np.isfinite([runs.gap, forward, reverse]).all():
         return "not finite"
     if runs.contradicts:
         return "contradict"
     if abs(forward - reverse) > ROUNDING * max(runs.larger, abs(reverse)):
         return "modes differ"
-    if not runs.differences.any():
-        return "no effect"
-    return "agree" if runs.worst_error < RESOLVED else "unresolved"
+    if runs.worst_error < RESOLVED and runs.differences.any():
+        return "agree"
+    return "no effect" if runs.is_nothing else "unresolved"

@@ -9,6 +9,8 @@ import numpy as np
 from torchtransient.testing.gradient_sweep.bsdfs import picture, rgb
 from torchtransient.testing.gradient_sweep.stages import Description, camera, film, look, move, stretch, turn
 
+# Their light departs from the sphere around the scene.
+DISTANT = ("directional", "constant", "envmap", "sunsky", "sunsky (by date)", "timed_sunsky")
 _POSE = look((0.8, 0.3, 3.5), (0.1, 0.0, 0.0))
 
 
@@ -54,8 +56,6 @@ def sensors() -> dict[str, Description]:
     pose = look((0.3, 0.0, 3.0))
     plane = {key: value for key, value in plain.items() if key != "fov"}
     first, second = camera(), camera(origin=(0.4, 0.2, 3.5))
-    for one in (first, second):
-        one["film"] = {"type": "hdrfilm", "rfilter": {"type": "box"}}
     meter_film = {**film(), "width": 1, "height": 1}
     batch = {"type": "batch", "film": film(), "sampler": {"type": "independent"}, "first": first, "second": second}
     return {

@@ -47,6 +47,7 @@ class Subject:
 
     def __init__(self, scene: Scene, key: str):
         self.scene, self.key = scene, key
+        self.place = scene.parameters()[key].place
         self.options = scene.options_for([key], BuildOptions(transient=True))
         with active_variant(scene.variant):
             slot = scene.slots((key,), self.options).slots[0]
@@ -54,7 +55,7 @@ class Subject:
             self.value = torch.tensor(np.asarray(slot.initial, dtype=np.float32).reshape(slot.shape))
             sensors = scene.built(self.options).scene.sensors()
             self._weights = weights_of(sensors[0].film())
-            self._sensor_count = len(sensors)
+            self.pixels = int(np.prod(sensors[0].film().crop_size()))
 
     def _job(self, seed: int, spp: int, derivative: bool) -> RenderJob:
         items = (Item(0, 0, seed, seed),)
@@ -96,7 +97,9 @@ class Subject:
             return tuple(self.scene.built(self.options).scene.sensors()[0].film().cube_shape())
 
     def tangents(self) -> list[Tangent]:
-        return tangents_of(self.key, self.kind, self.value)
+        """The directions that are tried."""
+        turns = not self.place or self.place[0] not in _FIXED_AXES
+        return tangents_of(self.key, self.kind, self.value, turns)
 
 
 def weights_of(film: Any) -> torch.Tensor:
@@ -113,7 +116,7 @@ def weights_of(film: Any) -> torch.Tensor:
 
 # ---------------------------------------------------------------------------------------------------------- directions
 
-_VALUE_STEP = 0.03
+_VALUE_STEP = 0.05
 _LENGTH_STEP = 0.01
 # By the last name of a key: the size of a change in its entries that is worth 1.
 _SIZES = {
@@ -124,6 +127,8 @@ _SIZES = {
 
 # What poses turn about, seen from the origin of the object: turned about its middle, a plate hardly changes.
 _PIVOT = np.array([0.7, -0.5, 0.4])
+# Poses that cannot have a rotation.
+_FIXED_AXES = ("SDFGrid.to_world",)
 # Numbers that may be negative; of all others zero is the least.
 _SIGNED = ("g", "theta", "delta", "scale_tilt", *_SIZES)
 _PLACES = ("position", "sun_direction")
@@ -134,12 +139,12 @@ def generator_of(key: str) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(key.encode()))
 
 
-def tangents_of(key: str, kind: str, value: torch.Tensor) -> list[Tangent]:
-    """The directions that are tried: two for poses and positions, one otherwise."""
+def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True) -> list[Tangent]:
+    """The directions that are tried: two for poses and positions, one otherwise. ``turns``: a pose may rotate."""
     rng = generator_of(key)
     name = key.rsplit(".", 1)[-1]
     if kind in ("transform", "mesh_transform") and value.shape == (4, 4):
-        return _motions(value.double().numpy(), rng, "sensor" in key)
+        return _motions(value.double().numpy(), rng, "sensor" in key, turns)
     shape = tuple(value.shape)
     if name in _PLACES:
         first, second = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
@@ -162,7 +167,7 @@ def _tensor(array: Array) -> torch.Tensor:
     return torch.tensor(np.asarray(array), dtype=torch.float32)
 
 
-def _motions(pose: Array, rng: np.random.Generator, rigid: bool) -> list[Tangent]:
+def _motions(pose: Array, rng: np.random.Generator, rigid: bool, turns: bool) -> list[Tangent]:
     """A translation by a metre, and a rotation by a fifth of a radian about a point near the object's origin, with
     a growth by a tenth unless it must stay rigid.
     """
@@ -173,8 +178,10 @@ def _motions(pose: Array, rng: np.random.Generator, rigid: bool) -> list[Tangent
     x, y, z = 0.2 * axis / np.linalg.norm(axis)
     turn = np.zeros((4, 4))
     turn[:3, :3] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) + (0.0 if rigid else 0.1) * np.eye(3)
+    if not turns:
+        turn = np.diag([0.1, 0.1, 0.1, 0.0])
     turn[:3, 3] = -turn[:3, :3] @ (pose[:3, 3] + _PIVOT)
-    words = "rotation" if rigid else "rotation and growth"
+    words = "rotation" if rigid else "rotation and growth" if turns else "growth"
     return [
         Tangent("translation", _tensor(shift @ pose), _LENGTH_STEP),
         Tangent(words, _tensor(turn @ pose), _LENGTH_STEP),

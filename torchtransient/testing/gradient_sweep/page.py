@@ -38,7 +38,8 @@ differences, in scenes in which no silhouette moves. Written by `make sweep`
 - Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
 - *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
   and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.
-  *No effect*: decided, and the finite difference is zero within its error, so that little is proven.
+  An effect below {RESOLVED:.0%} of the scale is compared with itself, to a tenth. *No effect*: both are below that and
+  the finite difference is zero within three errors, so that nothing is proven.
 - *Contradict*: differs, seed by seed, by more than {SIGMAS} standard errors and more than {TOLERANCE:.0%} of the larger
   of |finite difference| and scale, with fresh seeds again and extrapolated to a step of zero.
 - Forward mode uses the paths of reverse mode; *modes differ* when they disagree by more than rounding.

@@ -98,7 +98,7 @@ def shape_settings() -> Iterator[Setting]:
 def emitter_settings() -> Iterator[Setting]:
     """Lights that stand alone, and every area light on every shape that takes one."""
     for name, light in lights.emitters().items():
-        yield Setting("emitter", name, "", lambda _, e=light: lit_by(e()), LAMP)
+        yield Setting("emitter", name, "", lambda _, e=light, d=name in lights.DISTANT: lit_by(e(), d), LAMP)
     for name, light in lights.area_emitters().items():
         for shape, make in shapes.lamp_shapes().items():
             yield Setting(

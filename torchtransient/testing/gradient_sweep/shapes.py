@@ -62,10 +62,10 @@ def write_curve(path: Path) -> Path:
 
 
 def _sdf_slab() -> Description:
-    """A slab of signed distances, two metres thick and 20 m wide."""
+    """A slab of signed distances, a metre thick and 20 m wide. Mitsuba's cannot be rotated."""
     z = np.linspace(-1.0, 1.0, 8, dtype=np.float32)
     grid = np.broadcast_to(np.abs(z) - 0.5, (8, 8, 8)).transpose(2, 1, 0)[..., None]
-    pose = _TILT @ move(-10.0, -10.0, -1.5) @ stretch(20.0, 20.0, 2.0)
+    pose = move(-10.0, -10.0, -1.5) @ stretch(20.0, 20.0, 2.0)
     return {"type": "sdfgrid", "grid": np.ascontiguousarray(grid), "to_world": pose}
 
 

@@ -89,8 +89,8 @@ def matte(reflectance: float = 0.5) -> Description:
     return {"type": "diffuse", "reflectance": reflectance}
 
 
-def plate_pose(tilt: float = 8.0) -> Matrix:
-    return turn(1, tilt) @ stretch(30.0)
+def plate_pose(half: float = 30.0) -> Matrix:
+    return turn(1, 8.0) @ stretch(half)
 
 
 def fading(value: float, texels: int = 16) -> Description:
@@ -143,15 +143,17 @@ def in_a_group(bsdf: Description, plate: Description | None = None, grazing: boo
     return {**scene, "group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
 
 
-def lit_by(lamp: Description, start: float = 3.0) -> Description:
-    """A plate under a lamp, and a panel beside it that both light."""
+def lit_by(lamp: Description, distant: bool = False) -> Description:
+    """A plate under a lamp, and a panel beside it that both light. ``distant``: the light comes from the sphere around
+    the scene, which is kept small.
+    """
     panel = move(1.6, 0.0, 1.2) @ turn(1, -60) @ stretch(0.4)
     return {
         "type": "scene",
         "integrator": path(4),
-        "sensor": camera(start=start, bins=500),
+        "sensor": camera(bins=800),
         "panel": {"type": "rectangle", "to_world": panel, "bsdf": matte(0.7)},
-        "plate": {"type": "rectangle", "to_world": plate_pose(), "bsdf": matte()},
+        "plate": {"type": "rectangle", "to_world": plate_pose(5.0 if distant else 30.0), "bsdf": matte()},
         "lamp": lamp,
     }
 
