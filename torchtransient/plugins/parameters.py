@@ -22,7 +22,7 @@ from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
 from torchtransient.plugins.parameter_effect import Site, matching_effect
-from torchtransient.plugins.swept_parameters import place_of
+from torchtransient.plugins.swept_parameters import location_of
 
 
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
@@ -116,9 +116,9 @@ class ParameterTracker:
         """As the function of this name, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
 
-    def place_of(self, node: Any, key: str) -> tuple[str, ...]:
+    def location_of(self, node: Any, key: str) -> tuple[str, ...]:
         """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""
-        return place_of(Site(node, key.rsplit(".", 1)[-1], tuple(owners_of(node, self._holders))))
+        return location_of(Site(node, key.rsplit(".", 1)[-1], tuple(owners_of(node, self._holders))))
 
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]

@@ -20,7 +20,7 @@ UNCHECKED = "unchecked: not compared with finite differences there"
 _NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
-def place_of(site: Site) -> tuple[str, ...]:
+def location_of(site: Site) -> tuple[str, ...]:
     """Names of a parameter and of what its plugin is in, the nearest first: "class.key", "class.slot"."""
     places = [(lineage(node)[0], name) for node, name in [(site.node, site.key), *site.owners]]
     return tuple(dict.fromkeys(cls if cls in _NAMED_BY_USERS else f"{cls}.{name}" for cls, name in places))

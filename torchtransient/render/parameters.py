@@ -117,7 +117,7 @@ def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> Parame
     """With the place of the parameter, and whether the sweep of gradients has been there."""
     if not info.differentiable:
         return info
-    place = tracker.place_of(node, info.key)
+    place = tracker.location_of(node, info.key)
     if is_checked(place):
         return replace(info, place=place)
     return replace(info, place=place, checked=False, reason=f"{info.reason}; {UNCHECKED}")

@@ -17,8 +17,8 @@ TEXELS = 16
 @dataclass(frozen=True)
 class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
-    be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be swept in a polarized variant too. ``grazing``: its parameters
-    matter at grazing angles.
+    be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be
+    swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles.
     """
 
     make: Callable[[], Description]
@@ -57,6 +57,11 @@ PRINCIPLED = {
 COATED = {"metallic": 0.3, "clearcoat": 0.5, "clearcoat_gloss": 0.4}
 
 
+def late() -> Description:
+    """Paint that scatters late."""
+    return {"type": "delayed", "nested": matte(), "lifetime": 0.5}
+
+
 def surfaces() -> dict[str, Surface]:
     """Every BSDF that holds no other, by the name of its plugin; a word behind the name for what it is made of."""
 
@@ -77,12 +82,17 @@ def surfaces() -> dict[str, Surface]:
         "roughplastic": one("roughplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "pplastic": one("pplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}, grazing=True),
-        "principled (without lobes)": one("principled", {"roughness": 0.5, "specular": 0.6}, bare_only=True, grazing=True),
+        "principled (without lobes)": one(
+            "principled", {"roughness": 0.5, "specular": 0.6}, bare_only=True, grazing=True
+        ),
         "principled (transmitting)": one(
             "principled", {**PRINCIPLED, **COATED, "spec_trans": 0.6, "eta": 1.4}, transmits=True, grazing=True
         ),
         "principledthin": one(
-            "principledthin", {**PRINCIPLED, "spec_trans": 0.4, "diff_trans": 0.7, "eta": 1.4}, transmits=True, grazing=True,
+            "principledthin",
+            {**PRINCIPLED, "spec_trans": 0.4, "diff_trans": 0.7, "eta": 1.4},
+            transmits=True,
+            grazing=True,
         ),
         "hair": one("hair", {}, transmits=True),
         "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
@@ -96,13 +106,9 @@ def surfaces() -> dict[str, Surface]:
         "diff_retarder": one("diff_retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
         "diff_circular": one("diff_circular", {"transmittance": 0.8}, **thin),
         "null": one("null", {}, transmits=True),
-        "delayed": Surface(
-            lambda: {"type": "delayed", "nested": matte(), "lifetime": 0.5, "elastic_fraction": 0.3, "quantum_yield": 0.8},
-            outermost=True,
-        ),
+        "delayed": Surface(lambda: late() | {"elastic_fraction": 0.3, "quantum_yield": 0.8}, outermost=True),
         "delayed (elastic part)": Surface(
-            lambda: {"type": "delayed", "nested": matte(), "lifetime": 0.5, "elastic": {"type": "conductor", **METAL}},
-            outermost=True,
+            lambda: late() | {"elastic": {"type": "conductor", **METAL}}, outermost=True
         ),
     }  # fmt: skip
 

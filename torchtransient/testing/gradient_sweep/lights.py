@@ -29,8 +29,12 @@ def emitters() -> dict[str, Callable[[], Description]]:
             "type": "spot", "intensity": rgb(10.0, 8.0, 6.0), "cutoff_angle": 40.0, "beam_width": 2.0,
             "texture": picture(3), "to_world": _POSE,
         },
-        "projector": lambda: {"type": "projector", "irradiance": picture(3), "fov": 60.0, "scale": 3.0, "to_world": _POSE},
-        "directional": lambda: {"type": "directional", "direction": [-0.3, 0.1, -1.0], "irradiance": rgb(3.0, 2.0, 1.0)},
+        "projector": lambda: {
+            "type": "projector", "irradiance": picture(3), "fov": 60.0, "scale": 3.0, "to_world": _POSE,
+        },
+        "directional": lambda: {
+            "type": "directional", "direction": [-0.3, 0.1, -1.0], "irradiance": rgb(3.0, 2.0, 1.0),
+        },
         "constant": lambda: {"type": "constant", "radiance": rgb(1.0, 0.8, 0.6)},
         "envmap": sky,
         "sunsky": lambda: {"type": "sunsky", "sun_direction": [0.3, 0.4, 1.0], "to_world": np.eye(4)},

@@ -97,8 +97,8 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
     biased = sum(row["biased"] for row in rows if row["verdict"] == "contradict")
     share = counts["unresolved"] / max(compared, 1)
     return (
-        f"{compared} comparisons in {len({row['setting'] for row in rows})} scenes: {said}. Unresolved: {share:.1%}. Of "
-        f"what contradicts, {biased} are called biased by the table of parameters."
+        f"{compared} comparisons in {len({row['setting'] for row in rows})} scenes: {said}. Unresolved: {share:.1%}. "
+        f"Of what contradicts, {biased} are called biased by the table of parameters."
     )
 
 

@@ -140,7 +140,8 @@ def in_a_group(bsdf: Description, plate: Description | None = None, grazing: boo
         plate, pose = scene["plate"] | {"to_world": stretch(30.0)}, turn(1, 8)
     del scene["plate"]
     group = {"type": "shapegroup", "plate": plate}
-    return {**scene, "group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
+    copy = {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}
+    return {**scene, "group": group, "copy": copy}
 
 
 def lit_by(lamp: Description, distant: bool = False) -> Description:

@@ -83,9 +83,13 @@ def slots() -> dict[str, Slot]:
         "opacity": Slot(lambda t: {"type": "mask", "opacity": t, "nested": matte()}, "opacity", channels=1),
         "opacity of a mirror": Slot(lambda t: {"type": "mask", "opacity": t, "nested": mirror}, "opacity", channels=1),
         "weight": Slot(lambda t: {"type": "blendbsdf", "weight": t, "a": matte(), "b": rough}, "weight", channels=1),
-        "weight of a mirror": Slot(lambda t: {"type": "blendbsdf", "weight": t, "a": matte(), "b": mirror}, "weight", channels=1),
+        "weight of a mirror": Slot(
+            lambda t: {"type": "blendbsdf", "weight": t, "a": matte(), "b": mirror}, "weight", channels=1
+        ),
         "heights": Slot(lambda t: {"type": "bumpmap", "t": t, "nested": matte()}, "nested_texture", 0.0, 1.0, 1),
-        "heights of a mirror": Slot(lambda t: {"type": "bumpmap", "t": t, "nested": mirror}, "nested_texture", 0.0, 1.0, 1),
+        "heights of a mirror": Slot(
+            lambda t: {"type": "bumpmap", "t": t, "nested": mirror}, "nested_texture", 0.0, 1.0, 1
+        ),
     }
 
 
