@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import random
+import subprocess
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -14,10 +16,11 @@ import torch
 import torchtransient as tt
 from torchtransient.plugins import _registry
 from torchtransient.plugins.swept_parameters import FILE, is_checked
-from torchtransient.testing.gradient_sweep import compare
+from torchtransient.testing.gradient_sweep import compare, runner
 from torchtransient.testing.gradient_sweep.compare import Runs, judge
 from torchtransient.testing.gradient_sweep.measure import Subject, Tangent, tangents_of
 from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept
+from torchtransient.testing.gradient_sweep.runner import ResultFile
 from torchtransient.testing.gradient_sweep.settings import all_settings
 from torchtransient.testing.gradient_sweep.stages import between_lights, matte
 from torchtransient.testing.gradient_sweep.worker import results_of
@@ -189,6 +192,75 @@ def test_directions():
 
 
 # ----------------------------------------------------------------------------------------------------- the sweep itself
+
+
+def row(setting, key, verdict, place, **values):
+    result = compare.Result(setting, key, "random", verdict, **values)
+    return result.as_dict() | {"place": place}
+
+
+def test_what_the_table_of_parameters_reads():
+    """Names of what was decided; places of what was not, unless they were along another direction."""
+    glass, mask = "RoughDielectric.alpha", "MaskBSDF.nested_bsdf"
+    data = swept(
+        [
+            row("a", "x", "agree", [glass, "Rectangle.bsdf"]),
+            row("b", "x", "unresolved", [glass, mask, "Rectangle.bsdf"]),
+            row("c", "x", "unresolved", [glass, "Sphere.bsdf"]),
+            row("d", "y", "no effect", ["Hair.eta", "Rectangle.bsdf"]),
+            row("e", "z", "refused", ["SDFGrid.grid"]),
+        ]
+    )
+    assert data == {"checked": ["Rectangle.bsdf", glass], "undecided": [["Hair.eta"], [glass, mask]]}
+
+
+def test_results_are_taken_up_again(tmp_path):
+    """Settings that are not finished are done anew, and the later one of two results counts."""
+    first, second = list(SETTINGS)[:2]
+    file = ResultFile(tmp_path / "results.jsonl")
+    file.write(row(second, "x", "agree", [], scale=1.0))
+    file.write({"done": second})
+    file.write(row(first, "x", "agree", []))
+    file.path.write_text(file.path.read_text() + '{"setting": "cut o')
+    assert file.done() == {second}
+    assert [line["setting"] for line in file.results()] == [second]
+    file.path.write_text(file.path.read_text() + "\n")
+    file.write(row(first, "x", "contradict", []))
+    file.write({"done": first})
+    assert [(line["setting"], line["verdict"]) for line in file.results()] == [(first, "contradict"), (second, "agree")]
+
+
+def test_a_process_that_dies_is_a_result(tmp_path, monkeypatch):
+    """What it was at is given up, the rest goes to another process."""
+    names, died = list(SETTINGS)[:3], []
+
+    def process(waiting, results, patience, progress):
+        if waiting[0] == names[1]:
+            died.append(waiting[0])
+            return [], "Segmentation fault"
+        results.write({"done": waiting[0]})
+        return waiting[:1] if names[1] in waiting else waiting, ""
+
+    monkeypatch.setattr(runner, "_run_process", process)
+    file = ResultFile(tmp_path / "results.jsonl")
+    runner.sweep([SETTINGS[name] for name in names], file, processes=1)
+    assert died == [names[1]]
+    (lost,) = [line for line in file.lines() if line.get("verdict") == "error"]
+    assert lost["setting"] == names[1] and "Segmentation fault" in lost["note"]
+
+
+def test_a_process_has_one_variant():
+    for batch in runner.batches(SETTINGS.values()):
+        assert len({setting.variant for setting in batch}) == 1
+
+
+@pytest.mark.slow
+def test_from_the_command_line(tmp_path):
+    """Processes, file and page, for one scene."""
+    results, name = tmp_path / "results.jsonl", "sensor orthographic"
+    command = [sys.executable, "-m", "torchtransient.testing.gradient_sweep", "--results", str(results)]
+    subprocess.run([*command, "--only", f"^{name}$", "--patience", "0"], check=True)
+    assert {line["key"] for line in ResultFile(results).results()} == {"sensor.to_world"}
 
 
 def sample():

@@ -117,6 +117,8 @@ def weights_of(film: Any) -> torch.Tensor:
 # ---------------------------------------------------------------------------------------------------------- directions
 
 _VALUE_STEP = 0.05
+# Other free flights are other paths: longer steps have less noise.
+_MEDIUM_STEP = 0.1
 _LENGTH_STEP = 0.01
 # By the last name of a key: the size of a change in its entries that is worth 1.
 _SIZES = {
@@ -156,11 +158,12 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True) ->
         direction = rng.normal(size=shape) * _SIZES[name]
         return [Tangent("random", _tensor(direction), _LENGTH_STEP)]
     size = float(value.double().square().mean().sqrt()) or 1.0
+    step = _MEDIUM_STEP if "medium" in key else _VALUE_STEP
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
     direction *= size / np.sqrt(np.mean(direction**2))
     words = "relative change" if value.numel() == 1 else "random"
     at_zero = not value.any() and name not in _SIGNED
-    return [Tangent(f"{words}, from zero" if at_zero else words, _tensor(direction), _VALUE_STEP, at_zero)]
+    return [Tangent(f"{words}, from zero" if at_zero else words, _tensor(direction), step, at_zero)]
 
 
 def _tensor(array: Array) -> torch.Tensor:

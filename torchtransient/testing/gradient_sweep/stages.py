@@ -160,17 +160,18 @@ def lit_by(lamp: Description, distant: bool = False) -> Description:
 
 
 def seen_by(sensor: Description) -> Description:
-    """A plate under a lamp, before some sensor."""
-    scene = lit_by({"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0})
+    """A plate under a lamp, before some sensor. One that a shape carries hides nothing: the lamp is before it."""
+    on_a_shape = "sensor" in sensor
+    scene = lit_by({"type": "point", "position": [0.8, 0.5, 1.0 if on_a_shape else 3.0], "intensity": 10.0})
     del scene["panel"]
-    return {**scene, "sensor": sensor}
+    return {**scene, "sensor": sensor, "integrator": path(2 if on_a_shape else 4)}
 
 
 def filled(medium: Description) -> Description:
     """A slab of medium, wider than the view, between a plate and a camera with a lamp and a shining wall behind it."""
     scene = lit_by({"type": "point", "position": [0.8, 0.5, 3.0], "intensity": 10.0})
     del scene["panel"]
-    scene["integrator"] = {"type": "transient_prbvolpath", "max_depth": 4, "rr_depth": 100}
+    scene["integrator"] = {"type": "transient_prbvolpath", "max_depth": 3, "rr_depth": 100}
     scene["front"] = shining_wall(_FRONT, 1.0)
     scene["slab"] = {
         "type": "cube",
