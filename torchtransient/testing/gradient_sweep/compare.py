@@ -24,6 +24,8 @@ ROUNDING = 2e-3
 # Samples per pixel for a film of so many pixels, more of smaller ones.
 FIRST_SPP, FILM = 2048, 16
 MOST_PATHS = 2**21
+# How often a step is halved when its length makes a difference.
+SHORTER_STEPS = 4
 SEEDS, CONFIRMING_SEEDS = 6, 12
 
 
@@ -123,6 +125,24 @@ def resolved_runs(subject: Subject, tangent: Tangent, deadline: float, spp: int)
         spp *= factor
 
 
+def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, str]:
+    """Once more with fresh seeds, and with what the length of the step does taken away: shorter steps, until they
+    change nothing, and what is left extrapolated to a step of zero.
+    """
+    seeds, step = range(100, 100 + CONFIRMING_SEEDS), tangent.step
+    whole = run(subject, tangent, seeds, spp, step)
+    for _ in range(SHORTER_STEPS):
+        if not whole.contradicts:
+            return whole, "" if step == tangent.step else f"step of {step:g}"
+        half = run(subject, tangent, seeds, spp, step / 2)
+        extrapolated = Runs(whole.reverse, (4 * half.differences - whole.differences) / 3, whole.scale)
+        change = Runs(whole.differences, half.differences, whole.scale)
+        if not extrapolated.contradicts or not change.contradicts:
+            return extrapolated, f"differences extrapolated from steps of {step:g} and {step / 2:g}"
+        whole, step = half, step / 2
+    return whole, f"step of {step:g}, shorter ones may differ"
+
+
 def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_SPP) -> Result:
     """Compare the derivative of a parameter along a direction with finite differences."""
     started = time.monotonic()
@@ -130,14 +150,7 @@ def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_S
     runs, spp = resolved_runs(subject, tangent, started + seconds, spp)
     note = ""
     if runs.contradicts:
-        # With fresh seeds, and with what the length of the step does taken away.
-        seeds = range(100, 100 + CONFIRMING_SEEDS)
-        whole, half = (run(subject, tangent, seeds, spp, step) for step in (tangent.step, tangent.step / 2))
-        extrapolated = (4 * half.differences - whole.differences) / 3
-        if not Runs(whole.reverse, extrapolated, whole.scale).contradicts and whole.contradicts:
-            note = "differences extrapolated to a step of zero"
-            whole = Runs(whole.reverse, extrapolated, whole.scale)
-        runs = whole
+        runs, note = confirmed_runs(subject, tangent, spp)
     forward = subject.forward(tangent.direction, 0, spp)
     reverse = float(subject.reverse(0, spp) @ tangent.direction.double().reshape(-1).numpy())
     return Result(

@@ -47,7 +47,7 @@ class Subject:
 
     def __init__(self, scene: Scene, key: str):
         self.scene, self.key = scene, key
-        self.place = scene.parameters()[key].place
+        self.info = scene.parameters()[key]
         self.options = scene.options_for([key], BuildOptions(transient=True))
         with active_variant(scene.variant):
             slot = scene.slots((key,), self.options).slots[0]
@@ -98,8 +98,8 @@ class Subject:
 
     def tangents(self) -> list[Tangent]:
         """The directions that are tried."""
-        turns = not self.place or self.place[0] not in _FIXED_AXES
-        return tangents_of(self.key, self.kind, self.value, turns)
+        turns = not self.info.place or self.info.place[0] not in _FIXED_AXES
+        return tangents_of(self.key, self.kind, self.value, turns, self.info.moves_path_length)
 
 
 def weights_of(film: Any) -> torch.Tensor:
@@ -141,8 +141,10 @@ def generator_of(key: str) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(key.encode()))
 
 
-def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True) -> list[Tangent]:
-    """The directions that are tried: two for poses and positions, one otherwise. ``turns``: a pose may rotate."""
+def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True, moves: bool = False) -> list[Tangent]:
+    """The directions that are tried: two for poses and positions, one otherwise. ``turns``: a pose may rotate.
+    ``moves``: a number may change path lengths.
+    """
     rng = generator_of(key)
     name = key.rsplit(".", 1)[-1]
     if kind in ("transform", "mesh_transform") and value.shape == (4, 4):
@@ -158,7 +160,7 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True) ->
         direction = rng.normal(size=shape) * _SIZES[name]
         return [Tangent("random", _tensor(direction), _LENGTH_STEP)]
     size = float(value.double().square().mean().sqrt()) or 1.0
-    step = _MEDIUM_STEP if "medium" in key else _VALUE_STEP
+    step = _LENGTH_STEP if moves else _MEDIUM_STEP if "medium" in key else _VALUE_STEP
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
     direction *= size / np.sqrt(np.mean(direction**2))
     words = "relative change" if value.numel() == 1 else "random"
