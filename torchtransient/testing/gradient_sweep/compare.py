@@ -21,12 +21,28 @@ WEAK = 5.0
 SIGMAS, TOLERANCE = 3.5, 0.01
 # Forward and reverse mode use the same paths and add float32 terms in another order.
 ROUNDING = 2e-3
-# Samples per pixel for a film of so many pixels, more of smaller ones.
-FIRST_SPP, FILM = 2048, 16
+# Samples per pixel are for a film of so many pixels, more of smaller ones.
+FILM = 16
 MOST_PATHS = 2**21
 # How often a step is halved when its length makes a difference.
 SHORTER_STEPS = 4
-SEEDS, CONFIRMING_SEEDS = 6, 12
+CONFIRMING_SEEDS = 12
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is done for one parameter: seconds for one direction, seeds and samples per pixel to begin with, at
+    most so many directions.
+    """
+
+    seconds: float = 30.0
+    seeds: int = 6
+    spp: int = 2048
+    directions: int = 2
+
+
+# One round of few samples: what that cannot decide stays unresolved.
+QUICK = Effort(0.0, 4, 1024, 1)
 
 
 @dataclass
@@ -111,11 +127,13 @@ def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float)
     return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)))
 
 
-def resolved_runs(subject: Subject, tangent: Tangent, deadline: float, spp: int) -> tuple[Runs, int]:
+def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int]:
     """More and more samples, until errors are small or time is over."""
+    deadline = time.monotonic() + effort.seconds
+    spp = effort.spp * max(1, FILM // subject.pixels)
     while True:
         started = time.monotonic()
-        runs = run(subject, tangent, range(SEEDS), spp, tangent.step)
+        runs = run(subject, tangent, range(effort.seeds), spp, tangent.step)
         lasted = time.monotonic() - started
         if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED or runs.is_nothing:
             return runs, spp
@@ -143,13 +161,12 @@ def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, 
     return whole, f"step of {step:g}, shorter ones may differ"
 
 
-def judge(subject: Subject, tangent: Tangent, seconds: float, spp: int = FIRST_SPP) -> Result:
+def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
     """Compare the derivative of a parameter along a direction with finite differences."""
     started = time.monotonic()
-    spp *= max(1, FILM // subject.pixels)
-    runs, spp = resolved_runs(subject, tangent, started + seconds, spp)
+    runs, spp = resolved_runs(subject, tangent, effort)
     note = ""
-    if runs.contradicts:
+    if runs.contradicts and not (effort is QUICK and subject.info.biased):
         runs, note = confirmed_runs(subject, tangent, spp)
     forward = subject.forward(tangent.direction, 0, spp)
     reverse = float(subject.reverse(0, spp) @ tangent.direction.double().reshape(-1).numpy())

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchtransient.plugins.parameter_effect import SILHOUETTES
 from torchtransient.plugins.swept_parameters import FILE
 from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE
 
@@ -61,8 +62,15 @@ def _cells(row: dict[str, Any]) -> list[str]:
         f"{_number(row['differences'])} ± {row['differences_error']:.1g}" if decided else "-",
         f"{row['scale']:.2g}" if decided else "-",
         f"**{row['verdict']}**" if row["verdict"] in ("contradict", "modes differ", "error") else row["verdict"],
-        row["table"].replace("|", "/"),
+        _state(row).replace("|", "/"),
     ]
+
+
+def _state(row: dict[str, Any]) -> str:
+    """What the table of parameters says, in a few words."""
+    if row["biased"] or row["verdict"] == "refused":
+        return row["table"]
+    return "right, but for silhouettes" if row["table"].startswith(SILHOUETTES) else "right" if row["table"] else ""
 
 
 def _table(rows: Iterable[dict[str, Any]]) -> list[str]:

@@ -17,9 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from torchtransient.testing.gradient_sweep.compare import Result
+from torchtransient.testing.gradient_sweep.compare import QUICK, Effort, Result
 from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
-from torchtransient.testing.gradient_sweep.worker import PATIENCE, results_of
+from torchtransient.testing.gradient_sweep.worker import results_of
 
 BATCH = 24
 # A scene has a few dozen parameters of a few seconds each.
@@ -74,23 +74,23 @@ def sweep(
     settings: Sequence[Setting],
     results: ResultFile,
     processes: int = 2,
-    patience: float = PATIENCE,
+    quick: bool = False,
     progress: Callable[[str], None] = lambda name: None,
 ) -> None:
-    """Run the settings that the file does not have yet. ``patience``: seconds for one direction of a parameter.
-    ``progress`` is called with the name of each setting that is done.
+    """Run the settings that the file does not have yet. ``quick``: one round of few samples. ``progress`` is
+    called with the name of each setting that is done.
     """
     done = results.done()
     left = [setting for setting in settings if setting.name not in done]
     with ThreadPoolExecutor(processes) as pool:
-        for future in [pool.submit(_run_batch, batch, results, patience, progress) for batch in batches(left)]:
+        for future in [pool.submit(_run_batch, batch, results, quick, progress) for batch in batches(left)]:
             future.result()
 
 
-def _run_batch(batch: list[Setting], results: ResultFile, patience: float, progress: Callable[[str], None]) -> None:
+def _run_batch(batch: list[Setting], results: ResultFile, quick: bool, progress: Callable[[str], None]) -> None:
     waiting = [setting.name for setting in batch]
     while waiting:
-        finished, words = _run_process(waiting, results, patience, progress)
+        finished, words = _run_process(waiting, results, quick, progress)
         waiting = waiting[len(finished) :]
         if waiting:
             lost = waiting.pop(0)
@@ -100,11 +100,11 @@ def _run_batch(batch: list[Setting], results: ResultFile, patience: float, progr
 
 
 def _run_process(
-    names: list[str], results: ResultFile, patience: float, progress: Callable[[str], None]
+    names: list[str], results: ResultFile, quick: bool, progress: Callable[[str], None]
 ) -> tuple[list[str], str]:
     """The settings that a process has finished, and its last words."""
     module = "torchtransient.testing.gradient_sweep"
-    command = [sys.executable, "-m", module, "--worker", "--patience", str(patience)]
+    command = [sys.executable, "-m", module, "--worker", *(["--quick"] if quick else [])]
     finished: list[str] = []
     with tempfile.TemporaryFile("w+", encoding="utf-8") as said:
         process = subprocess.Popen(
@@ -127,7 +127,7 @@ def _run_process(
         return finished, said.read()[-400:]
 
 
-def work(patience: float) -> None:
+def work(quick: bool) -> None:
     """What a worker process does: names of settings from the standard input, JSON lines to the standard output."""
     by_name = {setting.name: setting for setting in all_settings()}
     output = sys.stdout
@@ -135,7 +135,7 @@ def work(patience: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in sys.stdin.read().splitlines():
             try:
-                for result in results_of(by_name[name], Path(folder), patience):
+                for result in results_of(by_name[name], Path(folder), QUICK if quick else Effort()):
                     print(json.dumps(result.as_dict()), file=output, flush=True)
             except Exception as error:  # noqa: BLE001  a scene that cannot be built is a result
                 failed = Result(name, "", "", "error", note=f"{type(error).__name__}: {error}")
