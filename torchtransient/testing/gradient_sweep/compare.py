@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,7 @@ class Runs:
     reverse: Array
     differences: Array
     scale: float
+    first_seed: int = 0
 
     @property
     def larger(self) -> float:
@@ -124,7 +125,7 @@ def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float)
         difference, scale = subject.difference(tangent, seed, spp, step)
         differences.append(difference)
         scales.append(scale)
-    return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)))
+    return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)), seeds[0])
 
 
 def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int]:
@@ -153,7 +154,7 @@ def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, 
         if not whole.contradicts:
             return whole, "" if step == tangent.step else f"step of {step:g}"
         half = run(subject, tangent, seeds, spp, step / 2)
-        extrapolated = Runs(whole.reverse, (4 * half.differences - whole.differences) / 3, whole.scale)
+        extrapolated = replace(whole, differences=(4 * half.differences - whole.differences) / 3)
         change = Runs(whole.differences, half.differences, whole.scale)
         if not extrapolated.contradicts or not change.contradicts:
             return extrapolated, f"differences extrapolated from steps of {step:g} and {step / 2:g}"
@@ -168,8 +169,7 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
     note = ""
     if runs.contradicts and not (effort is QUICK and subject.info.biased):
         runs, note = confirmed_runs(subject, tangent, spp)
-    forward = subject.forward(tangent.direction, 0, spp)
-    reverse = float(subject.reverse(0, spp) @ tangent.direction.double().reshape(-1).numpy())
+    forward, reverse = subject.forward(tangent.direction, runs.first_seed, spp), float(runs.reverse[0])
     return Result(
         setting="",
         key=subject.key,
