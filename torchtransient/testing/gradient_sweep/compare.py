@@ -86,7 +86,11 @@ class Runs:
         compared with itself, lest everything agrees.
         """
         effect = max(abs(float(self.differences.mean())), abs(float(self.reverse.mean())))
-        return max(abs(float(self.differences.mean())), self.scale) if effect > RESOLVED * self.scale else WEAK * effect
+        return (
+            max(abs(float(self.differences.mean())), self.scale)
+            if effect > RESOLVED * self.scale
+            else max(WEAK * effect, RESOLVED * self.scale)
+        )
 
     @staticmethod
     def error_of(values: Array) -> float:
@@ -195,6 +199,6 @@ def verdict(runs: Runs, forward: float, reverse: float) -> str:
         return "contradict"
     if abs(forward - reverse) > ROUNDING * max(runs.larger, abs(reverse)):
         return "modes differ"
-    if runs.worst_error < RESOLVED and runs.differences.any():
-        return "agree"
-    return "no effect" if runs.is_nothing else "unresolved"
+    if runs.is_nothing:
+        return "no effect"
+    return "agree" if runs.worst_error < RESOLVED else "unresolved"

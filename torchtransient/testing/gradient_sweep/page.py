@@ -10,7 +10,7 @@ from typing import Any
 
 from torchtransient.plugins.parameter_effect import SILHOUETTES
 from torchtransient.plugins.swept_parameters import FILE
-from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE
+from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
 
 PAGE, DATA = "gradients_sweep.md", "gradients_sweep.json"
 # Columns of the JSON file, one row for a comparison.
@@ -39,8 +39,9 @@ differences, in scenes in which no silhouette moves. Written by `make sweep`
 - Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
 - *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
   and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.
-  An effect below {RESOLVED:.0%} of the scale is compared with itself, to a tenth. *No effect*: both are below that and
-  the finite difference is zero within three errors, so that nothing is proven.
+  An effect below {RESOLVED:.0%} of the scale counts beside {WEAK:g} times itself, or {RESOLVED:.0%} of the scale where
+  that is more. *No effect*: both are below that and the finite difference is zero within three errors, so that nothing
+  is proven.
 - *Contradict*: differs, seed by seed, by more than {SIGMAS} standard errors and more than {TOLERANCE:.0%} of the larger
   of |finite difference| and scale, with fresh seeds again and extrapolated to a step of zero.
 - Forward mode uses the paths of reverse mode; *modes differ* when they disagree by more than rounding.
