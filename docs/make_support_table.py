@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
 NOT_SUPPORTED = (
     (
-        "`eta`, `specular` of `principled` with `spec_trans`",
-        "biased, see docs/gradients.md; use `diff_rough_dielectric`",
+        "`alpha`, `eta` of Mitsuba's own `roughplastic`",
+        "taken over by `diff_rough_plastic` when the key is asked for",
     ),
     (
         "eta of Mitsuba's own `dielectric`, `roughdielectric`",

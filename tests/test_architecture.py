@@ -19,12 +19,13 @@ TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
-    "gates": 0, "stokes": 0,
+    "gates": 0, "stokes": 0, "tensor_record": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
     "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
     "cli": 5,
+    "__main__": 6,
 }  # fmt: skip
 TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "vis"}
 MITSUBA = {"mitsuba", "drjit"}
@@ -37,6 +38,7 @@ FORBIDDEN = {
     "axes": MITSUBA,
     "capture": MITSUBA,
     "stokes": MITSUBA,
+    "tensor_record": MITSUBA,
     "interfaces": {"torch", *MITSUBA},
     **dict.fromkeys(TORCH_PILLAR, MITSUBA),
 }

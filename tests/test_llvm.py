@@ -212,6 +212,41 @@ def test_dr_jit_imported_first_with_an_old_library():
     assert "set DRJIT_LIBLLVM_PATH=" in result.stdout
 
 
+@pytest.mark.parametrize("first", ["drjit", "mitsuba"])
+def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tmp_path, first):
+    code = f"""
+        import warnings
+        import {first}, drjit
+        drjit.detail.llvm_version = lambda: (16, 0, 6)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            import torchtransient
+            import torchtransient.errors
+        print(len(caught), caught[0].category.__name__, caught[0].filename)
+        print(caught[0].message)
+    """
+    result = run(code, tmp_path)
+    assert result.returncode == 0, result.stderr
+    first_line, message = result.stdout.strip().splitlines()[-2:]
+    assert first_line == "1 VariantWarning <string>"
+    assert "imported before torchtransient and has bound LLVM 16.0.6" in message
+    assert "import torchtransient before drjit and mitsuba" in message
+
+
+@pytest.mark.parametrize("version", [(17, 0, 6), (0, 0, 0)])
+def test_a_library_that_works_or_none_is_not_warned_of(tmp_path, version):
+    code = f"""
+        import warnings
+        warnings.simplefilter("error")
+        import drjit
+        drjit.detail.llvm_version = lambda: {version}
+        import torchtransient
+        print("silent")
+    """
+    result = run(code, tmp_path)
+    assert result.stdout.strip() == "silent", result.stderr
+
+
 HEAVY = ("matplotlib", "h5py", "kornia", "scipy", "imageio", "click", "rich", "tqdm", "pandas", "mitransient")
 
 

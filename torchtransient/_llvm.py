@@ -7,7 +7,8 @@ No library is loaded to learn its version: it stands in the library's own name (
 process of its own asks.
 
 Importing the package never fails for want of an LLVM, since CUDA and scalar variants do without. `ensure_llvm()`
-raises the error, and is called wherever an `llvm_*` variant is about to be used.
+raises the error, and is called wherever an `llvm_*` variant is about to be used. Users who render with Mitsuba alone
+never come there: they get a warning at the import.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ import re
 import struct
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from torchtransient.errors import VariantError
+from torchtransient.errors import VariantError, VariantWarning
 
 MIN_MAJOR = 17
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -79,10 +81,14 @@ _outcome = _Outcome()
 
 
 def bind() -> None:
-    """Choose an LLVM and import Dr.Jit with it. Never raises; called once, by the package's `__init__`."""
+    """Choose an LLVM and import Dr.Jit with it. Never raises; called once, by the package's `__init__`.
+
+    Where Dr.Jit has one already that would end the process, VariantWarning says so.
+    """
     own = _outcome.own = os.environ.get(VARIABLE)
     if "drjit" in sys.modules:
         _outcome.too_late = True
+        _warn_of_bound()
         return
     if own:
         _check_own(own)
@@ -104,6 +110,21 @@ def bind() -> None:
                 os.environ[VARIABLE] = own
 
 
+def _warn_of_bound() -> None:
+    version = _bound_version()
+    if version and version[0] < MIN_MAJOR:
+        # The line to move is the one that imports this package.
+        warnings.warn(_too_late_message(version), VariantWarning, stacklevel=4)
+
+
+def _bound_version() -> tuple[int, ...]:
+    """Version of the LLVM that Dr.Jit has bound; empty when it has none."""
+    import drjit as dr
+
+    version = tuple(int(n) for n in dr.detail.llvm_version())
+    return version if version[0] > 0 else ()
+
+
 def users_choice() -> str | None:
     """What the user had set `DRJIT_LIBLLVM_PATH` to before the package was imported, None when nothing."""
     return _outcome.own or None
@@ -115,15 +136,12 @@ def ensure_llvm() -> LLVMLibrary:
     Call it before an `llvm_*` variant is set. It asks Dr.Jit what it really bound, so it is right also when Dr.Jit was
     imported before torchtransient.
     """
-    import drjit as dr
-
-    version = tuple(int(n) for n in dr.detail.llvm_version())
-    bound = version[0] > 0
-    if bound and version[0] >= MIN_MAJOR:
+    version = _bound_version()
+    if version and version[0] >= MIN_MAJOR:
         path = _outcome.chosen.path if _outcome.chosen else os.environ.get(VARIABLE, "found by Dr.Jit itself")
         return LLVMLibrary(path, version)
     if _outcome.too_late:
-        raise VariantError(_too_late_message(version if bound else ()))
+        raise VariantError(_too_late_message(version))
     if _outcome.chosen is not None:
         raise VariantError(
             f"llvm variants need LLVM >= {MIN_MAJOR}; {_outcome.chosen} was found but Dr.Jit could not load it "

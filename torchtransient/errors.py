@@ -1,4 +1,4 @@
-"""The errors of the library. Every message says what was expected, what came and what to do."""
+"""The errors and warnings of the library. Every message says what was expected, what came and what to do."""
 
 from __future__ import annotations
 
@@ -19,6 +19,16 @@ class SceneError(TorchTransientError, ValueError):
     """A scene description, plugin parameter or parameter key cannot be used."""
 
 
+class PhysicsError(SceneError):
+    """What ``PhysicsWarning`` is about, where an error was asked for (``physics="error"``)."""
+
+
+class UnknownKeyError(SceneError, KeyError):
+    """A table or a renderer has nothing under a key."""
+
+    __str__ = Exception.__str__  # that of KeyError would put the message in quotation marks
+
+
 class StorageError(TorchTransientError, ValueError):
     """A file cannot be read or written, or a result would not fit into memory."""
 
@@ -37,3 +47,17 @@ class GradientError(TorchTransientError, RuntimeError):
 
 class PluginRegistrationError(TorchTransientError, RuntimeError):
     """A Mitsuba plugin of this library could not be registered for the active variant."""
+
+
+class TorchTransientWarning(UserWarning):
+    """Base of every warning that torchtransient gives on purpose."""
+
+
+class PhysicsWarning(TorchTransientWarning):
+    """A scene, a value or a render that is computed as it is asked for, and that no physical system can be: more light
+    scattered than arrives, a transform without an inverse, a window that misses the light.
+    """
+
+
+class VariantWarning(TorchTransientWarning, RuntimeWarning):
+    """What is loaded already cannot do what variants of this library need."""

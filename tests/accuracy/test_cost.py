@@ -155,3 +155,8 @@ def test_phasors_have_a_cost_too():
     assert "phasor [independent]" in report.table() and report.settings["time_axis"] is None
     with pytest.raises(SceneError, match="the film has none"):
         tt.cost_of_accuracy(renderer, temporal_filters=("tent",), progress=False)
+
+
+def test_a_scene_is_no_renderer():
+    with pytest.raises(tt.errors.SceneError, match=r"expected a tt\.TransientRenderer, got Scene"):
+        tt.cost_of_accuracy(tt.load(tt.scenes.cornell_box(8)))

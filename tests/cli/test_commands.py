@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -151,7 +152,7 @@ def test_list_of_parameters(folder):
         (("box.xml", "--set", "gray.reflectance.value=0.1"), "Did you mean 'grey.reflectance.value'"),
         (("box.xml", "--set", "grey.reflectance.value=0.1"), "expected shape (3,)"),
         (("box.xml", "--variant", "scalar_rgb"), "llvm_ad_rgb"),
-        (("box.xml", "--sensor", "2"), "sensors"),
+        (("box.xml", "--sensor", "2"), "--sensor"),
         (("box.xml", "--param", "res=60000", "--quiet"), "TiB"),
         (("box.xml", "-o", "out.exr"), ".npz"),
         (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),
@@ -246,3 +247,39 @@ def test_help_needs_no_torch():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ)
     assert result.returncode == 0, result.stderr
     assert "doctor" in result.stdout
+
+
+def test_the_command_as_a_module(folder):
+    place = {**os.environ, "PYTHONPATH": str(Path(tt.__file__).parents[1])}
+    command = [sys.executable, "-m", "torchtransient", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, env=place)
+    assert done.returncode == 0 and done.stdout.startswith("torchtransient, version")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("render", "box.xml", "--set", "wrong.key=1"),
+            "`torchtransient render SCENE --list-parameters` lists all keys",
+        ),
+        (("plan", "box.xml", "--gradient", "wrong.key"), "`torchtransient render SCENE --list-parameters` lists"),
+        (("plan", "box.xml", "--outputs", "gates"), "nor the command line has gates. Give --gates, or make the film"),
+        (("plan", "box.xml", "--outputs", "phasor"), "Give --frequencies, or make the film"),
+        (("plan", "box.xml", "--outputs", "sound"), "--outputs takes some of transient, phasor"),
+        (("render", "box.xml", "--sensor", 4), "--sensor: the scene has 1"),
+    ],
+)
+def test_errors_speak_of_options(folder, arguments, message):
+    result = run(*arguments)
+    assert result.exit_code == 2 and message in result.stderr
+    for python in ("tt.", "print(", "=["):
+        assert python not in result.stderr
+
+
+def test_warnings_are_lines(folder):
+    result = run("render", "box.xml", "--quiet", "--spp", 2, "--set", "grey.reflectance.value=1.5,0.5,0.5")
+    assert result.exit_code == 0, result.output
+    lines = [line for line in result.stderr.splitlines() if line]
+    assert len(lines) == 1 and lines[0].startswith("warning: 'grey.reflectance.value' is a share of the light")
+    assert ".clamp" not in lines[0]

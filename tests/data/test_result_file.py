@@ -163,3 +163,15 @@ def test_hdf5_without_its_package(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(StorageError, match=r"torchtransient\[data\]"):
         check_target(tmp_path / "a.h5")
+
+
+def test_what_is_no_render_is_refused(tmp_path):
+    with pytest.raises(StorageError, match=r"expected what a render returned, a RenderOutput, got Tensor.*torch\.save"):
+        write_result(tmp_path / "out.npz", torch.zeros(3, 4, 2, 2))
+
+
+def test_a_result_that_was_read_is_written_again(tmp_path):
+    first = read_result(write_result(tmp_path / "a.npz", output(), {"name": "first"}))
+    again = read_result(write_result(tmp_path / "b.npz", first))
+    assert torch.equal(again.transient, first.transient) and again.axis == first.axis
+    assert again.metadata == first.metadata and again.metadata["name"] == "first"

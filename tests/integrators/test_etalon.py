@@ -149,14 +149,16 @@ def radiance_through(camera_z, lamp, eta, alpha=0.3):
     distance = to_lamp.norm()
     wi = torch.tensor([[0.0, 0.0, np.sign(camera_z)]], dtype=torch.float64)
     value, _ = rough_dielectric(wi, to_lamp / distance, eta * one, alpha * one, alpha * one, True)
-    index = eta if camera_z > 0 else 1 / eta
-    return 3.0 * value[0] / distance**2, abs(camera_z) + index * distance
+    # The inside of the interface lies at z < 0: there stands either the lamp or the camera.
+    before, behind = (1, eta) if camera_z > 0 else (eta, 1)
+    return 3.0 * value[0] / distance**2, abs(camera_z) * before + behind * distance
 
 
 @pytest.mark.parametrize("kind", ROUGH)
 @pytest.mark.parametrize(("camera_z", "lamp"), [(3.0, [0.4, 0.1, -2.0]), (-3.0, [0.3, -0.2, 2.0])])
 def test_connection_through_a_rough_interface(kind, camera_z, lamp):
-    """Guards against counting the connection with the index of the camera's side: 3 m of air and 2 m of glass are 6 m.
+    """Guards against counting the connection with the index of the camera's side: 3 m of air and 2 m of glass are 6 m,
+    3 m of glass around the camera and 2 m of air 6.5 m.
 
     mitransient puts this light at 5 m.
     """

@@ -24,13 +24,27 @@ def foam():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inches, paths", [(2, 200_000), (4, 400_000)])
+@pytest.mark.parametrize("inches, paths", [(2, 200_000), (4, 400_000), (8, 800_000)])
 def test_transmittance_is_the_measured_one(foam, inches, paths):
-    # Published coefficients, only time and height are fitted. 1e4 detected paths leave at most 1 % of noise in a bin.
+    # Published coefficients, only time and height are fitted. Noise and misfit add up in squares; the standard error is
+    # known from eight batches, to about a quarter of itself.
     result = foam.run(inches, paths, max_depth=30_000)
-    assert result["traced"].rms < 0.02
-    # What is left where the curve is bright is left by the theory too: it lies in the coefficients.
-    assert result["traced"].rms_bright < result["diffusion"].rms_bright + 0.01
+    traced, noise, theory = result["traced"], result["noise"], result["diffusion"]
+    assert theory.rms < 0.01
+    assert traced.rms < np.hypot(0.01, 1.5 * noise.rms)
+    # What is left where the curve is bright, theory leaves too.
+    assert traced.rms_bright < np.hypot(theory.rms_bright, 1.5 * noise.rms_bright) + 0.002
+    assert noise.rms < 0.03
+
+
+def test_noise_is_the_standard_error_of_the_mean(foam):
+    # Batches of normal noise around a triangle of height 50: rms over the peak is sigma / sqrt(batches) / 50.
+    rng = np.random.default_rng(0)
+    shape = np.concatenate([np.arange(50.0), 50 - np.arange(50.0), np.zeros(100)])
+    batches = [shape + rng.normal(0, 2.0, shape.size) for _ in range(64)]
+    noise = foam.noise_of(batches, 0.0, shape.size)
+    assert noise.rms == pytest.approx(2.0 / 8 / 50, rel=0.05)
+    assert noise.rms_bright == pytest.approx(2.0 / 8 / 50, rel=0.05)
 
 
 @pytest.mark.slow

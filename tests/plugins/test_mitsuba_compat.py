@@ -78,6 +78,10 @@ def test_delta_weights_lack_the_derivative_of_their_probability(plugin, attach):
     assert abs(density) > 0.1 and abs(weight) < 0.3 * abs(density)
     assert compat.hides_lobe_probability(bsdf)
     assert compat.hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
+    bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 1)))}}
+    assert compat.hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
+    # Mixtures are asked part by part.
+    assert not compat.hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
 
 
 @pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
@@ -87,6 +91,22 @@ def test_delta_weights_of_others_have_it(plugin):
     weight, density = slopes_of_lobe(bsdf, 0.01, by_direction)
     assert density == 0 and abs(weight) > 0.1
     assert not compat.hides_lobe_probability(bsdf)
+
+
+def test_blends_of_delta_lobes_have_wrong_values():
+    activate(RGB)
+    mirror = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
+    paint = {"type": "diffuse", "reflectance": 0.5}
+    bsdf = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": mirror})
+    n = 100_000
+    u = mi.Float((np.arange(n) + 0.5) / n)
+    si = interaction(unit(0.3, 0.0, 0.8))
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, u, mi.Point2f(0.3, 0.4))
+    reflected = dr.mean(dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), weight.x, 0))
+    # Half of the mirror: 0.45. What comes is divided by 1 / 2 and half of the density of the paint.
+    assert abs(float(reflected[0]) - 0.45) > 0.02
+    assert compat.mixes_delta(bsdf) and compat.weight_slot(bsdf) == "weight"
+    assert not compat.mixes_delta(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
 
 
 # -------------------------------------------------------------------------------------------------------- polarization
@@ -151,6 +171,95 @@ def test_wave_plate_jumps_at_oblique_incidence():
         return np.abs(matrix(beside[0]) - matrix(beside[1])).max()
 
     assert jump("retarder") > 0.5 and jump(compat.POLARIZED_PLUGINS["retarder"]) < 1e-2
+
+
+# ------------------------------------------------------------------------------------------- samples, lobes and tables
+
+
+def many_samples(bsdf, count=20000):
+    """(samples, their weights, interaction) for directions from behind the surface."""
+    rng = mi.PCG32(count)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = -mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    return *bsdf.sample(mi.BSDFContext(), si, u, v), si
+
+
+@pytest.mark.parametrize("plugin", ["principled", "principledthin", "roughdielectric"])
+def test_samples_that_are_thrown_away_have_a_density(plugin):
+    """What asks for it: ``discarded`` in the attached form of scattering by surfaces."""
+    activate(RGB)
+    rough = {"alpha": 0.7} if plugin == "roughdielectric" else {"roughness": 0.8, "spec_trans": 0.5}
+    thin = {"diff_trans": 0.5} if plugin == "principledthin" else {}
+    bsdf = mi.load_dict({"type": plugin, **rough, **thin})
+    sample, weight, si = many_samples(bsdf)
+    value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
+    lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
+    assert dr.count(lost)[0] > 20
+
+
+def clearcoat_slope(weight):
+    """(derivative of a principled surface by its clearcoat, forward difference)."""
+    bsdf = mi.load_dict({"type": "principled", "clearcoat": {"type": "uniform", "value": weight}})
+    params = mi.traverse(bsdf)
+
+    def value(x):
+        params["clearcoat.value"] = x
+        params.update()
+        wi, wo = unit(0.3, 0.1, 0.9), unit(-0.3, -0.1, 0.9)
+        return dr.sum(bsdf.eval(mi.BSDFContext(), interaction(wi), wo))
+
+    x = mi.Float(weight)
+    dr.enable_grad(x)
+    dr.backward(value(x))
+    return float(dr.grad(x)[0]), float(((value(mi.Float(weight + 0.1)) - value(mi.Float(weight))) / 0.1)[0])
+
+
+def test_a_lobe_of_weight_zero_is_skipped():
+    activate(RGB)
+    at_zero, difference = clearcoat_slope(0.0)
+    assert at_zero == 0 and difference > 0.1
+    beside, difference = clearcoat_slope(1e-6)
+    assert beside == pytest.approx(difference, rel=1e-3)
+    assert 0 in compat.SKIPPED_AT["Principled"]["clearcoat"]
+
+
+def test_rough_plastic_has_no_derivative_through_its_tables():
+    activate(RGB)
+    context = mi.BSDFContext()
+    context.component = 1  # of the diffuse base, where roughness acts through the tables alone
+
+    def derivative(plugin):
+        bsdf = mi.load_dict({"type": plugin, "alpha": 0.3})
+        params = mi.traverse(bsdf)
+        x = mi.Float(0.3)
+        dr.enable_grad(x)
+        params["alpha"] = x
+        params.update()
+        value = dr.sum(bsdf.eval(context, interaction(unit(0.3, 0.1, 0.9)), unit(-0.3, -0.1, 0.9)))
+        if not dr.grad_enabled(value):
+            return 0.0
+        dr.backward(value)
+        return float(dr.grad(x)[0])
+
+    assert derivative("roughplastic") == 0
+    assert derivative(compat.DIFFERENTIABLE_PLUGINS["roughplastic"]) < -0.01
+
+
+def test_the_sun_shows_its_angle_in_its_description_alone():
+    activate(RGB)
+    sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8], "sun_aperture": 2.5, "sky_scale": 0.0})
+    assert not any("aperture" in key for key in mi.traverse(sky).properties)
+    half = compat.sun_half_angle(sky)
+    assert half == pytest.approx(np.radians(1.25), rel=1e-5)
+
+    def light_at(angle):
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        towards = np.arctan2(0.6, 0.8) + angle
+        si.wi = -mi.Vector3f(0, float(np.sin(towards)), float(np.cos(towards)))
+        return float(dr.max(sky.eval(si))[0])
+
+    assert light_at(0.99 * half) > 0 and light_at(1.01 * half) == 0
 
 
 # --------------------------------------------------------------------------------------------- indices, sides, spectra
@@ -238,6 +347,68 @@ def test_shapes_do_not_speak_of_all_that_moves_them():
 FILM = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
 
 
+def round_shape(plugin):
+    shapes = {
+        "sphere": {"type": "sphere", "radius": 0.8},
+        "cylinder": {"type": "cylinder", "p0": [-2, 0, 0], "p1": [2, 0.1, 0], "radius": 0.7},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.6).rotate([1, 1, 0], 30)},
+    }
+    if plugin in shapes:
+        return {"shape": shapes[plugin]}
+    group = {"type": "shapegroup", "ball": shapes["sphere"]}
+    pose = mi.ScalarTransform4f().translate([0.1, 0, 0])
+    return {"group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
+
+
+def slopes_of_the_way_out(plugin):
+    """Where a ray that shifts and turns leaves a shape: derivative of the distance by finite differences, by Mitsuba,
+    and by what stands in for it.
+    """
+    activate("llvm_ad_mono")
+    scene = mi.load_dict({"type": "scene", **round_shape(plugin)}, optimize=False)
+
+    def ray(x):
+        return mi.Ray3f(mi.Point3f(0.3 + x, 0.2, -4 - 0.5 * x), dr.normalize(mi.Vector3f(0.01 - 0.2 * x, 0.02, 1)))
+
+    def way_out(x):
+        line = ray(mi.Float(x))
+        start = scene.ray_intersect_preliminary(line).t + 1e-3
+        onward = mi.Ray3f(line)
+        onward.o = line(start)
+        pi = scene.ray_intersect_preliminary(onward)
+        pi.t += start
+        return pi
+
+    def slope(distance):
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        t = distance(way_out(0.0), ray(x))
+        dr.forward(x)
+        return float(dr.grad(t)[0])
+
+    h = 1e-2
+    expected = float((way_out(h).t - way_out(-h).t)[0]) / (2 * h)
+    theirs = slope(lambda pi, line: pi.compute_surface_interaction(line, mi.RayFlags.Minimal).t)
+
+    def ours(pi, line):
+        si = pi.compute_surface_interaction(line, mi.RayFlags.Minimal | mi.RayFlags.FollowShape)
+        return compat.attached_distance(pi, si, line, mi.Bool(True))
+
+    return expected, theirs, slope(ours)
+
+
+@pytest.mark.parametrize("plugin", ["sphere", "cylinder", "instance"])
+def test_distances_behind_round_shapes_have_the_derivative_of_those_before(plugin):
+    expected, theirs, _ = slopes_of_the_way_out(plugin)
+    assert abs(theirs - expected) > 5e-3
+
+
+@pytest.mark.parametrize("plugin", ["sphere", "cylinder", "instance", "cube"])
+def test_attached_distance(plugin):
+    expected, _, ours = slopes_of_the_way_out(plugin)
+    assert ours == pytest.approx(expected, abs=5e-4)
+
+
 def test_where_rays_of_sensors_start():
     activate(RGB)
     meter = mi.load_dict({"type": "radiancemeter", "film": FILM})
@@ -293,3 +464,37 @@ def test_forward_mode_through_a_batch_of_sensors_ends_the_process():
         run = subprocess.run([sys.executable, "-c", BATCH % batch], capture_output=True, text=True, timeout=300)
         assert (run.returncode != 0) == ends, run.stderr
         assert not ends or "unrecoverable" in run.stderr
+
+
+# -------------------------------------------------------------------------------------------------------- sphere lights
+
+
+def towards_sphere(radius, height, p=(0, 0, 0), u=(0.3, 0.4), radiance=1.0, **more):
+    """(direction sample, emission over density, density that is asked for) of Mitsuba's area light on a sphere."""
+    activate("llvm_ad_mono")
+    light = {"type": "sphere", "center": [0, 0, height], "radius": radius, **more}
+    shape = mi.load_dict(light | {"emitter": {"type": "area", "radiance": radiance}})
+    it = dr.zeros(mi.Interaction3f, max(dr.width(p), dr.width(u)))
+    it.p = mi.Point3f(p)
+    ds, weight = shape.emitter().sample_direction(it, mi.Point2f(u))
+    return ds, weight.x, shape.emitter().pdf_direction(it, ds)
+
+
+def test_cone_of_a_small_sphere_has_no_digits_left():
+    """pi L (r / d)^2 of a sphere of 1 mm, and of one of 0.3 mm, at 3 m."""
+    weights = [float(towards_sphere(radius, 3.0)[1][0]) / (np.pi * (radius / 3.0) ** 2) for radius in (1e-3, 3e-4)]
+    assert weights[0] == pytest.approx(1.07, abs=0.06) and abs(weights[0] - 1) > 0.01
+    assert weights[1] == 0
+
+
+def test_sphere_draws_and_answers_with_different_densities_on_its_own_surface():
+    """Of points on its inner side some see it from outside."""
+    activate("llvm_ad_mono")
+    n = 1 << 12
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(3, n)).astype(np.float32)
+    p /= np.linalg.norm(p, axis=0)
+    u = mi.Point2f(rng.random((2, n)).astype(np.float32))
+    ds, _, asked = towards_sphere(1.0, 0.0, mi.Point3f(p), u, flip_normals=True)
+    different = np.abs(np.array(asked) / np.array(ds.pdf) - 1) > 0.05
+    assert 1e-3 < different.mean() < 0.1

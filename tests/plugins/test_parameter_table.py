@@ -63,6 +63,7 @@ MOVES = [
     ("rectangle sphere disk cylinder sdfgrid instance area directionalarea angulararea irradiancemeter", "to_world",
      "LS", "shape"),
     ("cube obj ply instance", "vertex_positions vertex_normals", "LS", "shape"),
+    ("cube obj ply instance", "vertex_texcoords", "S", "value"),
     ("bsplinecurve linearcurve", "control_points", "LS", "shape"),
     ("sdfgrid", "grid", "LS", "shape"),
     ("ellipsoids ellipsoidsmesh", "data", "LS", "shape"),
@@ -71,9 +72,10 @@ MOVES = [
     ("orthographic", "to_world", "LS", "sensor"),
     ("thinlens", "to_world x_fov aperture_radius focus_distance", "LS", "sensor"),
     ("point", "position", "LS", "emitter"),
-    ("spot projector directional envmap sunsky timed_sunsky", "to_world", "LS", "emitter"),
+    ("spot projector directional envmap sunsky sunsky_at_a_time timed_sunsky", "to_world", "LS", "emitter"),
+    ("sunsky sunsky_at_a_time", "sun_direction", "LS", "sun"),
     ("dielectric diff_dielectric", "eta", "LS", "index"),
-    ("principled", "specular", "LS", "index"),
+    ("principled", "specular", "L", "index"),
     ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
     ("delayed", "lifetime", "L", "delay"),
     ("heterogeneous", "data", "M", "medium"),
@@ -200,6 +202,8 @@ def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, be
     assert texture.moves_length == bends and texture.role == ("normal" if bends else "value")
     assert effects["mirror.vertex_texcoords"].moves_length == bends
     assert effects["mirror.vertex_texcoords"].supported
+    # The slope of a bump map is the same all over a texel.
+    assert effects["mirror.vertex_texcoords"].biased == (plugin == "bumpmap")
     colours = [effect for key, effect in effects.items() if "reflectance" in key or ".k." in key]
     assert not any(effect.moves for effect in colours)
 
@@ -208,6 +212,21 @@ def test_coordinates_of_a_mask_over_a_normal_map():
     inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
     scene = mi.load_dict({"type": "scene", "it": {"type": "cube", "bsdf": {"type": "mask", "nested": inner}}})
     assert effect_of(scene.shapes()[0], "vertex_texcoords").moves_length
+
+
+def test_coordinates_of_a_light_with_a_texture_belong_to_its_shape():
+    plain = {"type": "cube", "emitter": {"type": "area", "radiance": 2.0}}
+    patterned = {"type": "cube", "emitter": {"type": "area", "radiance": normals()}}
+    inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
+    told = [effect_of(mi.load_dict(d), "vertex_texcoords") for d in (plain, patterned, patterned | {"bsdf": inner})]
+    assert [(letters(effect), effect.role) for effect in told] == [("S", "value"), ("S", "shape"), ("LS", "shape")]
+
+
+def test_opacities_of_ellipsoids_move_them_where_they_are_clamped():
+    data = {"data": mi.TensorXf([[0.0] * 3 + [1.0] * 3 + [0.0] * 3 + [1.0]]), "opacities": mi.TensorXf([[0.9]])}
+    for clamped in (True, False):
+        shape = mi.load_dict({"type": "ellipsoids", "extent_adaptive_clamping": clamped} | data)
+        assert effect_of(shape, "opacities").moves_length == clamped
 
 
 def test_an_emitting_mesh_without_coordinates_is_differentiated_in_rigid_motion_only():
@@ -255,8 +274,9 @@ def test_reasons():
     assert effect_of(mi.load_dict({"type": "diff_dielectric"}), "eta").reason == SILHOUETTES
     stand_in = effect_of(mi.load_dict({"type": "dielectric"}), "eta").reason
     assert stand_in.startswith(SILHOUETTES) and "diff_dielectric" in stand_in
-    principled = effect_of(mi.load_dict({"type": "principled"}), "specular")
-    assert principled.biased and "docs/gradients.md" in principled.reason
+    coating = effect_of(mi.load_dict({"type": "roughplastic"}), "alpha")
+    assert not coating.biased and "diff_rough_plastic" in coating.reason
+    assert effect_of(mi.load_dict({"type": "principled"}), "specular").reason == CORRECT
 
 
 def test_no_moving_silhouette_is_called_correct(own_rows):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.films import phasor_events
 from torchtransient.testing.film_storage import storage
 
@@ -246,3 +248,12 @@ def test_slope_of_the_adjoint():
 def test_description():
     text = str(make_film(**GRID))
     assert "37 from -0.4 to 3.56 per metre" in text
+
+
+def test_defaults_that_nobody_asked_for_are_said():
+    with pytest.warns(TorchTransientWarning, match=r"no frequencies are given.*mitransient's defaults, .* cycles per"):
+        mi.load_dict({"type": "phasor_hdr_film"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mi.load_dict({"type": "phasor_hdr_film", "wl_mean": 100.0})
+        mi.load_dict({"type": "phasor_hdr_film", "frequencies": "0.5"})

@@ -7,6 +7,7 @@ import sys
 import textwrap
 import warnings
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 
@@ -114,6 +115,7 @@ def test_variant_chosen_before_import():
 
 
 THIRD_PARTY = """
+import drjit as dr
 import mitsuba as mi
 from torchtransient.plugins import register
 class Dim(mi.Texture):
@@ -204,3 +206,17 @@ def test_a_callback_does_not_raise_when_warnings_are_errors(third_party):
         mi.set_variant("llvm_ad_mono")
     with pytest.raises(PluginRegistrationError, match="gone"):
         plugins.sync()
+
+
+def test_a_plugin_that_refuses_its_parameters_takes_part_in_no_later_kernel():
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+    kept = []
+    for kind in ({"alpha_u": 0.2}, {"distribution": "none"}):
+        with pytest.raises(Exception, match="diff_rough_plastic") as raised:
+            mi.load_dict({"type": "diff_rough_plastic", **kind})
+        kept.append(raised)  # with its traceback, as a notebook and a test runner keep it
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere"}, "film": {"type": "perspective"}})
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1)))
+    value = si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
+    assert dr.all(dr.isfinite(value), axis=None)

@@ -138,6 +138,37 @@ def test_flat_vertices_are_taken(room_scene):
     assert torch.equal(batch[0], out.detach())
 
 
+def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
+    """Mitsuba samples patterns by a map that it keeps when texture coordinates alone change."""
+    pixels = np.linspace(0.1, 9.0, 16, dtype=np.float32).reshape(4, 4, 1).repeat(3, axis=2)
+    corners = np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.6], [0.1, 0.6]])
+
+    def lit_by(name, uv):
+        lines = [f"v {x} {y} 0" for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))] + [f"vt {u} {v}" for u, v in uv]
+        (tmp_path / name).write_text("\n".join([*lines, "f 1/1 2/2 3/3", "f 1/1 3/3 4/4", ""]))
+        radiance = {"type": "bitmap", "data": pixels, "raw": True}
+        room = make_room()
+        room["lamp"] = {
+            "type": "obj",
+            "filename": str(tmp_path / name),
+            "to_world": np.diag([0.5, -0.5, -0.5, 1]) + pose(0.2, 0.6, 2.0) - np.eye(4),
+            "emitter": {"type": "area", "radiance": radiance},
+        }
+        return tt.TransientRenderer(
+            tt.load(room, variant=VARIANT), parameters=["lamp.vertex_texcoords"], spp=64, temporal_filter="tent"
+        )
+
+    moved = corners + np.array([0.3, 0.25])
+    before, written = lit_by("before.obj", corners), lit_by("moved.obj", moved)
+    expected = written(seed=1).transient.detach()
+    # The loader of these files turns the second coordinate over.
+    uv = before.values["lamp.vertex_texcoords"].detach()
+    uv = uv + torch.tensor([0.3, -0.25]).repeat(4).reshape_as(uv)
+    given = before({"lamp.vertex_texcoords": uv}, seed=1).transient.detach()
+    torch.testing.assert_close(given.sum(), expected.sum(), rtol=1e-4, atol=0)
+    assert (before(seed=1).transient.sum() - expected.sum()).abs() > 0.01 * expected.sum()
+
+
 def test_mesh_pose_keeps_authored_normals(tmp_path):
     import mitsuba as mi
 
@@ -206,6 +237,23 @@ def test_indices_that_bend_nothing_keep_the_box(plugin):
     assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
 
 
+@pytest.mark.parametrize("key", ["alpha", "eta"])
+def test_rough_plastic_is_built_with_its_derivative(key):
+    room = make_room()
+    room["box"]["bsdf"] = {"type": "twosided", "nested": {"type": "roughplastic", "alpha": 0.3}}
+    scene = tt.load(room, variant=VARIANT)
+    key = f"box.bsdf.brdf_0.{key}"
+    info = scene.parameters()[key]
+    assert info.differentiable and not info.biased and "diff_rough_plastic" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=64)
+    own = tt.TransientRenderer(scene, parameters=["light.intensity.value"], spp=64)
+    image = renderer(seed=0).steady
+    # Values and random numbers are those of Mitsuba's, up to the rounding of the tables.
+    torch.testing.assert_close(image.detach(), own(seed=0).steady.detach(), rtol=1e-3, atol=1e-4 * float(image.max()))
+    image.sum().backward()
+    assert renderer.values[key].grad.abs() > 1e-4
+
+
 def test_table_of_a_scene_with_a_parameter_that_is_not_set():
     room = make_room()
     room["box"]["bsdf"] = {"type": "hair"}
@@ -230,6 +278,17 @@ def test_extinction_is_told_from_albedo():
     moving = [key for key, info in table.items() if info.moves_medium and info.differentiable]
     assert moving == ["box.interior_medium.sigma_t.value.value"]
     assert table["box.interior_medium.albedo.value.value"].differentiable
+
+
+def test_a_key_that_the_table_does_not_have(room_scene):
+    table = room_scene.parameters()
+    with pytest.raises(
+        tt.errors.SceneError, match=r"^the scene has no parameter 'box\.bsdf\.reflectanse.*Did you mean"
+    ):
+        table["box.bsdf.reflectanse.value"]
+    with pytest.raises(KeyError):
+        table["nope"]
+    assert "nope" not in table and table.get("nope") is None
 
 
 def test_unknown_key_suggests_the_right_one(room_scene):

@@ -184,3 +184,13 @@ def test_files_and_their_parameters(tmp_path):
         tt.TransientRenderer(path, effects=plan)
     # what the plan was made for is still there
     assert plan.renderer(spp=1)(seed=0).steady.shape == (1, 2, 2)
+
+
+def test_a_plan_is_equal_to_its_copies():
+    scene = tt.scenes.cornell_box(8)
+    plan = tt.plan(scene, pilot=False)
+    for other in (pickle.loads(pickle.dumps(plan)), copy.deepcopy(plan), tt.plan(scene, pilot=False)):
+        assert plan == other and hash(plan) == hash(other)
+    assert plan != tt.plan(scene, pilot=False, max_depth=3)
+    assert plan != tt.plan(tt.scenes.cornell_box(9), pilot=False)
+    assert plan != "plan"

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.render import memory
-from torchtransient.render.arguments import mix_seed
+from torchtransient.render.seeds import mix_seed
 from torchtransient.render.variant import active_variant
 from torchtransient.testing.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 
@@ -242,11 +242,47 @@ def test_wrong_shapes(room_scene):
 
 
 @pytest.mark.parametrize(
-    "value", [[0.1, 0.2, 0.3], np.zeros(3), torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool()]
+    "value",
+    [[0.25, 0.5, 0.75], (0.25, 0.5, 0.75), np.array([0.25, 0.5, 0.75], np.float16), [torch.tensor(0.25), 0.5, 0.75]],
 )
-def test_values_that_are_not_real_tensors(room_scene, value):
+def test_values_that_are_no_tensors(room_scene, value):
+    renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: value, GREY: 0.125}, spp=4)
+    expected = renderer({COLOUR: torch.tensor([0.25, 0.5, 0.75]), GREY: torch.tensor(0.125)}, seed=0)
+    assert torch.equal(renderer(seed=0).transient, expected.transient)
+    assert torch.equal(renderer({COLOUR: value, GREY: np.float64(0.125)}, seed=0).transient, expected.transient)
+    assert torch.equal(tt.render(room_scene, {COLOUR: value, GREY: 0.125}, spp=4, seed=0).steady, expected.steady)
+    batch = renderer({COLOUR: [[0.25, 0.5, 0.75], [0, 1, 0]], GREY: [0.125, 1]}, seed=0)
+    assert torch.equal(batch.transient[0], expected.transient)
+
+
+def test_gradients_reach_numbers_inside_lists(room_scene):
+    red = torch.tensor(0.25, requires_grad=True)
+    tt.render(room_scene, {COLOUR: [red, 0.5, 0.75]}, spp=4, seed=0).steady.sum().backward()
+    assert red.grad > 0
+
+
+@pytest.mark.parametrize(
+    "value",
+    [torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool(), [True, False, True], [[1, 2], [3]], "red", object()],
+)
+def test_values_that_are_no_real_numbers(room_scene, value):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
-        tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)({COLOUR: value}, seed=0)
+        renderer({COLOUR: value}, seed=0)
+    with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
+        tt.TransientRenderer(room_scene, parameters={COLOUR: value})
+
+
+def test_parameters_are_set_by_their_keys(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
+    before = renderer.values[COLOUR]
+    renderer.values[COLOUR] = [0.25, 0.5, 0.75]
+    assert renderer.values[COLOUR] is before and before.tolist() == [0.25, 0.5, 0.75] and before.requires_grad
+    with pytest.raises(tt.errors.ShapeError, match="has no batch"):
+        renderer.values[COLOUR] = torch.rand(2, 3)
+    with pytest.raises(tt.errors.SceneError, match=r"no parameter 'box\.colour'; it was made with"):
+        renderer.values["box.colour"] = 0.5
+    assert "box.colour" not in renderer.values and renderer.values.get("box.colour") is None
 
 
 def test_wrong_device(room_scene):

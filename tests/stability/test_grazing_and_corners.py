@@ -83,7 +83,7 @@ def check_finite(scene, keys, lit=True):
 MATERIALS = {
     "diffuse": ({"type": "diffuse", "reflectance": 0.5}, ["floor.bsdf.reflectance.value", "floor.to_world"]),
     "rough conductor": ({"type": "roughconductor", "alpha": 0.05}, ["floor.bsdf.alpha.value", "floor.to_world"]),
-    "rough plastic": ({"type": "roughplastic", "alpha": 0.1}, ["floor.bsdf.alpha", "floor.to_world"]),
+    "rough plastic": ({"type": "diff_rough_plastic", "alpha": 0.1}, ["floor.bsdf.alpha", "floor.to_world"]),
 }
 
 

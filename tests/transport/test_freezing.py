@@ -36,16 +36,23 @@ def scene_of(kind):
         result["sensor"]["film"] = result["sensor"]["film"] | {"pulse": "gaussian", "pulse_fwhm_opl": 0.5}
     if kind == "thin glass":  # its lobes hide the derivative of their probability
         result["small-box"] = small | {"bsdf": {"type": "thindielectric"}}
+    if kind == "mixture":
+        blend = {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"}, "b": {"type": "conductor"}}
+        result["small-box"] = small | {"bsdf": {"type": "mask", "opacity": 0.7, "nested": blend}}
     if kind == "delayed":
         result["small-box"] = small | {"bsdf": {"type": "delayed", "lifetime": 0.3, "nested": {"type": "diffuse"}}}
     if kind == "filter":
         result["sensor"]["film"]["rfilter"] = {"type": "gaussian"}
     if kind == "glass":
         result["small-box"] = small | {"bsdf": {"type": "diff_rough_dielectric", "alpha": 0.3}}
+    if kind == "coating":  # its tables are no parameters
+        result["small-box"] = small | {"bsdf": {"type": "diff_rough_plastic", "alpha": 0.3}}
     return result
 
 
-KINDS = ("surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed")
+KINDS = (
+    "surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture", "coating",
+)  # fmt: skip
 
 
 def render(scene, params, x, adjoint, seed):

@@ -13,6 +13,7 @@ from torchtransient.accuracy.measure import Candidate, Estimates, Task, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.render.films.choices import of_output
+from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.variant import active_variant
@@ -44,6 +45,7 @@ def _response(out: RenderOutput) -> torch.Tensor:
     return response
 
 
+@opaque
 def cost_of_accuracy(
     renderer: TransientRenderer,
     spp: Sequence[int] = (16, 64, 256, 1024),
@@ -78,6 +80,11 @@ def cost_of_accuracy(
     that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
     per curve.
     """
+    if not isinstance(renderer, TransientRenderer):
+        raise SceneError(
+            f"cost_of_accuracy: expected a tt.TransientRenderer, got {type(renderer).__name__}. Make one of a scene: "
+            "tt.TransientRenderer(scene, parameters=[...])."
+        )
     missing = [key for key in gradients if key not in renderer.values]
     if missing:
         raise SceneError(

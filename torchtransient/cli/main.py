@@ -6,14 +6,16 @@ Commands are imported when they are called, so that `torchtransient --help` need
 
 from __future__ import annotations
 
+import functools
 import importlib
 import sys
+import warnings
 from typing import Any
 
 import click
 
 from torchtransient import __version__
-from torchtransient.errors import TorchTransientError
+from torchtransient.errors import TorchTransientError, TorchTransientWarning
 
 # In the order of the help text: name of the command (and of its module), what the help says about it.
 COMMANDS = {
@@ -48,14 +50,31 @@ class Commands(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; an error of the library ends the process with status 2."""
+        """Run the command; an error of the library ends the process with status 2, a warning is a line on stderr."""
         try:
-            return super().invoke(ctx)
+            with warnings.catch_warnings():
+                show = warnings.showwarning
+                warnings.showwarning = functools.partial(_show_warning, show)
+                return super().invoke(ctx)
         except TorchTransientError as error:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"error: {error}", err=True)
+            click.echo(f"error: {_in_options(error)}", err=True)
             sys.exit(2)
+
+
+def _in_options(message: Any) -> str:
+    # Where the library could not be imported, its films are not known, and its message is as it is.
+    from torchtransient.cli.words import in_options
+
+    return in_options(str(message))
+
+
+def _show_warning(otherwise: Any, message: Any, category: type[Warning], *where: Any, **more: Any) -> None:
+    if issubclass(category, TorchTransientWarning):
+        click.echo(f"warning: {_in_options(message)}", err=True)
+    else:
+        otherwise(message, category, *where, **more)
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import click
 
 from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
 from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
+from torchtransient.errors import PhysicsWarning
 from torchtransient.render.films.choices import from_options, of_output
 
 
@@ -66,7 +68,9 @@ def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str
 
     import torchtransient as tt
 
-    with torch.no_grad():
+    with torch.no_grad(), warnings.catch_warnings():
+        # What the axis misses is said in the words of the command line, by `_report_energy`.
+        warnings.filterwarnings("ignore", "the window misses", PhysicsWarning)
         return tt.render(
             described,
             values,

@@ -16,11 +16,11 @@ import json
 import os
 import secrets
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.gates import Gate
 from torchtransient.render.films.choices import of_entries, of_output
 from torchtransient.render.output import RenderOutput, named_fields
+from torchtransient.tensor_record import TensorRecord
 
 FORMAT = "torchtransient result 1"
 _HDF5 = (".h5", ".hdf5")
@@ -38,13 +39,16 @@ _ENDINGS = (*_HDF5, ".npz")
 _PART_BYTES = 2**26
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
     `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
-    and settings of films that have no attribute here, by name.
+    and settings of films that have no attribute here, by name. A batch of results (``stack``, ``cat``,
+    ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
 
     transient: torch.Tensor | None
     steady: torch.Tensor
@@ -56,6 +60,13 @@ class Result:
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
+        return {"metadata": {"batch": [record.metadata for record in records]}}
+
+    def _shown_notes(self) -> dict[str, str]:
+        return {"metadata": ", ".join(self.metadata)} if self.metadata else {}
 
 
 def check_target(path: str | Path) -> Path:
@@ -80,16 +91,22 @@ def check_folder(path: str | Path) -> None:
         raise StorageError(f"result file: '{target}' {what}. Choose another place.")
 
 
-def write_result(path: str | Path, output: RenderOutput, metadata: Mapping[str, Any] | None = None) -> Path:
-    """Write a render. An existing file is replaced once the new one is complete.
+def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
+    """Write a render, or a result that was read. An existing file is replaced once the new one is complete.
 
     `metadata`: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render. Raises
     StorageError for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
     """
     target = check_target(path)
-    stats = asdict(output.stats)
+    given: Any = output
+    if not isinstance(given, RenderOutput | Result):
+        raise StorageError(
+            f"result file: expected what a render returned, a RenderOutput, got {type(given).__name__}. Tensors alone "
+            "have no axis; write them with torch.save."
+        )
+    own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
     try:
-        note = json.dumps({**(metadata or {}), "stats": stats})
+        note = json.dumps({**(metadata or {}), **own})
     except TypeError as error:
         raise StorageError(f"result file: metadata must be plain data ({error}).") from error
     film = of_output(output)

@@ -35,6 +35,7 @@ import importlib
 import importlib.util
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -78,6 +79,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_dielectric", (("bsdf", "diff_rough_dielectric"),)),
+    PluginModule("torchtransient.plugins.bsdfs.rough_plastic", (("bsdf", "diff_rough_plastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
     PluginModule(
         "torchtransient.plugins.bsdfs.thin_elements",
@@ -297,8 +299,12 @@ def _keeping_errors(constructor: Callable[..., object]) -> Callable[[object], ob
     def construct(props: object) -> object:
         try:
             return constructor(props)
-        except TorchTransientError as error:
-            _state.raised.append(error)
+        except Exception as error:
+            # Whoever keeps the error would keep the half-made plugin alive: Dr.Jit's registry would hand it to every
+            # later virtual call of the variant.
+            traceback.clear_frames(error.__traceback__)
+            if isinstance(error, TorchTransientError):
+                _state.raised.append(error)
             raise
 
     return construct

@@ -7,30 +7,52 @@ and what asks for it can go. Our own plugins are told by what they declare, neve
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+
+from torchtransient.errors import SceneError
 
 WRITTEN_AGAINST = "3.9.1"
 
 # ----------------------------------------------------------------------------------------- what Mitsuba's BSDFs return
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
-# Those of the others (Mitsuba's dielectric and mask, ours) divide by the detached probability.
-_CANCELLING = ("ThinDielectric", "SmoothPlastic")
+# Those of the others (Mitsuba's dielectric, ours) divide by the detached probability.
+_CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
 # A scene's BSDFs show themselves by their description, nested ones included.
-_TWO_SIDED, _TWO_SIDED_DESCRIPTION = "TwoSidedBRDF", "TwoSided["
+_TWO_SIDED_DESCRIPTION = "TwoSided["
+# Mixtures, and the slot of the texture or volume that says how much of the (second) nested one there is.
+_WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFunction": "weight"}
+_MIXTURES = ("Mask[", "BlendBSDF[")
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
     """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
 
-    Inside ``mask`` the opacity hides in the same place and is attached already; such nested lobes are left as they are.
+    Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
     """
-    name = bsdf.class_name()
-    if name == _TWO_SIDED:
-        return any(nested in str(bsdf) for nested in _CANCELLING)
-    return name in _CANCELLING
+    shown = str(bsdf)
+    return any(name in shown for name in _CANCELLING) and not any(name in shown for name in _MIXTURES)
+
+
+def weight_slot(bsdf: Any) -> str | None:
+    """Name of the texture or volume that mixes what a BSDF or phase function holds, None for those that are no mixture.
+    A mixture of one BSDF lets the rest of the light pass.
+    """
+    return _WEIGHT_SLOTS.get(bsdf.class_name())
+
+
+def mixes_delta(bsdf: Any) -> bool:
+    """Whether a BSDF is a blend of which a part has a delta lobe.
+
+    Mitsuba divides the sum of both parts' values by the sum of their densities, of which that of a delta lobe is a
+    probability instead: the values of such blends are wrong, and the derivatives of their weights.
+    """
+    return bool(bsdf.class_name() == "BlendBSDF" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
 
 def is_two_sided(bsdf: Any) -> bool:
@@ -41,6 +63,11 @@ def is_two_sided(bsdf: Any) -> bool:
     exchanged.
     """
     return _TWO_SIDED_DESCRIPTION in str(bsdf)
+
+
+def is_two_sided_itself(bsdf: Any) -> bool:
+    """Whether a BSDF is ``twosided``."""
+    return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
 def has_equal_sides(bsdf: Any) -> bool:
@@ -57,15 +84,33 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
-# Built in place of Mitsuba's when the key of an index of refraction is asked for: Mitsuba's dielectric has a plain
-# number for it, its rough dielectric detaches it where directions are sampled.
-DIFFERENTIABLE_PLUGINS = {"dielectric": "diff_dielectric", "roughdielectric": "diff_rough_dielectric"}
+def is_bump_map(bsdf: Any) -> bool:
+    """Whether a BSDF takes its normals from the slope of a texture, which Mitsuba keeps between the texels of a bitmap:
+    it jumps at each of them.
+    """
+    return bool(bsdf.class_name() == "BumpMap")
+
+
+# Weights at which these skip a lobe, so that the derivative by the weight is zero there although its slope is not.
+SKIPPED_AT: dict[str, dict[str, tuple[float, ...]]] = {
+    "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
+    "PrincipledThin": {"sheen": (0,), "spec_trans": (0, 1), "diff_trans": (0, 2)},
+}
+
+# Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric has a plain number for
+# the index, its rough dielectric detaches it where directions are sampled, and its rough plastic computes tables from
+# roughness and index outside of the graph.
+DIFFERENTIABLE_PLUGINS = {
+    "dielectric": "diff_dielectric",
+    "roughdielectric": "diff_rough_dielectric",
+    "roughplastic": "diff_rough_plastic",
+}
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
 # its conductor, dielectric, polarizer and retarder by the direction are NaN; its rough dielectric depolarises; its wave
 # plate jumps at oblique incidence.
 POLARIZED_PLUGINS = {
-    **DIFFERENTIABLE_PLUGINS,
-    **{name: f"diff_{name}" for name in ("conductor", "polarizer", "retarder", "circular")},
+    **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
+    "roughdielectric": "diff_rough_dielectric",
 }
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights
@@ -76,9 +121,29 @@ def is_instance(shape: Any) -> bool:
     return bool(shape.class_name() == "Instance")
 
 
+def has_surface(shape: Any) -> bool:
+    """Whether rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF nevertheless."""
+    return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
+
+
 def is_sphere(shape: Any) -> bool:
     """Whether a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
     return bool(shape.class_name() == "Sphere")
+
+
+def samples_its_shape(emitter: Any) -> bool:
+    """Whether an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the solid
+    angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from a
+    point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
+    """
+    return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
+
+
+def leaves_hits_detached(shape: Any) -> bool:
+    """Whether the interactions of a shape lie at a detached distance along the ray: they follow neither the shape nor a
+    ray that moves.
+    """
+    return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
 def bounds_of(shape: Any) -> Any:
@@ -90,6 +155,29 @@ def bounds_of(shape: Any) -> Any:
         shape.recompute_bbox()
         bounds = shape.bbox()
     return bounds
+
+
+def attached_distance(pi: Any, si: Any, ray: Any, active: Any) -> Any:
+    """Distance along an attached ``ray`` of the surface at ``pi``, which need not be the first that the ray meets;
+    ``si``: the interaction there, which follows its shape (``RayFlags.FollowShape``).
+
+    Mitsuba takes the derivative of the distance of spheres and cylinders from another intersection with the whole
+    shape, so that where a ray leaves them from outside it is that of where it entered. This one intersects the ray with
+    the plane that touches the shape at the hit point and moves with it.
+    """
+    n = dr.detach(si.n)
+    cosine = dr.dot(n, ray.d)
+    meets = active & (dr.detach(cosine) != 0)
+    distance = dr.dot(si.p - ray.o, n) / dr.select(meets, cosine, 1)
+    return dr.replace_grad(pi.t, dr.select(meets, distance, 0))
+
+
+def sun_half_angle(emitter: Any) -> float:
+    """Half the angle (radians) that the sun of a ``sunsky`` fills. Mitsuba shows it in the description alone."""
+    shown = re.search(r"Sun aperture = ([-+.\de]+)", str(emitter))
+    if shown is None:
+        raise SceneError(f"{emitter.class_name()}: expected 'Sun aperture' in its description, got {emitter}.")
+    return math.radians(float(shown[1])) / 2
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors

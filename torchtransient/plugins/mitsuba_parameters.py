@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, normal_texture
-from torchtransient.plugins.node_walk import bsdfs_below
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, SKIPPED_AT, is_bump_map, normal_texture
+from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
     CORRECT,
+    SILHOUETTES,
     VALUE,
     ParameterEffect,
     Row,
@@ -28,13 +31,12 @@ SENSOR_KEYS = (
     "aperture_radius",
     "focus_distance",
 )
-# What a medium has that does not change how far light gets.
-_NO_EXTINCTION = ("albedo", "phase_function")
 
 SHAPE = ParameterEffect(moves_length=True, moves_silhouette=True, role="shape", trusted=True)
 SENSOR = replace(SHAPE, role="sensor")
 # Shadow edges move with a light.
 EMITTER = replace(SHAPE, role="emitter")
+SUN = replace(SHAPE, role="sun", trusted=False)
 NORMAL = replace(SHAPE, role="normal", trusted=False)
 MEDIUM = ParameterEffect(moves_medium=True, role="medium")
 INDEX = ParameterEffect(
@@ -45,11 +47,27 @@ INDEX = ParameterEffect(
     reason="biased where light is refracted: the path length does not follow this index",
     trusted=True,
 )
-PRINCIPLED_INDEX = replace(
-    INDEX,
-    reason="biased where the surface transmits (spec_trans): differs from finite differences, see docs/gradients.md",
+# Directions are held fixed while the index moves, so what is seen through the surface stays where it is.
+PRINCIPLED_INDEX = ParameterEffect(moves_length=True, role="index", trusted=True)
+COATING = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['roughplastic']} when asked for, which differentiates the "
+    "tables of its coating",
+    trusted=True,
+    stand_in=DIFFERENTIABLE_PLUGINS["roughplastic"],
 )
-COATING = ParameterEffect(biased=True, reason="biased: Mitsuba's table of transmittances is not differentiated")
+SKIPPED = ParameterEffect(
+    biased=True,
+    reason="biased: Mitsuba skips a lobe whose weight is exactly zero, and its derivative with it; start from 1e-6",
+)
+# Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
+_EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
+COORDINATES = ParameterEffect(moves_silhouette=True, reason=SILHOUETTES + _EDGES)
+PATTERN = replace(COORDINATES, role="shape")
+NORMAL_COORDINATES = replace(NORMAL, reason=SILHOUETTES + _EDGES)
+PATTERN_AND_NORMALS = replace(NORMAL_COORDINATES, role="shape")
+_STEPS = "biased: the slope of a bump map jumps from texel to texel, and its coordinates change it by nothing else"
+SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
+NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
 RIGID_ONLY = replace(
     SHAPE,
     biased=True,
@@ -84,16 +102,39 @@ def _turns_delta_lobes(bsdf: object) -> bool:
     return normal_texture(bsdf) is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)  # type: ignore[attr-defined]
 
 
+def _bsdfs_of(site: Site) -> list[Any]:
+    """The BSDF of a shape and all that it holds."""
+    outer = site.node.bsdf()
+    return [] if outer is None else [outer, *objects_below(outer, mi.BSDF)]
+
+
 def _places_normals(site: Site) -> bool:
     """Whether the texture coordinates of a mesh place normals of a delta lobe."""
-    outer = site.node.bsdf()
-    waiting = [] if outer is None else [outer]
-    while waiting:
-        bsdf = waiting.pop()
-        if _turns_delta_lobes(bsdf):
-            return True
-        waiting += bsdfs_below(bsdf)
-    return False
+    return any(_turns_delta_lobes(bsdf) for bsdf in _bsdfs_of(site))
+
+
+def _places_slopes(site: Site) -> bool:
+    """Whether the texture coordinates of a mesh place the slopes of a bump map."""
+    return any(is_bump_map(bsdf) for bsdf in _bsdfs_of(site))
+
+
+def _places_delta_slopes(site: Site) -> bool:
+    return _places_slopes(site) and _places_normals(site)
+
+
+def _places_light(site: Site) -> bool:
+    """Whether the texture coordinates of a mesh place what it emits."""
+    emitter = site.node.emitter()
+    return emitter is not None and any(t.is_spatially_varying() for t in objects_below(emitter, mi.Texture))
+
+
+def _places_light_and_normals(site: Site) -> bool:
+    return _places_light(site) and _places_normals(site)
+
+
+def _is_clamped(site: Site) -> bool:
+    """Whether the opacities of ellipsoids decide how large they are."""
+    return any(shown.key == "extent_adaptive_clamping" and shown.read(site.node) for shown in shown_by(site.node)[0])
 
 
 def _is_normal(site: Site) -> bool:
@@ -106,11 +147,37 @@ def _is_normal(site: Site) -> bool:
 
 def _is_extinction(site: Site) -> bool:
     """Whether a plugin is part of a medium's extinction."""
-    return any(isinstance(holder, mi.Medium) and name not in _NO_EXTINCTION for holder, name in site.owners)
+    return any(isinstance(holder, mi.Medium) and _attenuates(holder, name) for holder, name in site.owners)
+
+
+def _attenuates(medium: Any, name: str) -> bool:
+    """Whether what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase function does
+    where it is one of flakes, whose projected area is a factor of the extinction.
+    """
+    if name == "phase_function":
+        return bool(mi.has_flag(medium.phase_function().flags(), mi.PhaseFunctionFlags.Microflake))
+    return name != "albedo"
+
+
+def _skips_a_lobe(site: Site) -> bool:
+    """Whether a texture is the weight of a lobe and has, somewhere, exactly the value at which a lobe is skipped."""
+    if not site.owners:
+        return False
+    holder, name = site.owners[0]
+    values = SKIPPED_AT.get(holder.class_name(), {}).get(name, ())
+    if not values:
+        return False
+    shown = dr.detach(mi.traverse(site.node)[site.key])
+    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
+        return False
+    entries = shown.array if dr.is_tensor_v(shown) else shown
+    return any(bool(dr.any(entries == value, axis=None)) for value in values)
 
 
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
-IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium, outside of albedo and phase function")
+IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
+
+AT_ZERO = Row(SKIPPED, _skips_a_lobe, "the weight of a lobe of principled or principledthin, where a lobe vanishes")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -123,14 +190,31 @@ declare_effects(
         "to_world": (_EMITTING, Row(SHAPE)),
         "vertex_positions": (_EMITTING, Row(SHAPE)),
         "vertex_normals": (_EMITTING, Row(SHAPE)),
-        "vertex_texcoords": (Row(NORMAL, _places_normals, "a normal or bump map over a delta lobe"), Row(VALUE)),
+        "vertex_texcoords": (
+            Row(NORMAL_SLOPES, _places_delta_slopes, "a bump map over a delta lobe"),
+            Row(SLOPES, _places_slopes, "another bump map"),
+            Row(PATTERN_AND_NORMALS, _places_light_and_normals, "a textured light with a normal map over a delta lobe"),
+            Row(NORMAL_COORDINATES, _places_normals, "a normal map over a delta lobe"),
+            Row(PATTERN, _places_light, "a light with a textured radiance"),
+            Row(COORDINATES),
+        ),
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
-    declare_effects(_curve, {"control_points": replace(SHAPE, trusted=False)})
-declare_effects("SDFGrid", {"grid": replace(SHAPE, trusted=False)})
+    declare_effects(_curve, {"control_points": SHAPE})
+TURNED_GRID = "; Mitsuba does not draw grids that turn: put the grid into a group and turn an instance of it"
+declare_effects(
+    "SDFGrid",
+    {"grid": replace(SHAPE, trusted=False), "to_world": replace(SHAPE, reason=SILHOUETTES + TURNED_GRID)},
+)
 for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
     declare_effects(_blobs, {"data": replace(SHAPE, trusted=False)})
+CLAMPED = replace(
+    SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
+)
+declare_effects(
+    "Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))}
+)
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 
@@ -138,6 +222,7 @@ declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 declare_effects("Emitter", {"to_world": replace(EMITTER, trusted=False), "position": replace(EMITTER, trusted=False)})
 declare_effects("PointLight", {"position": EMITTER})
 declare_effects("SpotLight", {"to_world": EMITTER})
+declare_effects("SunskyEmitter", {"sun_direction": SUN})
 
 declare_effects("BSDF", {"eta": INDEX})
 declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})
@@ -148,6 +233,7 @@ declare_effects("ThinDielectric", {"eta": VALUE})
 declare_effects("Hair", {"eta": VALUE})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION)})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
+declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mitsuba_compat import has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -90,11 +90,9 @@ def bsdfs_below(node: Any) -> list[Any]:
 
 def bsdfs_of_scene(scene: Any) -> list[Any]:
     """The outermost BSDFs of a scene, those of shape groups included, each once."""
-    shapes = scene.shapes()
-    if any(is_instance(shape) for shape in shapes):
-        # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
-        return bsdfs_below(scene)
-    return list({bsdf.ptr: bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}.values())
+    # Every shape is asked for its own: some (ellipsoids) do not show it in a walk.
+    bsdfs = (shape.bsdf() for shape in shapes_of_scene(scene) if has_surface(shape))
+    return list({bsdf.ptr: bsdf for bsdf in bsdfs if bsdf is not None}.values())
 
 
 def shapes_of_scene(scene: Any) -> list[Any]:
@@ -102,6 +100,7 @@ def shapes_of_scene(scene: Any) -> list[Any]:
     shapes = list(scene.shapes())
     if not any(is_instance(shape) for shape in shapes):
         return shapes
+    # Shapes of groups are not among the scene's own. Walking the whole scene finds them, at a price per parameter.
     return objects_below(scene, mi.Shape)
 
 

@@ -24,7 +24,7 @@ from torchtransient.errors import PluginRegistrationError
 CORRECT = "correct"
 SILHOUETTES = "correct except where silhouettes move (no boundary term)"
 ANY_KEY = "*"
-ROLES = ("shape", "normal", "emitter", "sensor", "index", "delay", "medium", "value")
+ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "medium", "value")
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class ParameterEffect:
 
     ``moves_length``: it can change an optical path length. ``moves_silhouette``: it can move a visibility edge, seen
     directly, in a mirror or through glass. ``moves_medium``: it can change an extinction (transmittances, sampled
-    distances), which albedo and phase function do not.
+    distances), which an albedo does not, and a phase function only where it is one of flakes.
 
     ``role``: which part of the geometry it moves. "shape": points of a surface; "normal": the frame that a delta lobe
-    works in; "emitter": an emitter without a shape; "sensor": the sensor and its rays; "index": an index of refraction;
-    "delay": a lifetime; "medium": an extinction; "value": none.
+    works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its rays;
+    "index": an index of refraction; "delay": a lifetime; "medium": an extinction; "value": none.
 
     ``supported``: it has a derivative. ``biased``: that derivative is known to be wrong somewhere, besides the missing
     boundary term of ``moves_silhouette``. ``reason``: the state in words; where a silhouette moves and there is a

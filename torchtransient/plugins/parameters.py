@@ -150,7 +150,20 @@ def _is_attribute(node: Any, key: str) -> bool:
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in mitsuba_parameters.VERTICES
 
 
-# ----------------------------------------------------------------------------------------------------------- the slope
+# --------------------------------------------------------------------------------------- what has to be there for them
+
+
+def check_stand_ins(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> None:
+    """Raise ``GradientError`` where one out of :func:`attached_effects` belongs to a plugin of Mitsuba whose derivative
+    is wrong and for which another one has to be built.
+    """
+    for node, key, effect in effects:
+        if effect.stand_in:
+            raise GradientError(
+                f"{f'{node.id()}.{key}'.lstrip('.')!r}: Mitsuba's {node.class_name()} does not have the whole "
+                f"derivative of this parameter. Describe the plugin as '{effect.stand_in}', which takes the same "
+                "properties; tt.TransientRenderer does so by itself."
+            )
 
 
 def moving_names(effects: Sequence[tuple[Any, str, ParameterEffect]]) -> list[str]:

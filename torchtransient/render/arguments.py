@@ -1,45 +1,19 @@
-"""Checks of what is passed to the renderer, and seeds derived from one another."""
+"""Checks of what is passed to the renderer, values and settings."""
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, SceneError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import chosen
 
-SEED_RANGE = 2**32
 TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
-
-
-def whole_number(seed: Any) -> int | None:
-    """A seed as one number; None for a sequence of them. Raises ``UnitError`` for what is neither."""
-    try:
-        return operator.index(seed)
-    except TypeError:
-        pass
-    try:
-        several = len(seed) >= 0 and not isinstance(seed, str)
-    except TypeError:
-        several = False
-    if not several:
-        raise UnitError(f"seed: expected a whole number, or one for each batch entry, got {seed!r}.")
-    return None
-
-
-def mix_seed(seed: int, number: int) -> int:
-    """A 32-bit seed that looks unrelated to ``seed``; 0 leaves it as it is (a splitmix64 step, Steele et al. 2014)."""
-    if number == 0:
-        return seed % SEED_RANGE
-    z = (seed + number * 0x9E3779B97F4A7C15) % 2**64
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) % 2**64
-    return (z ^ (z >> 31)) % SEED_RANGE
 
 
 def samples(name: str, value: int | None) -> int | None:
@@ -86,15 +60,37 @@ def mangle(keys: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def as_float(key: str, value: Any) -> torch.Tensor:
-    """The value as float32, by an operation that gradients pass. Raises ``ShapeError`` for what is not real numbers."""
+def as_float(key: str, value: Any, device: str) -> torch.Tensor:
+    """The value as float32, by an operation that gradients pass. Numbers, lists and arrays come to ``device``, tensors
+    must be there. Raises ``ShapeError`` for what is not real numbers, ``DeviceError`` for another device.
+    """
     if not isinstance(value, torch.Tensor):
-        raise ShapeError(f"value of {key!r}: expected a torch tensor, got {type(value).__name__}.")
+        value = _tensor_of(key, value).to(device)
     if value.is_complex() or value.dtype == torch.bool:
         raise ShapeError(f"value of {key!r}: expected real numbers, got dtype {value.dtype}.")
     if value.layout != torch.strided:
         raise ShapeError(f"value of {key!r}: expected a dense tensor, got layout {value.layout}.")
+    if value.device.type != device:
+        raise DeviceError(
+            f"value of {key!r}: expected a tensor on {device!r}, where the scene's variant computes, got "
+            f"{str(value.device)!r}. Move it with .to({device!r}), or load the scene with a variant of the other kind."
+        )
     return value.to(torch.float32)
+
+
+def _tensor_of(key: str, value: Any) -> torch.Tensor:
+    """A tensor of a number, of lists of them, also with tensors inside, or of an array of any library."""
+    try:
+        if isinstance(value, (list, tuple)) and any(isinstance(entry, torch.Tensor) for entry in value):
+            return torch.stack([entry if isinstance(entry, torch.Tensor) else torch.tensor(entry) for entry in value])
+        array = np.asarray(value)
+        # Numpy reads texts and objects too; arrays that may not be written to would be a warning of torch's.
+        return torch.from_numpy(array.copy() if array.dtype.kind in "biufc" else array.astype(np.float64, copy=True))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ShapeError(
+            f"value of {key!r}: expected a torch tensor, an array, a list of numbers or a number, got "
+            f"{type(value).__name__}: {error}."
+        ) from error
 
 
 def fit_shape(key: str, value: torch.Tensor, shape: tuple[int, ...]) -> tuple[torch.Tensor, bool]:
@@ -129,13 +125,29 @@ def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:
 
 
 class Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys."""
+    """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does."""
 
     def __init__(self, module: nn.Module, names: Mapping[str, str]):
         self._module, self._names = module, names
 
     def __getitem__(self, key: str) -> nn.Parameter:
+        if key not in self._names:
+            raise UnknownKeyError(
+                f"this renderer has no parameter {key!r}; it was made with parameters={list(self._names)}. Keys are "
+                "given to TransientRenderer(..., parameters=[...])."
+            )
         return getattr(self._module, self._names[key])
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        parameter = self[key]
+        given, batched = fit_shape(key, as_float(key, value, parameter.device.type), tuple(parameter.shape))
+        if batched:
+            raise ShapeError(
+                f"value of {key!r}: expected shape {tuple(parameter.shape)}, got {tuple(given.shape)}: a parameter has "
+                "no batch; pass batches to the call, renderer({key: values})."
+            )
+        with torch.no_grad():
+            parameter.copy_(given)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

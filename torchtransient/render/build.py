@@ -16,12 +16,16 @@ import numpy as np
 from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
-from torchtransient.render.nodes import children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
+from torchtransient.render.nodes import check_finite, children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
@@ -70,12 +74,21 @@ class BuildOptions:
 
 @dataclass
 class BuiltScene:
-    """A Mitsuba scene with what has to be known about its nodes."""
+    """A Mitsuba scene with what has to be known about its nodes. ``to_world``: all transforms as described, by key."""
 
     scene: Any
     params: Any
     mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
     integrator: str = ""
+    to_world: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def findings(self) -> dict[str, str]:
+        """What is unphysical in the description, by key."""
+        if self._findings is None:
+            self._findings = scene_findings(described_shares(self.params), self.to_world)
+        return self._findings
+
+    _findings: dict[str, str] | None = None
 
     def __del__(self) -> None:
         contents = list(self.__dict__.values())
@@ -98,25 +111,30 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             _check_root(state)
             name_nodes(state)
             if not options.merge:
-                _name_nested(state)
+                take_merged_apart(state)
+                name_nested(state)
             _override_films(state, options)
             _override_integrator(state, options)
             _override_samplers(state, options)
             _substitute_plugins(state, options)
             transforms = _mesh_transforms(state)
+            placed = _placed(state)
             integrator = find_child(state, state.root, is_integrator)
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
+            check_finite(state)
             _forget_queries(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
             if not isinstance(scene, mi.Scene):
                 raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
+            params = mi.traverse(scene)
+            check_scene(scene, params)
     except TorchTransientError as error:
         raise type(error)(f"{_location(error.__cause__) or description.name}: {error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         text = str(error).replace("While loading string", f"While loading {description.name}")
         raise SceneError(f"{description.name}: Mitsuba could not build the scene. {text}") from error
-    return BuiltScene(scene, mi.traverse(scene), transforms, plugin)
+    return BuiltScene(scene, params, transforms, plugin, placed)
 
 
 def _location(error: BaseException | None) -> str | None:
@@ -147,45 +165,6 @@ def _add_child(state: Any, parent: int, key: str, plugin: str, kind: Any, proper
     state.nodes[parent].props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
-def name_nodes(state: Any) -> None:
-    """Give the nameless children of the scene names that do not change from run to run: ``sensor``, ``shape_0``,
-    ``shape_1``.
-    """
-    direct = [state.nodes[index] for _, index in children(state, state.root)]
-    taken = {node.props.id() for node in direct}
-    nameless = [node for node in direct if not node.props.id()]
-    count: dict[str, int] = {}
-    for node in nameless:
-        kind = str(node.type).rsplit(".", 1)[-1].lower()
-        count[kind] = count.get(kind, 0) + 1
-    seen: dict[str, int] = {}
-    for node in nameless:
-        kind = str(node.type).rsplit(".", 1)[-1].lower()
-        number = seen.get(kind, 0)
-        name = kind if count[kind] == 1 else f"{kind}_{number}"
-        while name in taken:
-            number += 1
-            name = f"{kind}_{number}"
-        seen[kind] = number + 1
-        taken.add(name)
-        node.props.set_id(name)
-
-
-def _name_nested(state: Any) -> None:
-    """Unique names for materials inside shapes and other materials, so that one of them can be substituted."""
-    import mitsuba as mi
-
-    direct = {index for _, index in children(state, state.root)}
-    taken = {node.props.id() for node in state.nodes}
-    for index, node in enumerate(state.nodes):
-        if node.type == mi.ObjectType.BSDF and index not in direct:
-            name = f"{node.props.id()}#{index}"
-            while name in taken:
-                name += "'"
-            taken.add(name)
-            node.props.set_id(name)
-
-
 def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
     """``to_world`` as described, by the name of the shape: meshes apply it while loading and forget it."""
     import mitsuba as mi
@@ -198,6 +177,16 @@ def _mesh_transforms(state: Any) -> dict[str, np.ndarray]:
                 matrix = np.array(node.props["to_world"].matrix, dtype=np.float64)
             result[node.props.id()] = matrix
     return result
+
+
+def _placed(state: Any) -> dict[str, np.ndarray]:
+    """Every ``to_world`` of the description, by its key."""
+    found = {}
+    for node in state.nodes:
+        if "to_world" in node.props:
+            name = node.props.id() or node.props.plugin_name()
+            found[f"{name}.to_world"] = np.array(node.props["to_world"].matrix, dtype=np.float64)
+    return found
 
 
 # ----------------------------------------------------------------------------------------------------- overrides

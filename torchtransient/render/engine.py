@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -27,6 +27,8 @@ from torchtransient.render.films.choices import of_film
 from torchtransient.render.filter_override import temporal_filter
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
+from torchtransient.render.physics import PhysicsWatch, are_finite, smallest_and_largest
+from torchtransient.render.seeds import Item, Seeding
 from torchtransient.render.variant import active_variant
 
 if TYPE_CHECKING:
@@ -35,34 +37,44 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Item:
-    """One film to fill: which entry of the batch, which sensor, with which seeds."""
+class RunLog:
+    """What one primal run reports. ``energy_before``, ``energy_after``: outside of the window, item by item."""
 
-    entry: int
-    sensor: int
-    seed: int
-    grad_seed: int
+    items: tuple[Item, ...]
+    seconds: float
+    integrator: str
+    spp: int
+    energy_before: tuple[float, ...]
+    energy_after: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class RenderJob:
     """Everything about a call that is not a tensor.
 
-    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``log`` collects
-    what the primal run reports (seconds, energy outside the window) and belongs to one call.
+    ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``watch``: says
+    what is unphysical. ``log`` collects what each primal run reports (seconds, seeds, energy outside the window) and
+    belongs to one call: under ``vmap`` a call is several runs.
     """
 
     scene: Scene
     options: BuildOptions
     keys: tuple[str, ...]
     items: tuple[Item, ...]
+    seeding: Seeding
     batched: tuple[bool, ...]
     spp: int
     spp_grad: int
     temporal_filter: str | None
+    watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
     progress: Callable[[float], None] | None = None
-    log: dict[str, Any] = field(default_factory=dict)
+    log: list[RunLog] = field(default_factory=list)
+
+    def seeded(self, seed: torch.Tensor | None) -> RenderJob:
+        """The job with the items of a seed; with its own ones for None."""
+        return self if seed is None else replace(self, items=self.seeding.items(int(seed)))
 
 
 class _Session:
@@ -153,19 +165,23 @@ def _session(job: RenderJob) -> Iterator[_Session]:
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
-    _check_finite(job, values)
+    _check_values(job, values)
     with _session(job) as session:
         started = time.perf_counter()
         check_items(session.sensors, job.items)
         check_fits(session.film(job.items[0]).cube_shape(), len(job.items), job.scene.variant)
-        result = _render_items(session, values)
-        job.log["seconds"] = time.perf_counter() - started
-        job.log["integrator"] = session.slots.built.integrator
-        job.log["spp"] = _drawn_samples(session)
-    return result
+        steady, response, before, after = _render_items(session, values)
+        seconds, spp = time.perf_counter() - started, _drawn_samples(session)
+        job.log.append(RunLog(job.items, seconds, session.slots.built.integrator, spp, before, after))
+        channels = len(session.film(job.items[0]).channel_names())
+    if job.watch.looks:
+        job.watch.window(steady, channels, sum(before), sum(after))
+    return steady, response
 
 
-def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+def _render_items(
+    session: _Session, values: Sequence[torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor, tuple[float, ...], tuple[float, ...]]:
     import drjit as dr
 
     job, count = session.job, len(session.job.items)
@@ -198,10 +214,9 @@ def _render_items(session: _Session, values: Sequence[torch.Tensor]) -> tuple[to
             steady_all[n].copy_(steady)
             response_all[n].copy_(response)
         del steady, response
-    job.log["energy_before"], job.log["energy_after"] = tuple(before), tuple(after)
     if steady_all is None or response_all is None:
         raise ShapeError("a batch must have at least one entry, got 0.")
-    return steady_all, response_all
+    return steady_all, response_all, tuple(before), tuple(after)
 
 
 def _drawn_samples(session: _Session) -> int:
@@ -258,13 +273,16 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
     return next(iter(found.values()))[0]
 
 
-def _check_finite(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
+def _check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
     for key, value in zip(job.keys, values, strict=True):
-        if not bool(torch.isfinite(value).all()):
+        low, high = smallest_and_largest(value)
+        if not are_finite(low, high):
             bad = int((~torch.isfinite(value)).sum())
             raise UnitError(
                 f"value of {key!r}: expected finite numbers, got {bad} of {value.numel()} that are NaN or infinite."
             )
+        if job.watch.looks:
+            job.watch.value(key, value, low, high)
 
 
 # ----------------------------------------------------------------------------------------------------- derivatives

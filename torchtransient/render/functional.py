@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
+from torch import nn
 
+from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 
 
+@opaque
 def render(
     scene: Any,
-    values: Mapping[str, torch.Tensor] | None = None,
+    values: Mapping[str, Any] | None = None,
     *,
     spp: int | None = None,
     seed: int | Sequence[int] | None = None,
@@ -27,6 +29,7 @@ def render(
     it holds what was built.
     """
     renderer = TransientRenderer(scene, parameters=list(values or {}), spp=spp, **settings)
-    for parameter in renderer.parameters():
-        parameter.requires_grad_(False)
+    for name, start in list(renderer.named_parameters()):
+        # Not by `requires_grad_`, which torch.func forbids inside of its transforms.
+        setattr(renderer, name, nn.Parameter(start.detach(), requires_grad=False))
     return renderer(values, seed=seed, progress=progress)

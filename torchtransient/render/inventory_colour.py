@@ -29,7 +29,8 @@ _PIXELS_WORTH_READING = 1 << 18
 _TRANSPARENT = frozenset((
     "scene", "area", "angulararea", "directionalarea", "point", "spot", "directional", "constant", "projector",
     "diffuse", "dielectric", "thindielectric", "roughdielectric", "diff_dielectric", "diff_rough_dielectric",
-    "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular", "conductor", "roughconductor", "plastic",
+    "diff_rough_plastic", "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular", "conductor",
+    "roughconductor", "plastic",
     "roughplastic", "pplastic", "principled", "principledthin", "blendbsdf", "mask", "twosided", "bumpmap",
     "normalmap", "null", "polarizer", "retarder", "circular", "delayed", "homogeneous", "heterogeneous",
     "isotropic", "hg", "rayleigh", "tabphase", "blendphase", "sggx", "constvolume", "checkerboard", "srgb",

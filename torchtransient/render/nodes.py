@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from torchtransient.plugins import kind_of
+from torchtransient.plugins.finite_values import count_bad, numbers_of, refuse
 
 # Direct children of the scene that matter only where something refers to them.
 _DECLARATIONS = ("BSDF", "Medium", "Texture", "Volume", "PhaseFunction", "ReconstructionFilter", "Film", "Sampler")
@@ -27,6 +28,23 @@ def children(state: Any, node: Any) -> list[tuple[str, int]]:
         elif isinstance(value, mi.Properties.Reference) and value.id() in by_id:
             result.append((key, by_id[value.id()]))
     return result
+
+
+def check_finite(state: Any) -> None:
+    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
+    bad: dict[str, str] = {}
+    waiting, seen = [(state.root, "")], set()
+    while waiting:
+        node, path = waiting.pop()
+        for key, value in node.props.items():
+            array = numbers_of(value)
+            if array is not None:
+                count_bad(bad, f"{path}{key}", array)
+        for key, index in children(state, node):
+            if index not in seen:
+                seen.add(index)
+                waiting.append((state.nodes[index], f"{path}{key}."))
+    refuse(bad)
 
 
 def find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.variant import stokes_components
+from torchtransient.tensor_record import TensorRecord
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,37 @@ class RenderStats:
     energy_before: tuple[float, ...]
     energy_after: tuple[float, ...]
 
+    @classmethod
+    def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
+        """Those of renders that are put into one batch: seeds and energies one behind another, times added up. Raises
+        ``ShapeError`` for renders that were not made alike.
+        """
+        first = several[0]
+        for name in ("spp", "variant", "integrator", "temporal_filter"):
+            values = list(dict.fromkeys(getattr(stats, name) for stats in several))
+            if len(values) > 1:
+                raise ShapeError(
+                    f"a batch of renders: expected the same {name} in all of them, got {values[0]!r} and "
+                    f"{values[1]!r}. Put together their tensors alone, out.transient for instance."
+                )
+        seconds = sum(stats.seconds for stats in several)
+        paths = sum(stats.samples_per_second * stats.seconds for stats in several)
+        return replace(
+            first,
+            seconds=seconds,
+            samples_per_second=paths / seconds,
+            seeds=tuple(seed for stats in several for seed in stats.seeds),
+            energy_before=tuple(energy for stats in several for energy in stats.energy_before),
+            energy_after=tuple(energy for stats in several for energy in stats.energy_after),
+        )
+
 
 # Fields that belong to a film: None in the output of another one.
 _OF_FILMS = ("transient", "phasor", "gated", "axis", "frequencies", "gates")
 
 
-@dataclass(frozen=True)
-class RenderOutput:
+@dataclass(frozen=True, repr=False)
+class RenderOutput(TensorRecord):
     """A rendered scene.
 
     ``steady``: float32 (C, H, W). Beside it, what the film measures, and None for what it does not:
@@ -57,7 +83,12 @@ class RenderOutput:
     H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. ``transient``, ``phasor``
     and ``gated`` are views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's
     order. ``others``: tensors and settings of films that have no attribute here, by name.
+
+    ``to``, ``cpu``, ``detach``, ``clone`` and ``map`` make copies; ``stack`` and ``cat`` put several together, as
+    ``torch.utils.data.default_collate`` does. Torch's pytrees see the tensors.
     """
+
+    notes: ClassVar[tuple[str, ...]] = ("stats",)
 
     transient: torch.Tensor | None
     steady: torch.Tensor
@@ -74,6 +105,17 @@ class RenderOutput:
     def polarized(self) -> bool:
         """Whether the Stokes components come before the channels."""
         return stokes_components(self.stats.variant) > 1
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:
+        return {"stats": RenderStats.of_batch([record.stats for record in records])}
+
+    def _shown_notes(self) -> dict[str, str]:
+        stats = self.stats
+        seeds = f"seed {stats.seeds[0]}" if len(stats.seeds) == 1 else f"{len(stats.seeds)} seeds"
+        made = f"{stats.spp} spp in {stats.seconds:.3g} s, {stats.integrator}, {stats.variant}, {seeds}"
+        outside = sum(stats.energy_before) + sum(stats.energy_after)
+        return {"stats": made + (f", energy outside of the window {outside:.4g}" if outside else "")}
 
     @classmethod
     def of(

@@ -7,13 +7,14 @@ and normals follow.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
@@ -59,6 +60,8 @@ class ParameterTable(Mapping[str, ParameterInfo]):
         self._entries = {entry.key: entry for entry in entries}
 
     def __getitem__(self, key: str) -> ParameterInfo:
+        if key not in self._entries:
+            raise UnknownKeyError(unknown_key(key, list(self._entries)))
         return self._entries[key]
 
     def __iter__(self) -> Iterator[str]:
@@ -86,6 +89,13 @@ class ParameterTable(Mapping[str, ParameterInfo]):
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def unknown_key(key: str, known: list[str]) -> str:
+    """The message for a parameter key that a scene does not have."""
+    close = difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
+    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
+    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
 def _short(value: Any) -> str:
@@ -285,6 +295,18 @@ class Slot:
             params[normals_key] = dr.ravel(dr.normalize(transform @ normals))
 
 
+def changed_with(keys: Iterable[str], params: Any) -> list[str]:
+    """The parameters that Mitsuba has to be told have changed beside ``keys``.
+
+    A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
+    change; where those do and normals do not, it makes up new normals.
+    """
+    ending = ".vertex_texcoords"
+    meshes = [key.removesuffix(ending) for key in keys if key.endswith(ending)]
+    others = [f"{mesh}.{name}" for mesh in meshes for name in ("vertex_positions", "vertex_normals")]
+    return [key for key in others if key in params]
+
+
 class SlotTable:
     """The slots of some keys in one built scene, with the values that the scene goes back to."""
 
@@ -298,6 +320,7 @@ class SlotTable:
             if normals != target and normals in built.params:
                 touched[normals] = None
         self._check_overlap()
+        self._changed_too = changed_with(touched, built.params)
         # Copies: what `params` returns may be the plugin's own variable, which changes when it is written.
         self.originals = {target: type(built.params[target])(built.params[target]) for target in touched}
 
@@ -315,7 +338,7 @@ class SlotTable:
         """Write one leaf per slot and let the scene follow."""
         for slot, leaf in zip(self.slots, leaves, strict=True):
             slot.write(leaf, self.originals)
-        self.built.params.update()
+        self._update()
 
     def restore(self) -> None:
         """Put the described values back."""
@@ -325,4 +348,9 @@ class SlotTable:
         for key, value in self.originals.items():
             params[key] = value
             params.set_dirty(key)
-        params.update()
+        self._update()
+
+    def _update(self) -> None:
+        for key in self._changed_too:
+            self.built.params.set_dirty(key)
+        self.built.params.update()

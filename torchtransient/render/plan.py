@@ -7,7 +7,7 @@ arrivals are listed one by one), or from the caller, and ``plan.reasons`` says f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from torchtransient import plugins
@@ -21,6 +21,7 @@ from torchtransient.render.effects import Effects
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, planned
 from torchtransient.render.inventory import SceneInventory, take_inventory
+from torchtransient.render.opaque import opaque
 from torchtransient.render.plan_finder import Draft, Finder
 from torchtransient.render.plan_pilot import PilotReport
 from torchtransient.render.pulse_properties import checked_pulse
@@ -89,7 +90,19 @@ class Plan(Effects):
     def __str__(self) -> str:
         return "\n".join(self.reasons)
 
+    def __eq__(self, other: object) -> bool:
+        """The same decisions about one scene, in whichever process they were made."""
+        if not isinstance(other, Plan):
+            return NotImplemented
+        rest = [field.name for field in fields(self) if field.name != "scene"]
+        same = all(getattr(self, name) == getattr(other, name) for name in rest)
+        return same and self.scene.same_description(other.scene)
 
+    def __hash__(self) -> int:
+        return hash((self.variant, self.integrator, self.film, self.outputs, self.reasons))
+
+
+@opaque
 def plan(
     scene: Any,
     outputs: Sequence[str] | str = ("transient",),

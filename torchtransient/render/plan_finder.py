@@ -13,9 +13,9 @@ from torchtransient.render import plan_choices as choices
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.films.choice import FilmChoice, PlannedFilm
 from torchtransient.render.inventory import SceneInventory
-from torchtransient.render.parameters import needing_slope
+from torchtransient.render.parameters import needing_slope, unknown_key
 from torchtransient.render.plan_pilot import MOST_BINS, Arrivals, PilotReport, axis_over
-from torchtransient.render.scene_handle import Scene, load, unknown_key
+from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.slope import check_filter, filter_for
 from torchtransient.render.variant import active_variant
 

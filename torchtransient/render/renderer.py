@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,13 +11,13 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import DeviceError, SceneError, ShapeError
+from torchtransient.errors import SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.plugins.parameters import check_slope
+from torchtransient.plugins.shares import is_share
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
-    SEED_RANGE,
     Values,
     as_float,
     checked_filter,
@@ -25,22 +25,23 @@ from torchtransient.render.arguments import (
     film_asked_for,
     fit_shape,
     mangle,
-    mix_seed,
     samples,
     sensor_list,
-    whole_number,
 )
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.effects import Effects
-from torchtransient.render.engine import Item, RenderJob
+from torchtransient.render.engine import RenderJob
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.layout import steady_channels_first
+from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput, RenderStats
-from torchtransient.render.parameters import ParameterInfo, needing_slope
+from torchtransient.render.parameters import ParameterInfo, needing_slope, unknown_key
+from torchtransient.render.physics import PhysicsWatch
 from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
-from torchtransient.render.scene_handle import Scene, load, unknown_key
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.seeds import Item, Seeding, drawn
 from torchtransient.render.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
@@ -85,10 +86,16 @@ class TransientRenderer(nn.Module):
     or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks of one sensor.
     ``sampler``: plugin name of a Mitsuba sampler that replaces those of the sensors, with the same number of samples.
 
+    ``physics``: what becomes of what no physical system has: reflectances, albedos and other shares of the light
+    outside of [0, 1], described or given, transforms without an inverse, and windows that miss more than 5 % of the
+    light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
+    ``PhysicsError``; "ignore" does not look.
+
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
     """
 
+    @opaque
     def __init__(
         self,
         scene: Any,
@@ -108,6 +115,7 @@ class TransientRenderer(nn.Module):
         gates: Sequence[Gate] | None = None,
         steady: bool = True,
         film: FilmChoice | None = None,
+        physics: str = "warn",
     ):
         super().__init__()
         film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
@@ -127,6 +135,7 @@ class TransientRenderer(nn.Module):
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
+        self._watch = PhysicsWatch(physics, self.scene.told)
         self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
@@ -138,6 +147,7 @@ class TransientRenderer(nn.Module):
             if isinstance(effects, Effects):
                 effects.check_sensors(self._sensors)
             start = self._initial_values(parameters)
+            self._look_at_scene()
         self._names = mangle(self._keys)
         for key in self._keys:
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
@@ -184,6 +194,19 @@ class TransientRenderer(nn.Module):
                 "Say which, for instance temporal_filter='box', or use one TransientRenderer per sensor."
             )
 
+    def _look_at_scene(self) -> None:
+        if self._watch.looks:
+            built = self.scene.built(self._options)
+            slots = self.scene.slots(self._keys, self._options).slots
+            if self.film.count > 1 or self.effective_filter in ("", "box"):
+                # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
+                self._watch.window_name = f"window of {self.film.describe('')}"
+            self._watch.shares = frozenset(key for key in self._keys if is_share(built.params, key))
+            self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
+            # What is given replaces what is described.
+            findings = self.scene.findings(self._options)
+            self._watch.scene({key: text for key, text in findings.items() if key not in self._keys})
+
     def _initial_values(self, given: Sequence[str] | Mapping[str, Any]) -> dict[str, torch.Tensor]:
         slots = self.scene.slots(self._keys, self._options).slots
         self._shapes = {slot.key: slot.shape for slot in slots}
@@ -192,8 +215,9 @@ class TransientRenderer(nn.Module):
         for slot in slots:
             value = torch.tensor(slot.initial, dtype=torch.float32, device=device).reshape(slot.shape)
             if isinstance(given, Mapping) and given[slot.key] is not None:
-                value = torch.as_tensor(given[slot.key], dtype=torch.float32).detach().clone().to(device)
-                value, batched = fit_shape(slot.key, value, slot.shape)
+                own = given[slot.key]
+                own = as_float(slot.key, own.to(device) if isinstance(own, torch.Tensor) else own, device)
+                value, batched = fit_shape(slot.key, own.detach().clone(), slot.shape)
                 if batched:
                     raise ShapeError(
                         f"start value of {slot.key!r}: expected shape {slot.shape}, got {tuple(value.shape)}."
@@ -230,6 +254,7 @@ class TransientRenderer(nn.Module):
             return self.temporal_filter
         return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
 
+    @opaque
     def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
         """A copy with the same parameter values and another sampler or temporal filter; None keeps what this one
         has.
@@ -250,6 +275,7 @@ class TransientRenderer(nn.Module):
         there = has_slope(self.effective_filter, self._pulsed) and self._response[0]
         return there or not needing_slope(self._infos, keys)
 
+    @opaque
     def samples_drawn(self, spp: int) -> int:
         """Samples per pixel that a render with ``spp`` really draws: stratified samplers round up to counts that
         they can lay out.
@@ -259,9 +285,10 @@ class TransientRenderer(nn.Module):
             sampler.set_sample_count(spp)
             return int(sampler.sample_count())
 
+    @opaque
     def forward(
         self,
-        values: Mapping[str, torch.Tensor] | None = None,
+        values: Mapping[str, Any] | None = None,
         *,
         seed: int | Sequence[int] | None = None,
         spp: int | None = None,
@@ -269,8 +296,9 @@ class TransientRenderer(nn.Module):
     ) -> RenderOutput:
         """Render. ``values`` replaces the module's own parameters, key by key; keys are those of ``parameters``.
 
-        A value has the shape listed by ``scene.parameters()``, or one leading batch dimension B more; values without
-        it are used for every entry. Any floating dtype is taken and computed in float32.
+        A value is a tensor, an array, a list or a number of the shape listed by ``scene.parameters()``, or with one
+        leading batch dimension B more; values without it are used for every entry. Any real dtype is taken and computed
+        in float32.
 
         ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
         every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
@@ -284,21 +312,24 @@ class TransientRenderer(nn.Module):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         used = samples("spp", spp) or self.spp or self._scene_spp
-        items = self._items(seed, batch)
+        seeding = Seeding(self._sensors, 1 if batch is None else batch, self.grad_seed)
+        number, per_entry = drawn(seed)
         bar = Bar() if progress else None
         job = RenderJob(
             scene=self.scene,
             options=self._options,
             keys=self._keys,
-            items=items,
+            items=() if number is None else seeding.items(number),
+            seeding=seeding,
             batched=tuple(batched),
             spp=used,
             spp_grad=self.spp_grad or used,
             temporal_filter=temporal_filter or None,
+            watch=self._watch,
             progress=bar,
         )
         try:
-            steady, response = Render.apply(job, *tensors)
+            steady, response = Render.apply(job, per_entry, *tensors)
         finally:
             if bar is not None:
                 bar.close()
@@ -309,7 +340,7 @@ class TransientRenderer(nn.Module):
             self.film, steady, self.film.channels_first(response, leading, components), stats, self._channels
         )
 
-    def _collect(self, values: Mapping[str, torch.Tensor] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
+    def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
         given = dict(values or {})
         for key in given:
@@ -320,13 +351,7 @@ class TransientRenderer(nn.Module):
         tensors, batched, batch = [], [], None
         for key in self._keys:
             value = given.get(key, self.values[key])
-            value = as_float(key, value)
-            if value.device.type != expected:
-                raise DeviceError(
-                    f"value of {key!r}: expected a tensor on {expected!r}, where variant {self.scene.variant} "
-                    f"computes, got {str(value.device)!r}. Move it with .to({expected!r}), or load the scene with a "
-                    f"variant of the other kind."
-                )
+            value = as_float(key, value, expected)
             value, has_batch = fit_shape(key, value, self._shapes[key])
             if has_batch:
                 if batch is not None and value.shape[0] != batch:
@@ -347,46 +372,19 @@ class TransientRenderer(nn.Module):
             check_filter(moving, temporal_filter, self._pulsed)
             check_slope(moving, *self._response)
 
-    def _items(self, seed: int | Sequence[int] | None, batch: int | None) -> tuple[Item, ...]:
-        entries = 1 if batch is None else batch
-        per_entry = len(self._sensors)
-        if seed is None:
-            seed = int(torch.randint(0, SEED_RANGE, (), dtype=torch.int64))
-        if (number := whole_number(seed)) is not None:
-            seeds = [mix_seed(number, n) for n in range(entries * per_entry)]
-        else:
-            given = list(seed) if isinstance(seed, Iterable) else []
-            if len(given) != entries:
-                raise ShapeError(
-                    f"seed: expected one integer, or one for each of {entries} batch entries, got {len(given)}."
-                )
-            seeds = [mix_seed(int(s), n) for s in given for n in range(per_entry)]
-        items = []
-        for n, value in enumerate(seeds):
-            items.append(Item(n // per_entry, self._sensors[n % per_entry], value, self._seed_of_gradient(value, n)))
-        return tuple(items)
-
-    def _seed_of_gradient(self, seed: int, number: int) -> int:
-        if self.grad_seed == "same":
-            return seed
-        if isinstance(self.grad_seed, int):
-            return mix_seed(self.grad_seed, number)
-        return mix_seed(seed, 0x5EED)
-
     def _stats(self, job: RenderJob) -> RenderStats:
-        log = job.log
-        pixels = self._cube_shape[0] * self._cube_shape[1]
-        paths = log["spp"] * pixels * len(job.items)
+        runs, pixels = job.log, self._cube_shape[0] * self._cube_shape[1]
+        items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
         return RenderStats(
-            spp=log["spp"],
-            seconds=log["seconds"],
-            samples_per_second=paths / log["seconds"],
+            spp=runs[0].spp,
+            seconds=seconds,
+            samples_per_second=runs[0].spp * pixels * len(items) / seconds,
             variant=self.scene.variant,
-            integrator=log["integrator"],
+            integrator=runs[0].integrator,
             temporal_filter=job.temporal_filter or "",
-            seeds=tuple(item.seed for item in job.items),
-            energy_before=log["energy_before"],
-            energy_after=log["energy_after"],
+            seeds=tuple(item.seed for item in items),
+            energy_before=tuple(energy for run in runs for energy in run.energy_before),
+            energy_after=tuple(energy for run in runs for energy in run.energy_after),
         )
 
     def extra_repr(self) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -12,7 +11,8 @@ from typing import Any
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.render.build import BuildOptions, BuiltScene, build
 from torchtransient.render.description import Description, describe_dict, describe_xml, same_description
-from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table
+from torchtransient.render.opaque import opaque
+from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table, unknown_key
 from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
@@ -35,6 +35,8 @@ class Scene:
         # Not in the built scenes: what refers to itself is freed late.
         self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
         self._table: ParameterTable | None = None
+        # Which unphysical things were said already (`render.physics`).
+        self.told: set[str] = set()
 
     @property
     def variant(self) -> str:
@@ -43,6 +45,7 @@ class Scene:
             self._variant = resolve_variant(self._requested_variant)
         return self._variant
 
+    @opaque
     def parameters(self) -> ParameterTable:
         """Every parameter key with its value, shape, and whether and why it is differentiable. Printing it gives
         a table.
@@ -65,6 +68,14 @@ class Scene:
             while len(self._builds) > _MAX_BUILDS:
                 self.drop(next(iter(self._builds)))
         self._builds.move_to_end(options)
+        return found
+
+    def findings(self, options: BuildOptions) -> dict[str, str]:
+        """What is unphysical in the description, by key. Must be called inside ``active_variant(scene.variant)``."""
+        found = self.built(options).findings()
+        if found and options.merge:
+            # Merged shapes have lost their names: those of the build that `parameters()` reads.
+            found = self.built(BuildOptions(real_bitmaps=True)).findings()
         return found
 
     def drop(self, options: BuildOptions) -> None:
@@ -124,13 +135,7 @@ class Scene:
         return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r})"
 
 
-def unknown_key(key: str, known: list[str]) -> str:
-    """The message for a parameter key that a scene does not have."""
-    close = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-    hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
-    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
-
-
+@opaque
 def load(
     scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, variant: str | None = None, **xml_parameters: Any
 ) -> Scene:

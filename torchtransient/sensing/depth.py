@@ -20,6 +20,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME, check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
+from torchtransient.tensor_record import TensorRecord
 
 
 def log_matched_filter(
@@ -124,8 +125,8 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     return (weights * (_positions(scores) - middle)).sum(TIME) + middle
 
 
-@dataclass(frozen=True)
-class Returns:
+@dataclass(frozen=True, repr=False)
+class Returns(TensorRecord):
     """``position`` in bins and ``strength`` (the entry there), (..., C, R, H, W), in order of time; ``valid``: bool,
     the same shape. Entries that are not valid come last and hold zero."""
 

@@ -26,13 +26,14 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import check_frequencies
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.layout import check_number, without_autocast
+from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 _TURN = 2 * math.pi
 
 
-@dataclass(frozen=True)
-class ItofReading:
+@dataclass(frozen=True, repr=False)
+class ItofReading(TensorRecord):
     """``phase`` (..., C, F, H, W) radians in [0, 2 pi); ``amplitude`` and ``offset`` in electrons per tap and
     ``confidence`` = amplitude / offset, all (..., C, F, H, W); ``depth_m`` (..., C, H, W) metres from the camera."""
 

@@ -12,6 +12,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_tensor, check_transient
 from torchtransient.sensing.sensor import Sensor
+from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 PLANCK_J_S = 6.626_070_15e-34  # exact by the definition of the kilogram (SI)
@@ -72,8 +73,8 @@ class Optics:
         return angle * self.pixel_area_m2 * self.transmission
 
 
-@dataclass(frozen=True)
-class BudgetReport:
+@dataclass(frozen=True, repr=False)
+class BudgetReport(TensorRecord):
     """Where the detections of a pixel come from. Rates per laser cycle, before pile-up and dead time.
 
     `signal_per_cycle`: (..., C, H, W), detections of laser light; `ambient_per_cycle`, `dark_per_cycle`: the same for

@@ -88,7 +88,8 @@ def emitters() -> dict[str, dict[str, Any]]:
         "directional": {"type": "directional", "direction": [0, 0, 1]},
         "constant": {"type": "constant"},
         "envmap": {"type": "envmap", "bitmap": _bitmap()["bitmap"]},
-        "sunsky": {"type": "sunsky"},
+        "sunsky": {"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8]},
+        "sunsky_at_a_time": {"type": "sunsky"},
         "timed_sunsky": {"type": "timed_sunsky"},
     }
 
@@ -104,7 +105,8 @@ def bsdfs() -> dict[str, dict[str, Any]]:
     plain = (
         "diffuse", "dielectric", "thindielectric", "roughdielectric", "conductor", "roughconductor", "plastic",
         "roughplastic", "pplastic", "hair", "polarizer", "retarder", "circular", "diff_dielectric",
-        "diff_rough_dielectric", "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular",
+        "diff_rough_dielectric", "diff_rough_plastic", "diff_conductor", "diff_polarizer", "diff_retarder",
+        "diff_circular",
     )  # fmt: skip
     return {
         **{name: {"type": name} for name in plain},

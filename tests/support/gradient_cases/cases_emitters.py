@@ -29,6 +29,15 @@ def angular_light():
     return lamp
 
 
+def sky_with_sun():
+    return {"type": "sunsky", "sun_direction": [0.3, 0.4, 0.7]}
+
+
+def turn_sun(params, x):
+    # Not of unit length on the way: Mitsuba reads angles from it as if it were.
+    params["light.sun_direction"] = mi.Vector3f(params["light.sun_direction"]) + mi.Vector3f(0.3, -0.2, 0.5) * x
+
+
 CASES = [
     Case("point_intensity", "emitter radiance or intensity", room, set_color("light.intensity.value"), 10.0, 0.5),
     Case(
@@ -99,6 +108,16 @@ CASES = [
         scale_texture("light.data"),
         0.0,
         0.05,
+        spp=4096,
+    ),
+    Case(
+        "sun_direction",
+        "direction of the sun",
+        lambda: room(light=sky_with_sun(), sensor=camera(start=2.0, bins=400)),
+        turn_sun,
+        0.0,
+        0.01,
+        variant="llvm_ad_rgb",
         spp=4096,
     ),
     Case(

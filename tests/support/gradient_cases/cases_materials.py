@@ -22,6 +22,16 @@ def blend():
     return {"type": "blendbsdf", "weight": 0.4, **parts}
 
 
+def principled_glass():
+    return {"type": "principled", "roughness": 0.5, "base_color": 0.8, "eta": 1.4, "spec_trans": 0.8}
+
+
+def thin_sheet():
+    return {
+        "type": "principledthin", "roughness": 0.5, "base_color": 0.8, "eta": 1.4, "spec_trans": 0.6, "diff_trans": 0.7,
+    }  # fmt: skip
+
+
 CASES = [
     Case("diffuse_albedo", "diffuse albedo", room, set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
     Case(
@@ -79,12 +89,51 @@ CASES = [
     Case(
         "plastic_alpha",
         "roughness (rough plastic)",
-        lambda: room(bsdf={"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": 0.3}, light=area_light()),
+        lambda: room(bsdf={"type": "diff_rough_plastic", "alpha": 0.3, "diffuse_reflectance": 0.3}, light=area_light()),
         set_color("wall.bsdf.alpha"),
         0.3,
         0.01,
         spp=4096,
-        support="biased: Mitsuba's transmittance table is not differentiated",
+    ),
+    Case(
+        "plastic_index",
+        "index of a rough plastic",
+        lambda: room(bsdf={"type": "diff_rough_plastic", "alpha": 0.2, "diffuse_reflectance": 0.8}, light=area_light()),
+        set_color("wall.bsdf.eta"),
+        1.49,
+        # Mitsuba's quadrature of the internal reflectance is rough on smaller scales.
+        0.04,
+        spp=4096,
+    ),
+    Case(
+        "principled_glass_index",
+        "index of a principled surface that transmits",
+        lambda: glass_slab(principled_glass()),
+        set_color("slab.bsdf.eta"),
+        1.4,
+        4e-3,
+        spp=16384,
+    ),
+    # Of very rough glass, a tenth of the samples leads to the wrong side of the surface and is thrown away.
+    Case(
+        "very_rough_glass",
+        "specular transmittance (rough glass)",
+        lambda: glass_slab(
+            {"type": "roughdielectric", "alpha": 0.7, "int_ior": 1.5, "ext_ior": 1.0, "specular_transmittance": 0.7}
+        ),
+        set_color("slab.bsdf.specular_transmittance.value"),
+        0.7,
+        0.02,
+        spp=8192,
+    ),
+    Case(
+        "principled_thin_colour",
+        "colour of a thin principled sheet",
+        lambda: glass_slab(thin_sheet(), "rectangle"),
+        set_color("slab.bsdf.base_color.value"),
+        0.8,
+        0.02,
+        spp=16384,
     ),
     Case(
         "principled_roughness",

@@ -51,6 +51,44 @@ def block(medium, bsdf=None, **arguments):
     return scene
 
 
+SPHERE = {"type": "sphere", "center": [0, 0, 1], "radius": 0.6}
+COLUMN = {"type": "cylinder", "p0": [0, -30, 1], "p1": [0, 30, 1], "radius": 0.6}
+
+
+def ball(medium, shape=SPHERE, **arguments):
+    """A ball of medium, or a column, before the wall; nothing else casts a shadow."""
+    scene = block(medium, **arguments)
+    scene["block"] = {key: value for key, value in scene["block"].items() if key != "to_world"} | shape
+    del scene["side"]
+    return scene
+
+
+def under_the_sky(medium):
+    """A ball of medium before a wall without a rim, below a sky that is dark towards the horizon."""
+    sky = np.zeros((32, 64, 3), np.float32)
+    sky[:8] = np.linspace(1.5, 0.5, 8)[:, None, None]
+    pose = transform().rotate([1, 0, 0], 90)
+    scene = ball(medium, light={"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": pose}, depth=3)
+    u = (np.arange(64) + 0.5) / 64 - 0.5
+    reflectance = np.clip((0.45 - np.hypot(u[:, None], u)) / 0.3, 0, 0.5).astype(np.float32)
+    texture = {"type": "bitmap", "data": mi.TensorXf(reflectance[..., None]), "raw": True}
+    scene["wall"] |= {"to_world": transform().scale(3), "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene["sensor"]["film"] |= {"temporal_bins": 400, "bin_width_opl": 0.05}
+    return scene
+
+
+def inside_a_ball(medium):
+    """The camera in a ball of thin fog, and a ball of ``medium`` in there; the light stands beside it."""
+    light = {"type": "point", "position": [1.9, 0.0, 4.0], "intensity": 10.0}
+    scene = ball(medium, {"type": "sphere", "center": [0, 0, 2.8], "radius": 0.4}, light=light, depth=3)
+    scene["fog"] = homogeneous(0.4, 0.9, 0.3)
+    fog = {"type": "ref", "id": "fog"}
+    null = {"type": "null"}
+    scene["around"] = {"type": "sphere", "center": [0, 0, 3.5], "radius": 1.5, "bsdf": null, "interior": fog}
+    scene["block"]["exterior"] = scene["sensor"]["medium"] = fog
+    return scene
+
+
 def fog(medium, light=None, **arguments):
     """The plain room filled with a medium, which the sensor stands in: every surface has it on both sides."""
     scene = room(light=light, **({"depth": 4} | arguments))
@@ -120,6 +158,22 @@ def thicken(key):
     return apply
 
 
+def flakes():
+    """Flakes that lie in no axis of the scene: how much light they stop depends on its direction."""
+    S = np.broadcast_to(np.float32([0.3, 0.6, 0.9, 0.05, -0.1, 0.08]), (2, 2, 2, 6))
+    return {"type": "sggx", "S": volume(S)}
+
+
+def turn_flakes(key):
+    """Change all six entries of the flakes' matrix."""
+
+    def apply(params, x):
+        change = np.tile(np.float32([0.5, -0.3, 0.4, 0.2, 0.1, -0.1]), 8)
+        params[key] = mi.TensorXf(params[key].array + mi.Float(change) * x, params[key].shape)
+
+    return apply
+
+
 def blended():
     parts = {"a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}
     return homogeneous() | {"phase": {"type": "blendphase", "weight": 0.4, **parts}}
@@ -137,6 +191,8 @@ BLOCKS = {
     "coloured": lambda: block(coloured()),
     "black": lambda: block(homogeneous(albedo=0.0)),
     "blended": lambda: block(blended()),
+    "flakes": lambda: block(homogeneous() | {"phase": flakes()}, depth=2),
+    "clouds of flakes": lambda: block(clouds(phase=flakes())),
     "clouds": lambda: block(clouds()),
     "sparse": lambda: block(clouds(sparse())),
     "albedo grid": lambda: block(clouds(albedo=volume(sparse()))),
@@ -146,6 +202,12 @@ BLOCKS = {
     "fog, scattered once": lambda: fog(homogeneous(0.3), depth=2),
     "fog and lamp": lambda: fog(homogeneous(0.1), **wide_lamp()),
     "fog and ball": lambda: fog(homogeneous(0.3), **lamp("sphere")),
+    "ball": lambda: ball(homogeneous(1.0, 0.9), depth=2),
+    "ball and lamp": lambda: ball(homogeneous(1.0, 0.9), **lamp()),
+    "column and lamp": lambda: ball(homogeneous(1.0, 0.9), COLUMN, **lamp()),
+    "ball of clouds": lambda: ball(clouds(), **lamp()),
+    "ball under the sky": lambda: under_the_sky(homogeneous(1.0, 0.9, 0.3)),
+    "inside a ball": lambda: inside_a_ball(homogeneous(1.5, 0.8, 0.0)),
     "smooth glass": smooth_pool,
     "rough glass": rough_pool,
 }
@@ -190,6 +252,8 @@ CASES = [
     case("albedo_zero", "medium albedo", "black", set_color(ALBEDO), 0.0, 0.02),
     case("g", "phase function", "plain", set_color(PHASE + "g"), 0.4, 0.02),
     case("blend", "phase function", "blended", set_color(PHASE + "weight.value.value"), 0.4, 0.02, tags=SLOW),
+    case("flakes", "flakes (sggx)", "flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
+    case("flakes_in_clouds", "flakes (sggx)", "clouds of flakes", turn_flakes(PHASE + "S.data"), 0.0, 0.02),
     case("grid", "density and albedo grids", "clouds", scale_texture(GRID), 0.0, 0.02),
     case("grid_sparse", "density and albedo grids", "sparse", scale_texture(GRID), 0.0, 0.02),
     case(
@@ -199,6 +263,14 @@ CASES = [
     lengths("wall_behind", "plain", move("wall.to_world", FORWARD)),
     lengths("wall_in_fog", "fog, scattered once", move("wall.to_world", FORWARD)),
     lengths("wall_behind_grid", "clouds", move("wall.to_world", FORWARD), tags=SLOW),
+    lengths("wall_behind_ball", "ball and lamp", move("wall.to_world", FORWARD), spp=4096),
+    lengths("wall_behind_column", "column and lamp", move("wall.to_world", FORWARD), spp=4096),
+    lengths("wall_behind_ball_grid", "ball of clouds", move("wall.to_world", FORWARD), spp=4096, tags=SLOW),
+    lengths("wall_under_the_sky", "ball under the sky", move("wall.to_world", FORWARD), spp=8192, tags=SLOW),
+    lengths("wall_from_a_ball", "inside a ball", move("wall.to_world", FORWARD), spp=4096, tags=SLOW),
+    lengths("camera_in_ball", "inside a ball", move("sensor.to_world", FORWARD), spp=4096, tags=SLOW),
+    lengths("ball", "ball", move("block.to_world", FORWARD), step=8e-3, spp=16384, tags=SLOW),
+    lengths("ball_sideways", "ball", move("block.to_world", (1, 0, 0)), step=8e-3, spp=16384, tags=SLOW),
     lengths("light_in_fog", "fog", move_point("light.position", FORWARD)),
     lengths("light_behind", "plain", move_point("light.position", FORWARD), tags=SLOW),
     lengths("lamp_in_fog", "fog and lamp", move("light.to_world", FORWARD), step=4e-3, spp=4096, fd_spp=4096),

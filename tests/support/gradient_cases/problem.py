@@ -19,7 +19,8 @@ import numpy as np
 class Case:
     """One unknown: ``scene()`` is a Mitsuba dictionary, ``apply(params, x)`` writes the attached unknown into it.
 
-    ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given.
+    ``fd_spp``: samples of the renders for finite differences, as many as ``spp`` when it is not given. ``side``: 1 or
+    -1 for differences on that side of the value alone, where it ends.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Case:
     spp: int = 1024
     seeds: int = 6
     fd_spp: int = 0
+    side: int = 0
     support: str = "correct"
     tags: tuple[str, ...] = field(default=())
 
@@ -94,10 +96,23 @@ class Problem:
         self.params.update()
         return list(changes)
 
+    def detach(self):
+        """Leave nothing attached: Mitsuba traces what other scenes hold, and refuses some of it when attached."""
+        self.install(mi.Float(self.case.value))
+
     def loss(self, x: float, seed: int) -> float:
         self.install(mi.Float(x))
         _, transient = self.scene.integrator().render(self.scene, seed=seed, spp=self.case.fd_spp)
         return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())
+
+    def difference(self, seed: int) -> float:
+        """Finite difference of the loss: central, or of second order on one side."""
+        x, h = self.case.value, self.case.step
+        if self.case.side:
+            h *= self.case.side
+            here, near, far = (self.loss(x + k * h, seed) for k in range(3))
+            return (4 * near - 3 * here - far) / (2 * h)
+        return (self.loss(x + h, seed) - self.loss(x - h, seed)) / (2 * h)
 
     def reverse(self, seed: int) -> float:
         x = mi.Float(self.case.value)
@@ -110,7 +125,9 @@ class Problem:
         for key in keys:
             dr.enqueue(dr.ADMode.Backward, self.params[key])
         dr.traverse(dr.ADMode.Backward)
-        return float(dr.grad(x)[0])
+        slope = float(dr.grad(x)[0])
+        self.detach()
+        return slope
 
     def forward(self, seed: int) -> float:
         x = mi.Float(self.case.value)
@@ -118,4 +135,5 @@ class Problem:
         self.install(x)
         dr.set_grad(x, 1.0)
         _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
+        self.detach()
         return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())

@@ -1,4 +1,4 @@
-"""Properties that both dielectric plugins read: the relative index and the textures of the two lobes."""
+"""Properties that the dielectric plugins read: the relative index and the textures of the two lobes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 
 
-def relative_index(props: Any, plugin: str) -> Any:
-    """``int_ior / ext_ior`` as a Dr.Jit scalar; each a number or a material name, by default ``bk7`` in ``air``.
+def relative_index(props: Any, plugin: str, default: str = "bk7") -> Any:
+    """``int_ior / ext_ior`` as a Dr.Jit scalar; each a number or a material name, by ``default`` in ``air``.
 
     Names are looked up by Mitsuba itself: its own ``dielectric`` is built from the same two values and asked for its
     ``eta``, so that the table of materials and its spelling are the installed version's.
     """
-    sides = {name: props[name] for name in ("int_ior", "ext_ior") if name in props}
+    sides = {"int_ior": default} | {name: props[name] for name in ("int_ior", "ext_ior") if name in props}
     sides = {name: value if isinstance(value, str) else float(value) for name, value in sides.items()}
     for name, value in sides.items():
         if not isinstance(value, str) and not value > 0:

@@ -41,14 +41,14 @@ class RefractiveBSDFs:
         optical length, and for a refractive plugin that does not expose ``eta``.
         """
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
-        leaves = ((bsdf, _refractive_leaf(bsdf)) for bsdf in found)
-        entries = [(bsdf, leaf) for bsdf, leaf in leaves if leaf is not None]
+        leaves = ((bsdf, _refractive_leaves(bsdf, (mi.BSDFFlags.GlossyTransmission,))) for bsdf in found)
+        entries = [(bsdf, _one_index(bsdf, parts)) for bsdf, parts in leaves if parts]
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
         """The indices as they are now; to be called outside of loops, once a job."""
         with dr.resume_grad():
-            indices = [_index_of(leaf) for _, leaf in self._entries]
+            indices = [index_of(leaf) for _, leaf in self._entries]
             return RefractionTable(PointerTable([bsdf for bsdf, _ in self._entries], indices, default=1))
 
 
@@ -75,35 +75,51 @@ class RefractionTable:
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))
 
 
-def _refractive_leaf(bsdf: Any) -> Any | None:
-    """The BSDF inside ``bsdf``, or itself, that holds the index of refraction; None if it does not refract."""
-    if not _has_refraction_lobe(bsdf):
-        return None
+def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
+    """(BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by a
+    smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+    """
+    lobes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
+    leaves = ((bsdf, _refractive_leaves(bsdf, lobes)) for bsdf in bsdfs)
+    return [(bsdf, parts[0]) for bsdf, parts in leaves if parts]
+
+
+def _refractive_leaves(bsdf: Any, lobes: tuple[Any, ...]) -> list[Any]:
+    """The BSDFs inside ``bsdf``, or itself, that hold an index of refraction; none if it does not refract through one
+    of the kinds of ``lobes``.
+    """
+    if not _has_refraction_lobe(bsdf, lobes):
+        return []
     leaves: list[Any] = []
     pending = [bsdf]
     while pending:
         node = pending.pop()
         nested = bsdfs_below(node)
         if nested:
-            pending.extend(child for child in nested if _has_refraction_lobe(child))
+            pending.extend(child for child in nested if _has_refraction_lobe(child, lobes))
         elif not has_equal_sides(node):
             leaves.append(node)
-    indices = {round(float(dr.slice(dr.detach(_index_of(leaf)), 0)), 6) for leaf in leaves}
+    return leaves
+
+
+def _one_index(bsdf: Any, leaves: list[Any]) -> Any:
+    """The first of the parts, which must have one index."""
+    indices = {round(float(dr.slice(dr.detach(index_of(leaf)), 0)), 6) for leaf in leaves}
     if len(indices) > 1:
         raise SceneError(
             f"BSDF '{bsdf.id()}': one relative index of refraction per surface is expected, its parts have "
             f"{', '.join(map(str, sorted(indices)))}. Give the parts the same index, or use separate surfaces."
         )
-    return leaves[0] if leaves else None
+    return leaves[0]
 
 
-def _has_refraction_lobe(bsdf: Any) -> bool:
-    wanted = (mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.NonSymmetric)
-    components = (bsdf.flags(i) for i in range(bsdf.component_count()))
-    return any(all(mi.has_flag(flags, flag) for flag in wanted) for flags in components)
+def _has_refraction_lobe(bsdf: Any, lobes: tuple[Any, ...]) -> bool:
+    components = [bsdf.flags(i) for i in range(bsdf.component_count())]
+    both_ways = [flags for flags in components if mi.has_flag(flags, mi.BSDFFlags.NonSymmetric)]
+    return any(mi.has_flag(flags, lobe) for flags in both_ways for lobe in lobes)
 
 
-def _index_of(leaf: Any) -> Any:
+def index_of(leaf: Any) -> Any:
     """Inside over outside index of a BSDF without nested ones, attached if its parameter is."""
     params = mi.traverse(leaf)
     if "eta" in params:

@@ -26,6 +26,8 @@ class AngularAreaLight(mi.Emitter):
     rays (``sample_ray``).
     """
 
+    samples_its_shape = True
+
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.radiance = props.get_emissive_texture("radiance", 1.0)

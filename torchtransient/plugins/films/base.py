@@ -8,6 +8,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.interfaces import FilmInterface
+from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
@@ -52,6 +53,7 @@ class TimeResolvedFilm(mi.Film):
 
     def traverse(self, cb):
         super().traverse(cb)
+        note_scene(self, cb)
         if self.curves is not None:
             for name, curve in zip(self.curves.names, self.curves.textures, strict=True):
                 cb.put(name, curve, mi.ParamFlags.NonDifferentiable)

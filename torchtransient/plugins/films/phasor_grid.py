@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, TorchTransientWarning
 
 LIST = ("frequencies",)
 GRID = ("frequency_first", "frequency_step", "frequency_count")
@@ -31,12 +32,22 @@ def frequencies_of(props) -> np.ndarray:
         if count < 1:
             raise SceneError(f"phasor_hdr_film: frequency_count must be at least 1, got {count}.")
         return checked(float(props["frequency_first"]) + np.arange(count) * float(props["frequency_step"]))
-    return transform_bins(
+    found = transform_bins(
         float(props.get("wl_mean", 100.0)),
         float(props.get("wl_sigma", 1000.0)),
         int(props.get("temporal_bins", 4096)),
         float(props.get("bin_width_opl", 0.003)),
     )
+    if not given:
+        numbers = ", ".join(f"{number:.4g}" for number in found)
+        warnings.warn(
+            f"phasor_hdr_film: no frequencies are given, so the film keeps those of mitransient's defaults, {numbers} "
+            "cycles per metre. Give 'frequencies': '...', numbers with commas in cycles per metre, or wl_mean and "
+            "wl_sigma to mean these.",
+            TorchTransientWarning,
+            stacklevel=2,
+        )
+    return found
 
 
 def parse_list(given) -> np.ndarray:

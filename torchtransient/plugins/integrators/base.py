@@ -8,14 +8,15 @@ import mitsuba as mi
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
+from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.launch import Pass, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
-from torchtransient.plugins.parameters import ParameterTracker, check_slope, moving_names
+from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
-from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sample_rays, views
+from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.contents import SceneContents
@@ -28,17 +29,6 @@ from torchtransient.plugins.transport.walk import walk
 from torchtransient.plugins.transport.world import PathSettings, World
 
 UNLIMITED = 0xFFFFFFFF
-
-
-class PrimaryRays:
-    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``scale`` (of a sample
-    in its pixel), ``row`` and ``column`` of the pixel, and the :class:`~..sensors.origin.View` of every sensor
-    (``seen``). A plain object, which Dr.Jit loops leave alone.
-    """
-
-    def __init__(self, sampler, ray, weight, scale, row, column, seen):
-        self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
-        self.row, self.column, self.seen = row, column, seen
 
 
 @IntegratorInterface.register
@@ -76,6 +66,10 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        note_scene(self, cb)
 
     # ----------------------------------------------------------------------------------- preparation
 
@@ -120,12 +114,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         return self._seen_scene(scene).tracker(scene)
 
     def reference(self, scene):
-        """The sphere around the scene as it was first seen, which light from and to infinity is timed by."""
+        """The sphere around the scene as described, which light from and to infinity is timed by."""
         return self._seen_scene(scene).reference
 
     def _seen_scene(self, scene) -> SeenScene:
         if self._seen is None or not self._seen.is_of(scene):
-            self._seen = SeenScene(scene)
+            self._seen = SeenScene(scene, self)
         return self._seen
 
     def settings(self) -> PathSettings:
@@ -176,10 +170,11 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
+            η = index_at_sensor(seen, self.contents(scene, sensor).surroundings, scene)
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen)
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η)
 
     def channel_match(self, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
@@ -199,8 +194,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
         length = mi.Float(0)
         if not self.camera_unwarp:
-            length = dr.detach(length_to_sensor_origin(rays.seen, rays.ray))
+            length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
+
+    def _walk(self, world, film, rays, sink):
+        ray, η = dr.detach(rays.ray), dr.detach(rays.η)
+        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η)
 
     # ----------------------------------------------------------------------------------- entry points
 
@@ -233,7 +232,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events())
-        _, kept = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), FilmSink(block))
+        _, kept = self._walk(world, film, rays, FilmSink(block))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
         block.finish()
@@ -259,7 +258,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             jobs, _ = self.passes(world, sensor, film, seed, int(spp))
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
-            with dr.isolate_grad():
+            with dr.isolate_grad(), contents.hidden_from_mitsuba():
                 for job in jobs:
                     self._backward_pass(world, sensor, film, job, g_steady, g_transient)
                     dr.eval()
@@ -269,6 +268,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
             effects = self.parameters(scene).attached()
+        check_stand_ins(effects)
         check_slope(moving_names(effects), film.has_slope, film.response_name, film.slope_remedy)
         if self.max_depth == UNLIMITED:
             raise GradientError(
@@ -280,7 +280,7 @@ class TransientIntegrator(mi.CppADIntegrator):
     def _record(self, world, film, rays):
         """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
         sink = RecordSink()
-        count, store = walk(world, rays.sampler, dr.detach(rays.ray), self.first_opl(film, rays), sink)
+        count, store = self._walk(world, film, rays, sink)
         return sink.layout, store, count
 
     def _backward_pass(self, world, sensor, film, job, g_steady, g_transient):
@@ -298,15 +298,21 @@ class TransientIntegrator(mi.CppADIntegrator):
             transient = (flat, strides[2], strides[3])
         block = film.create_adjoint_block(transient, base, steady, match)
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
+        with dr.resume_grad():
+            if world.wanted.sensor or dr.grad_enabled(rays.η):
+                dr.backward_from(self._objective_of(world, rays, adjoint))
+
+    def _objective_of(self, world, rays, adjoint):
+        """``<adjoint, Carry>`` of the primary rays."""
+        objective = adjoint.η * rays.η
+        if not self.camera_unwarp:
+            objective += adjoint.slope * rays.length()
         if world.wanted.sensor:
-            with dr.resume_grad():
-                objective = dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
-                if not self.camera_unwarp:
-                    objective += adjoint.slope * length_to_sensor_origin(rays.seen, rays.ray)
-                if mi.is_polarized:
-                    d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-                    objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
-                dr.backward_from(objective)
+            objective += dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
+        if world.wanted.sensor and mi.is_polarized:
+            d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
+            objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
+        return objective
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -323,9 +329,10 @@ class TransientIntegrator(mi.CppADIntegrator):
                 propagate_tangents(self.parameters(scene), world)
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
-            for job in jobs:
-                self._forward_pass(world, sensor, film, job)
-                dr.eval(film.bands[job.band][2], film.steady)
+            with contents.hidden_from_mitsuba():
+                for job in jobs:
+                    self._forward_pass(world, sensor, film, job)
+                    dr.eval(film.bands[job.band][2], film.steady)
             film.finish_render()
             return film.develop() if develop else None
 
@@ -342,16 +349,17 @@ class TransientIntegrator(mi.CppADIntegrator):
     def _tangent_of(self, world, rays) -> Carry:
         """The tangent of the Carry of the primary rays."""
         tangent = Carry.zeros()
-        if not world.wanted.sensor:
-            return tangent
         with dr.resume_grad():
-            attached = [rays.ray.o, rays.ray.d, length_to_sensor_origin(rays.seen, rays.ray)]
+            if not (world.wanted.sensor or dr.grad_enabled(rays.η)):
+                return tangent
+            attached = [rays.ray.o, rays.ray.d, rays.length(), rays.η]
             if mi.is_polarized:
                 attached.append(sensor_rotation(rays.seen, rays.ray).angle())
-            o, d, length, *rotation = tangents_of(attached)
+            o, d, length, η, *rotation = tangents_of(attached)
         tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
         tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
         tangent.slope = mi.Float(0) if self.camera_unwarp else mi.Float(length)
+        tangent.η = mi.Float(η)
         if mi.is_polarized:
             tangent.β = rotation_tangent(rotation[0])
         return tangent

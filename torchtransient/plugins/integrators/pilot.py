@@ -121,7 +121,7 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         settings = integrator.settings()
         settings = replace(settings, max_depth=PILOT_DEPTH, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
         world = integrator.world(scene, integrator.contents(scene, sensor), settings=settings)
-        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink)
+        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η))
         most = dr.max(sink.used)
         dr.eval(most, sink.opl, sink.energy, sink.depth)
         dr.sync_thread()

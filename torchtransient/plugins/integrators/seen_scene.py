@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchtransient.plugins.described_scene import check_scene, described
 from torchtransient.plugins.parameters import ParameterTracker
-from torchtransient.plugins.sampling.distant import DistantReference, distant_reference
+from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.contents import SceneContents
 
 
@@ -13,14 +14,16 @@ class SeenScene:
     """Look-ups that need to be made once a scene: the ``reference`` sphere of distant light, the contents by sensor,
     the parameters.
 
-    The reference is that of the scene as it was first seen: moving a shape must not shift the clock. The scene itself
-    is not kept, since it owns the integrator and would never be freed; one of its shapes is, so that no later scene can
-    be taken for this one because it got the same addresses.
+    The reference is that of the scene as described, see :mod:`..described_scene`: neither moving a shape nor what was
+    rendered before may shift the clock. The scene itself is not kept, since it owns the integrator and would never be
+    freed.
     """
 
-    def __init__(self, scene: Any) -> None:
-        self.reference: DistantReference = distant_reference(scene)
-        self._key = _key_of(scene)
+    def __init__(self, scene: Any, integrator: Any) -> None:
+        self._described = described(scene, integrator)
+        check_scene(scene, known=self._described)
+        self.reference: DistantReference = self._described.reference
+        # So that no later scene can be taken for this one because it got the same addresses.
         self._kept = scene.shapes()[:1]
         self._plugins: tuple[int, ...] = ()
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
@@ -28,7 +31,7 @@ class SeenScene:
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
-        return self._key == _key_of(scene)
+        return self._described.is_of(scene)
 
     def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
         """What the scene contains for a sensor, which may stand in a medium."""
@@ -58,7 +61,3 @@ def _plugins_of(scene: Any) -> tuple[int, ...]:
     """What surfaces and lights are made of, by address: those in use are kept by the scene."""
     bsdfs = (shape.bsdf() for shape in scene.shapes())
     return (*(0 if bsdf is None else bsdf.ptr for bsdf in bsdfs), *(emitter.ptr for emitter in scene.emitters()))
-
-
-def _key_of(scene: Any) -> tuple[int, ...]:
-    return (scene.ptr, *(shape.ptr for shape in scene.shapes()))

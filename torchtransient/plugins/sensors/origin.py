@@ -36,6 +36,22 @@ class View:
         return near * dr.squared_norm(axis) / dr.dot(axis, ray.d)
 
 
+class PrimaryRays:
+    """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``scale`` (of a sample
+    in its pixel), ``row`` and ``column`` of the pixel, the :class:`View` of every sensor (``seen``),
+    and the index of refraction ``η`` where the rays start (attached to the glass that they start in). A plain object,
+    which Dr.Jit loops leave alone.
+    """
+
+    def __init__(self, sampler, ray, weight, scale, row, column, seen, η):
+        self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
+        self.row, self.column, self.seen, self.η = row, column, seen, η
+
+    def length(self):
+        """Optical length from the sensor's origin to where the rays start, attached."""
+        return length_to_sensor_origin(self.seen, self.ray) * self.η
+
+
 def views(sensor: Any, position: Any, reference: Any) -> list[View]:
     """The sensors behind the film positions ``position`` in [0, 1]^2, each with the lanes that are its own.
 
@@ -98,3 +114,15 @@ def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
     for view in seen[1:]:
         length = dr.select(view.active, view.length(ray), length)
     return length
+
+
+def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
+    """Index of refraction where the rays start, attached to the glass around the sensor; ``surroundings`` (a
+    :class:`~.surroundings.Surroundings`): what may lie around it, None for nothing.
+    """
+    if surroundings is None:
+        return mi.Float(1)
+    first, *others = surroundings.indices(scene)
+    for view, index in zip(seen[1:], others, strict=True):
+        first = dr.select(view.active, index, first)
+    return first

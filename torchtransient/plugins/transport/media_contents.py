@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import GradientError
+from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import shapes_of_scene
 
 
@@ -16,20 +18,24 @@ class MediaContents:
 
     ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
     media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``emitter_sampling``: every medium allows connections to emitters. ``extent``: the
-    size of the scene in metres.
+    lines go through several media. ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
+    connections to emitters. ``extent``: the size of the scene in metres. ``phase_mixtures``: blends of phase functions,
+    None where there are none.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
 
-    def __init__(self, media: list[Any], at_sensor: Any, open_boundaries: bool, extent: float):
+    def __init__(self, media: list[Any], at_sensor: Any, open_boundaries: bool, shapes_in_groups: bool, extent: float):
         self.media = media
         self.at_sensor = at_sensor
         self.homogeneous = any(m.is_homogeneous() for m in media)
         self.heterogeneous = any(not m.is_homogeneous() for m in media)
         self.emitter_sampling = all(m.use_emitter_sampling() for m in media)
         self.open_boundaries = open_boundaries
+        self.shapes_in_groups = shapes_in_groups
         self.extent = extent
+        phases = {phase.ptr: phase for phase in (medium.phase_function() for medium in media)}
+        _, self.phase_mixtures = mixtures_of(list(phases.values()), mi.PhaseFunction)
 
     @property
     def one_stretch(self) -> bool:
@@ -46,6 +52,17 @@ class MediaContents:
                 "and a medium has sample_emitters = false. Set it to true, or use lights of another shape."
             )
 
+    @staticmethod
+    def check_sun(moves: bool) -> None:
+        """Raise ``GradientError`` where the direction of the sun has a derivative: the way of its light through a
+        medium changes with it, which is not followed.
+        """
+        if moves:
+            raise GradientError(
+                "transient_prbvolpath: 'sun_direction' has no derivative in a scene with media, expected a scene "
+                "without. Leave out the medium or the parameter; a moving 'point' light has one."
+            )
+
 
 class FlightSettings:
     """How the walks through media are made in one job: the contents, and what derivatives ask of them.
@@ -54,12 +71,15 @@ class FlightSettings:
     before a vertex is kept, since the vertex may move with it. ``rate_floor`` (1 / m, None when no extinction is
     differentiated): the smallest rate at which collisions are sampled: where the density is zero, its derivative is
     not, and is found by collisions alone. ``hide_emitters``: rays from the sensor pass light sources.
+    ``surfaces``: what their derivatives need beside Mitsuba (:class:`.instances.AttachedSurfaces`), or None.
     """
 
-    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool):
+    def __init__(self, contents: MediaContents, wanted: Any, hide_emitters: bool, surfaces: Any = None):
+        self.surfaces = surfaces
         self.at_sensor, self.emitter_sampling = contents.at_sensor, contents.emitter_sampling
         self.homogeneous, self.heterogeneous = contents.homogeneous, contents.heterogeneous
         self.open_boundaries, self.one_stretch = contents.open_boundaries, contents.one_stretch
+        self.shapes_in_groups = contents.shapes_in_groups
         self.hide_emitters = hide_emitters
         self.recorded = wanted is not None
         self.geometry = self.recorded and wanted.geometry
@@ -83,7 +103,8 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
         return None
     box = scene.bbox()
     extent = float(dr.norm(box.extents())) if box.valid() else 1.0
-    return MediaContents(list(media.values()), found[0], any(is_open(shape) for shape in shapes), max(extent, 1e-6))
+    open_boundaries, grouped = any(is_open(shape) for shape in shapes), any(is_instance(shape) for shape in shapes)
+    return MediaContents(list(media.values()), found[0], open_boundaries, grouped, max(extent, 1e-6))
 
 
 def is_open(shape: Any) -> bool:

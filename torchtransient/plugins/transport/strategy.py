@@ -212,8 +212,8 @@ class Connection(Strategy):
         total = density + sum(others)
         return dr.select(total > 0, density / total, 0) * mis_weight(total, pdf)
 
-    def claims(self, world: Any, emitter: Any, wanted: Any) -> Any:
-        """Mask of the emitters that derivatives reach by connections alone; None for none."""
+    def claims(self, world: Any, emitter: Any, d: Any, wanted: Any) -> Any:
+        """Mask of the emitters, in the direction ``d``, that derivatives reach by connections alone; None for none."""
         return None
 
     def numbers(self, recorded: dict[str, Any]) -> list[Any] | None:

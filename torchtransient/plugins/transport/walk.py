@@ -29,14 +29,16 @@ class Path:
     active: Any            # Bool
 
 
-def start(world, ray, first_opl) -> Path:
-    """A path at the sensor; ``first_opl``: optical length before the ray's origin, minus the film's start."""
+def start(world, ray, first_opl, η) -> Path:
+    """A path at the sensor; ``first_opl``: optical length before the ray's origin, minus the film's start; ``η``: index
+    of refraction there.
+    """
     return Path(
         ray=mi.Ray3f(ray),
         leg=None,
         depth=mi.UInt32(0),
         β=mi.Spectrum(1),
-        η=mi.Float(1),
+        η=mi.Float(η),
         τ=mi.Float64(first_opl),
         prev_p=mi.Point3f(ray.o),
         prev_n=mi.Normal3f(0),
@@ -107,9 +109,11 @@ def roulette(world, path, vertex, step, sampler, zeros):
 
 
 @dr.syntax
-def walk(world, sampler, ray, first_opl, sink):
-    """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept)."""
-    path = start(world, ray, first_opl)
+def walk(world, sampler, ray, first_opl, sink, η=1):
+    """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept). ``η``: index of
+    refraction where they start.
+    """
+    path = start(world, ray, first_opl, η)
     path.leg = world.segment.first(world, ray, sampler)
     kept = sink.begin(world)
     while dr.hint(path.active, max_iterations=world.max_depth, label="path"):

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.light_box import LightBox
+from torchtransient.plugins.transport.instances import AttachedSurfaces
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class World:
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
         self.window = window
+        # Only where path lengths change is it asked how surfaces move.
+        self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
@@ -71,8 +74,9 @@ class World:
         return self.max_depth * sum(c.events(self.wanted) for c in self.connections)
 
     def tables(self) -> list[Any]:
-        """What the strategies have computed of the scene's parameters."""
-        return [table for strategy in self.strategies() for table in strategy.tables()]
+        """What has been computed of the scene's parameters, by the strategies and for the surfaces."""
+        tables = [] if self.surfaces is None else self.surfaces.tables()
+        return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property
     def index_changes(self) -> bool:

@@ -73,14 +73,16 @@ class EmitterFound(Connection):
         emitter = vertex.sid.emitter(world.scene)
         if wanted.emitter_shape:
             hit &= v.before(world.scattering.name, "delta", at_sensor=True)
-        elif (claimed := self._claimed(world, emitter, wanted)) is not None:
+        elif (claimed := self._claimed(world, emitter, v.ray.d, wanted)) is not None:
             hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~claimed
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
         return EventTerm(value=first_column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
 
-    def _claimed(self, world, emitter, wanted):
-        """Mask of the emitters that derivatives reach by another strategy alone; None for none."""
-        claims = [c.claims(world, emitter, wanted) for c in world.connections if c is not self]
+    def _claimed(self, world, emitter, d, wanted):
+        """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for
+        none.
+        """
+        claims = [c.claims(world, emitter, d, wanted) for c in world.connections if c is not self]
         claims = [c for c in claims if c is not None]
         return None if not claims else claims[0] if len(claims) == 1 else dr.any(claims)
 
@@ -90,7 +92,8 @@ class EmitterFound(Connection):
         lit = step.ahead & (mis > 0)
         with dr.suspend_grad():
             hit = following.pi.compute_surface_interaction(following.ray, mi.RayFlags.Minimal, lit)
-            if (claimed := self._claimed(world, hit.emitter(world.scene), wanted)) is not None:
+            claimed = self._claimed(world, hit.emitter(world.scene), following.ray.d, wanted)
+            if claimed is not None:
                 lit &= ~claimed
         light, area = material_point(following.pi, following.ray, lit)
         out = direction_to(si.p, light.p, lit, mi.Vector3f(following.ray.d))

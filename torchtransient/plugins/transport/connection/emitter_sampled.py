@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
+from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import (
     direction_to,
@@ -18,22 +19,42 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 
 
 class EmitterSampled(Connection):
-    """A point of an emitter, drawn by Mitsuba's sampling of emitters."""
+    """A point of an emitter, drawn by Mitsuba's sampling of emitters, but for spheres."""
 
     name = "emitter_sampled"
     light_of_scene_alone = True
+
+    def prepare(self, world):
+        lights = world.contents.sphere_lights
+        self.spheres = None if lights is None else lights.read(world.scene)
+        sky = None if world.wanted is None else world.wanted.sky
+        self.sun = None if sky is None else MovingSun(sky)
+
+    def tables(self):
+        return [] if self.spheres is None else [self.spheres.values]
+
+    def sample(self, world, ref, u, active):
+        """(direction sample, emission over density) towards an emitter."""
+        if self.spheres is not None:
+            return self.spheres.sample(world.scene, ref, u, active)
+        return world.scene.sample_emitter_direction(ref, u, False, active)
 
     # ------------------------------------------------------------------------------------------------- primal
 
     def propose(self, world, path, vertex, sampler):
         active = vertex.goes_on & vertex.connectable
         u = sampler.next_2d()
-        ds, weight = world.scene.sample_emitter_direction(vertex.at, u, False, active)
+        ds, weight = self.sample(world, vertex.at, u, active)
         active &= ds.pdf != 0
         return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
     def density(self, world, ref, ds, active):
-        return dr.select(ds.delta, ds.pdf, world.scene.pdf_emitter_direction(ref, ds, active & ~ds.delta))
+        smooth = active & ~ds.delta
+        if self.spheres is not None:
+            pdf = self.spheres.pdf(world.scene, ref, ds, smooth)
+        else:
+            pdf = world.scene.pdf_emitter_direction(ref, ds, smooth)
+        return dr.select(ds.delta, ds.pdf, pdf)
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
@@ -67,13 +88,14 @@ class EmitterSampled(Connection):
 
     # ----------------------------------------------------------------------------------------------- attached
 
-    def claims(self, world, emitter, wanted):
+    def claims(self, world, emitter, d, wanted):
         # The limb of a sphere turns away from the vertex: in area measure its derivative has infinite variance. A
-        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone.
-        if not wanted.sphere_lights:
-            return None
-        on_surface = mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
-        return on_surface & (emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere))
+        # sphere is sampled over the cone that it fills, which moves with it, and by this strategy alone. So is the sun.
+        claimed = self.spheres.lists(emitter) if wanted.sphere_lights else None
+        if self.sun is not None:
+            shines = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) & self.sun.contains(d)
+            claimed = shines if claimed is None else claimed | shines
+        return claimed
 
     def numbers(self, recorded):
         return [recorded["u"].x, recorded["u"].y]
@@ -84,11 +106,13 @@ class EmitterSampled(Connection):
         lit = r["lit"]
         light = self._light(world, si, r["u"], lit, wanted)
         d = mi.Vector3f(light.ds.d)
+        if self.sun is not None:
+            d = self.sun.followed(d, light.sun)
         if wanted.geometry:
             d = direction_to(si.p, light.p, light.near, d)
         Le = self._emission(world, si, light, d, lit, wanted)
         towards = world.scattering.evaluate(world, vertex, d, lit, ds=light.ds)
-        pdf = dr.select(light.ds.delta | light.cone, 0, dr.detach(towards.pdf))
+        pdf = dr.select(light.ds.delta | light.cone | light.sun, 0, dr.detach(towards.pdf))
         with dr.suspend_grad():
             mis = self.weight(world, dr.detach(si), light.ds, light.ds.pdf, pdf, lit)
         value = scatter_unpolarized(towards.value, vertex.rotation) * Le * mis
@@ -109,21 +133,23 @@ class EmitterSampled(Connection):
         """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""
         scene = world.scene
         with dr.suspend_grad():
-            ds, weight = scene.sample_emitter_direction(dr.detach(si), u, False, lit)
+            ds, weight = self.sample(world, dr.detach(si), u, lit)
             flags = ds.emitter.flags()
             far = lit & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
-        light.p, light.n, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Float(1)
-        light.cone, light.cone_weight = mi.Bool(False), None
+        light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
+        light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
+        if self.sun is not None:
+            light.sun = far & self.sun.contains(ds.d)
         if wanted.light:
             at_point = lit & mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
             moving, _ = scene.sample_emitter_direction(si, u, False, at_point)
             light.p = dr.replace_grad(light.p, dr.select(at_point, moving.p, dr.detach(moving.p)))
         if wanted.sphere_lights:
-            light.cone = surface & self.claims(world, ds.emitter, wanted)
+            light.cone = surface & self.claims(world, ds.emitter, ds.d, wanted)
             light.surface = surface & ~light.cone
-            moving, light.cone_weight = scene.sample_emitter_direction(si, u, False, light.cone)
+            moving, light.cone_weight = self.sample(world, si, u, light.cone)
             light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))
         if wanted.emitter_shape:
             self._follow_shape(world, si, light)
@@ -139,12 +165,15 @@ class EmitterSampled(Connection):
         there = light.surface & pi.is_valid() & (dr.detach(found).emitter(world.scene) == light.ds.emitter)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
         light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
+        light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
         light.area = dr.relative_grad(dr.select(there, area, 1))
 
     @staticmethod
     def _emission(world, si, light, d, lit, wanted):
         """Emission over density, with the derivative of the emission and of the solid angle."""
         ds = dr.copy(light.ds)
+        if wanted.emitter_shape:  # a pattern that moves over the shape
+            ds.uv = light.uv
         if wanted.geometry:
             ds.p, ds.n, ds.d = light.p, light.n, d
             ds.dist = dr.replace_grad(light.ds.dist, distance(si.p, light.p, light.near))

@@ -14,11 +14,11 @@ from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``geometry``: path lengths change. ``light``: an emitter without a shape moves. ``emitter_shape``: the shape of a
-    light does. ``sphere_lights``: path lengths change and some lights are spheres. ``sensor``: the sensor moves.
-    ``index``: an index of refraction changes. ``ray``: the ray itself is handed on, behind delta lobes or a sensor that
-    moves. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry` that
-    derivatives go through.
+    ``geometry``: path lengths change. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun
+    moves, or None. ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights
+    are spheres. ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is
+    handed on, behind delta lobes or a sensor that moves. ``extinction``: that of a medium changes. ``carried``: the
+    fields of the :class:`~..carry.Carry` that derivatives go through.
 
     ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """
@@ -31,10 +31,11 @@ class Wanted:
         carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
         self.geometry = any(effect.moves_length for _, _, effect in effects)
         self.light, self.index = bool(moved("emitter")), bool(moved("index"))
+        self.sky = next(iter(moved("sun")), None)
         self.emitter_shape = any(isinstance(node, mi.Shape) and node.is_emitter() for node in moved("shape"))
         self.sensor = any(node.ptr in sensors for node in moved("sensor"))
         self.sensor |= any(node.ptr in carriers for node in moved("shape"))
-        self.sphere_lights = self.geometry and contents.sphere_lights
+        self.sphere_lights = self.geometry and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
         self.extinction = any(effect.moves_medium for _, _, effect in effects)
         self.carried: tuple[str, ...] = ("β",)
@@ -48,3 +49,4 @@ class Wanted:
             self.carried += ("η",)
         if contents.media is not None:
             contents.media.check_spheres(self.sphere_lights)
+            contents.media.check_sun(self.sky is not None)

@@ -34,7 +34,24 @@ def phase_and_scattering(mei, active):
 class SurfaceOrMedium(Surface):
     """In a medium the vertex scatters by the phase function times the scattering coefficient."""
 
+    def prepare(self, world):
+        super().prepare(world)
+        blends = world.contents.media.phase_mixtures
+        self.blends = None if blends is None else blends.read(world.wanted is not None)
+
+    def _phase_and_scattering(self, mei, u, active):
+        """(phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
+        phase, σ_s = phase_and_scattering(mei, active)
+        if self.blends is None:
+            return phase, σ_s
+        phase, weight = self.blends.part_of(phase, mei, u, active)
+        return phase, σ_s * weight
+
     # ------------------------------------------------------------------------------------------------- primal
+
+    def arrive(self, world, path, vertex, sampler):
+        super().arrive(world, path, vertex, sampler)
+        vertex.u_phase = None if self.blends is None else sampler.next_1d()
 
     def connectable(self, world, vertex):
         smooth = super().connectable(world, vertex)
@@ -44,7 +61,8 @@ class SurfaceOrMedium(Surface):
     def elsewhere(self, world, vertex, proposals, answers, step):
         ctx, mei, scatter = mi.PhaseFunctionContext(None), vertex.mei, vertex.scatter
         active = vertex.goes_on & scatter
-        phase, σ_s = phase_and_scattering(mei, active)
+        step.u_phase = vertex.u_phase
+        phase, σ_s = self._phase_and_scattering(mei, vertex.u_phase, active)
         for p, answer in zip(proposals, answers, strict=True):
             if p is not None:
                 f, pdf = phase.eval_pdf(ctx, mei, p.d, p.active & scatter)
@@ -64,16 +82,22 @@ class SurfaceOrMedium(Surface):
     def value_towards(self, world, path, vertex, out, active):
         value, pdf = super().value_towards(world, path, vertex, out, active)
         scatter, mei = vertex.scatter, vertex.mei
-        phase, σ_s = phase_and_scattering(mei, active & scatter)
+        phase, σ_s = self._phase_and_scattering(mei, vertex.u_phase, active & scatter)
         f, f_pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active & scatter)
         f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
         return dr.select(scatter, f, value), dr.select(scatter, finite(f_pdf), pdf)
+
+    # ------------------------------------------------------------------------------------------------- record
+
+    def fields(self, world):
+        return super().fields(world) | ({} if self.blends is None else {"u_phase": mi.Float})
 
     # ----------------------------------------------------------------------------------------------- attached
 
     def look_up_attached(self, world, vertex, wanted):
         super().look_up_attached(world, vertex, wanted)
-        vertex.phase, vertex.σ_s = phase_and_scattering(vertex.mei, vertex.v.active & vertex.scatter)
+        u, active = vertex.v.of(self.name).get("u_phase"), vertex.v.active & vertex.scatter
+        vertex.phase, vertex.σ_s = self._phase_and_scattering(vertex.mei, u, active)
 
     def eval_pdf(self, vertex, wo, out, active, sampled):
         """A phase function too narrow for single precision has no light towards a given point, and its own samples

@@ -38,6 +38,7 @@ class Surface(Scattering):
         contents = world.contents
         self.refraction = None if contents.refraction is None else contents.refraction.read()
         self.delays = None if contents.delays is None else contents.delays.read()
+        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted is not None)
         for guide in self.guides:
             guide.prepare(world)
 
@@ -50,7 +51,10 @@ class Surface(Scattering):
 
     def arrive(self, world, path, vertex, sampler):
         vertex.u_delay = None if self.delays is None else sampler.next_2d()
+        vertex.u_part = None if self.mixtures is None else sampler.next_1d()
         vertex.delay = self.delay(vertex.si.bsdf(path.ray), vertex.u_delay, path.ray.wavelengths)
+        if self.mixtures is not None:
+            self.mixtures.take_part(vertex.delay, vertex.si, vertex.u_part, vertex.si.is_valid())
         vertex.bsdf = vertex.delay.bsdf
         vertex.scattered_si, vertex.at = self.behind(vertex.delay, vertex.si, vertex.at)
         vertex.connectable = self.connectable(world, vertex)
@@ -91,7 +95,7 @@ class Surface(Scattering):
         weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
             out=si.to_world(bs.wo), wo=bs.wo, weight=weight, pdf=bs.pdf, eta=bs.eta, u_lobe=u_lobe, u_dir=u_dir,
-            u_delay=vertex.u_delay,
+            u_delay=vertex.u_delay, u_part=vertex.u_part,
             delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         )  # fmt: skip
         step.unconnected = step.delta
@@ -150,7 +154,8 @@ class Surface(Scattering):
         way = dr.norm(step.point - vertex.at.p)
         arrived = reached & (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
         pdf = dr.select(step.guided & ~arrived, 0, pdf)
-        step.weight = dr.select(smooth, dr.select(pdf > 0, value / pdf, 0), step.weight)
+        kept = step.guided | ~is_black(step.weight)
+        step.weight = dr.select(smooth, dr.select((pdf > 0) & kept, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
         wo = vertex.scattered_si.to_local(step.out)
         step.eta = dr.select(smooth, self.relative_index(vertex.bsdf, vertex.scattered_si, wo), step.eta)
@@ -186,15 +191,17 @@ class Surface(Scattering):
     # ------------------------------------------------------------------------------------------------- record
 
     def fields(self, world):
-        fields = {"delta": mi.Bool}
+        fields = {"delta": mi.Bool} | ({"black": mi.Bool} if world.contents.glossy else {})
         if world.contents.delta:
             fields |= {"u_lobe": mi.Float, "u_dir": mi.Point2f}
         if self.delays is not None:
             fields["u_delay"] = mi.Point2f
+        if self.mixtures is not None:
+            fields["u_part"] = mi.Float
         return fields | ({"pdf": mi.Float} if self.guides else {})
 
     def record(self, step):
-        return vars(step)
+        return vars(step) | {"black": is_black(step.weight)}
 
     # ----------------------------------------------------------------------------------------------- attached
 
@@ -203,6 +210,9 @@ class Surface(Scattering):
         vertex.rotation = rotation_to_sensor(si, vertex.carry.w)
         u = v.of(self.name).get("u_delay")
         vertex.delay = self.delay(vertex.sid.bsdf(v.ray), u, v.ray.wavelengths)
+        if self.mixtures is not None:
+            u_part = v.of(self.name)["u_part"]
+            self.mixtures.take_part(vertex.delay, si, u_part, vertex.sid.is_valid())
         vertex.bsdf = vertex.delay.bsdf
         (vertex.scattered_si,) = self.behind(vertex.delay, si)
         vertex.scattered_slope, vertex.scattered_opl = vertex.slope, vertex.delay.after(v.τ)
@@ -233,7 +243,12 @@ class Surface(Scattering):
             J = dr.relative_grad(solid_angle_over_area(si.p, following.p, following.n, ahead, volume))
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
-        inv_pdf = dr.select(smooth & (pdf > 0), v.rr / pdf, 0)
+        counts = smooth & (pdf > 0)
+        if world.contents.glossy:
+            # Some BSDFs throw samples away (the facet that was drawn mirrors to behind the surface): their weight is
+            # zero, though other lobes have a value and a density there.
+            counts &= ~r["black"] | is_black(towards.value)
+        inv_pdf = dr.select(counts, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         weight = dr.select(smooth, weight * (inv_pdf * J), 0)
         eta = dr.select(smooth, towards.eta, 1)
@@ -258,3 +273,8 @@ class Surface(Scattering):
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
         )
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
+
+
+def is_black(weight):
+    """Whether scattering by ``weight`` leaves nothing of the light."""
+    return dr.max(dr.detach(mi.unpolarized_spectrum(weight))) == 0

@@ -156,18 +156,21 @@ def closed_surface(scene, media, ray, active):
     """The next surface along ``ray`` that is not an open boundary."""
     pi = scene.ray_intersect_preliminary(ray, active=active)
     if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
-        passes = active & lets_through(pi, False)
+        passes = active & lets_through(media, ray, pi, False)
         while dr.hint(passes, label="open boundaries"):
             pi, _ = cross_boundary(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
-            passes &= lets_through(pi, False)
+            passes &= lets_through(media, ray, pi, False)
     return pi
 
 
-def lets_through(pi, hide):
+def lets_through(media, ray, pi, hide):
     """Whether the surface at ``pi`` is an open boundary; with ``hide`` emitting surfaces count as such."""
-    opens = pi.is_valid() & is_open(pi.shape)
+    shape = pi.shape
+    if media.shapes_in_groups:  # of an instance, only the interaction knows which shape of the group was met
+        shape = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, pi.is_valid()).shape
+    opens = pi.is_valid() & is_open(shape)
     if hide:
-        opens |= pi.is_valid() & pi.shape.is_emitter()
+        opens |= pi.is_valid() & shape.is_emitter()
     return opens
 
 
@@ -200,7 +203,7 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
             collides, real, t_new, factor = tentative_flight(media, medium, ray, t, pi.t, so_far, u, rng, inside)
             weight *= factor
             scatter = collides & real
-            passes = going & ~collides & lets_through(pi, hide)
+            passes = going & ~collides & lets_through(media, ray, pi, hide)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
             if dr.hint(media.keeps_entry, mode="scalar"):
                 entry = dr.select(passes, pi, entry)
@@ -235,7 +238,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active):
             t_end = dr.minimum(pi.t, length)
             collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
-            blocked = pi.is_valid() & ~lets_through(pi, False)
+            blocked = pi.is_valid() & ~lets_through(media, ray, pi, False)
             passes = going & ~collides & pi.is_valid() & ~blocked
             visible &= ~(going & ~collides & blocked)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))

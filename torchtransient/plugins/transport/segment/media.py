@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import attenuated
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd
+from torchtransient.plugins.transport.instances import distance_to, surface_interaction
 from torchtransient.plugins.transport.media_contents import FlightSettings
 from torchtransient.plugins.transport.segment.free_flight import (
     closed_surface,
@@ -47,7 +48,7 @@ class Media(Vacuum):
     """
 
     def prepare(self, world):
-        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters)
+        self.settings = FlightSettings(world.contents.media, world.wanted, world.hide_emitters, world.surfaces)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -64,7 +65,11 @@ class Media(Vacuum):
     def _leg(self, world, ray, medium, carried, sampler, active, first=False):
         u, lanes = sampler.next_1d(), lane_numbers(sampler)
         end = sample_free_flight(world.scene, self.settings, ray, medium, carried, u, lanes, active, first=first)
-        leg = {"pi": end.pi, "scatter": end.scatter, "t": end.t, "medium": end.medium, "weight": end.weight}
+        t = end.t
+        if self.settings.geometry:
+            # A collision on top of the vertex before has no direction to it: as far as single precision can tell apart.
+            t = dr.maximum(t, 1e-6 * (1 + dr.max(dr.abs(ray.o))))
+        leg = {"pi": end.pi, "scatter": end.scatter, "t": t, "medium": end.medium, "weight": end.weight}
         if self.settings.recorded:
             leg["begin"] = medium
         if self.settings.keeps_entry:
@@ -134,7 +139,7 @@ class Media(Vacuum):
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
-        si, mei, stretch = self._surface_or_medium(v, ray, carry.w, wanted)
+        si, mei, stretch = self._surface_or_medium(v, carry, ray, wanted)
         vertex = self.arrived(world, v, carry, ray, si, wanted)
         vertex.scatter, vertex.mei = v.scatter, mei
         far = ~vertex.sid.is_valid()
@@ -145,34 +150,32 @@ class Media(Vacuum):
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
         return vertex
 
-    def _surface_or_medium(self, v, ray, w, wanted):
+    def _surface_or_medium(self, v, carry, ray, wanted):
         """(interaction, medium interaction, attached length of the stretch that a vertex in a medium divides).
 
         Vertices in media come as surface interactions too: at the point itself, with no normal and no shape.
         """
-        si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active & ~v.scatter)
-        t, stretch = self._attached_distance(v, ray, wanted)
+        si = surface_interaction(self.settings.surfaces, v.pi, ray, mi.RayFlags.All, v.active & ~v.scatter)
+        t, stretch = self._attached_distance(v, carry, ray, wanted)
         mei = medium_interaction(ray, v.end, t)
-        mei.wi = -w
-        mei.sh_frame = mi.Frame3f(-w)
+        mei.wi = -carry.w
+        mei.sh_frame = mi.Frame3f(-carry.w)
         si.t = dr.select(v.scatter, t, si.t)
         si.p = dr.select(v.scatter, mei.p, si.p)
         si.n = dr.select(v.scatter, mi.Normal3f(0), si.n)
-        si.sh_frame = dr.select(v.scatter, mi.Frame3f(dr.detach(w)), si.sh_frame)
+        si.sh_frame = dr.select(v.scatter, mi.Frame3f(dr.detach(carry.w)), si.sh_frame)
         return si, mei, stretch
 
-    def _attached_distance(self, v, ray, wanted):
+    def _attached_distance(self, v, carry, ray, wanted):
         """Distance along ``ray`` of a vertex in a medium, and the length of the stretch that it divides."""
         if not wanted.geometry:
             return v.t, mi.Float(1)
-        begin = mi.Float(0)
+        begin = dr.dot(carry.x - ray.o, ray.d)
         if self.settings.open_boundaries:
             entered = v.scatter & v.entry.is_valid()
-            behind = v.entry.compute_surface_interaction(ray, mi.RayFlags.Minimal, entered)
-            begin = dr.select(entered, behind.t, 0)
-        exit = v.pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, v.scatter)
+            begin = dr.select(entered, distance_to(self.settings.surfaces, v.entry, ray, entered), begin)
         bounded = v.scatter & v.pi.is_valid()
-        end = dr.select(bounded, exit.t, begin + 1)
+        end = dr.select(bounded, distance_to(self.settings.surfaces, v.pi, ray, bounded), begin + 1)
         stretch = end - begin
         ratio = dr.detach((v.t - begin) / stretch)
         return dr.fma(ratio, stretch, begin), dr.select(bounded, stretch, 1)

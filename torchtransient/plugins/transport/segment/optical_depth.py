@@ -12,6 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.transport.instances import distance_to
 from torchtransient.plugins.transport.segment.free_flight import cross_boundary, generator, medium_interaction
 
 # Streams of random numbers, one for each kind of leg.
@@ -53,9 +54,9 @@ def optical_depth(media, leg, part, x0, x1, active):
         end = dr.select(leg.far, end, dr.norm(span))
         if media.open_boundaries:
             passed = inside & part.entry.is_valid()
-            begin = dr.select(passed, part.entry.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed).t, 0)
+            begin = dr.select(passed, distance_to(media.surfaces, part.entry, ray, passed), 0)
             ends &= inside
-            end = dr.select(ends, part.pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, ends).t, end)
+            end = dr.select(ends, distance_to(media.surfaces, part.pi, ray, ends), end)
     if media.heterogeneous:
         hits, near, far = part.medium.intersect_aabb(ray)
         begin = dr.select(hits, dr.maximum(begin, near), begin)

@@ -8,6 +8,7 @@ import mitsuba as mi
 from torchtransient.plugins.sampling.visible_lights import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
+from torchtransient.plugins.transport.instances import surface_interaction
 from torchtransient.plugins.transport.strategy import Segment, Vertex
 
 # How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
@@ -110,7 +111,7 @@ class Vacuum(Segment):
     def attached(self, world, v, carry, wanted):
         ray = mi.Ray3f(v.ray)
         ray.o, ray.d = carry.o, carry.d
-        si = v.pi.compute_surface_interaction(ray, mi.RayFlags.All, v.active)
+        si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, v.active)
         return self.arrived(world, v, carry, ray, si, wanted)
 
     def arrived(self, world, v, carry, ray, si, wanted):

@@ -1,0 +1,229 @@
+"""Light from and to infinity is timed by the sphere around the scene as described: whatever was rendered before, and
+through whichever integrator, sensor, copy or call values came in.
+"""
+
+from __future__ import annotations
+
+import copy
+import gc
+import pickle
+import weakref
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.lights_and_sensors import film, looking_down
+from torchtransient import plugins
+
+VARIANT = "llvm_ad_rgb"
+LIGHTS = {
+    "constant": {"type": "constant"},
+    "envmap": {"type": "envmap", "bitmap": np.ones((4, 8, 3), dtype=np.float32)},
+    "directional": {"type": "directional", "direction": [0.3, 0.0, -1.0]},
+}
+AXIS = {"bins": 400, "width": 0.1, "start": -5.0}
+
+
+def square(x, z, size=1.0):
+    matrix = np.diag([size, size, 1.0, 1.0])
+    matrix[:3, 3] = [x, 0, z]
+    return {"type": "rectangle", "to_world": matrix}
+
+
+def description(light="constant", sensor=None, integrator=True):
+    """A plane, and a small square far from it, whose place decides how large the scene is."""
+    sensor = sensor or {"type": "perspective", "fov": 1.0, **looking_down(4.0), "film": film(**AXIS)}
+    kept = {"integrator": {"type": "transient_path", "max_depth": 2}} if integrator else {}
+    return {
+        "type": "scene", **kept, "sensor": sensor, "plane": square(0, 0), "far": square(0, -3, 0.1),
+        "sky": LIGHTS[light] if isinstance(light, str) else light,
+    }  # fmt: skip
+
+
+def load(*args, **kwargs):
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    scene = description(*args, **kwargs)
+    if "bitmap" in scene["sky"]:
+        scene["sky"] = scene["sky"] | {"bitmap": mi.Bitmap(scene["sky"]["bitmap"])}
+    for node in scene.values():
+        if isinstance(node, dict) and isinstance(node.get("to_world"), np.ndarray):
+            node["to_world"] = mi.ScalarTransform4f(node["to_world"])
+    return mi.load_dict(scene, optimize=False)
+
+
+def move(scene, distance):
+    params = mi.traverse(scene)
+    matrix = square(0, -distance, 0.1)["to_world"]
+    params["far.to_world"] = mi.Transform4f(mi.Matrix4f(matrix))
+    params.update()
+
+
+def arrival(scene, integrator=None, sensor=0):
+    """Mean arrival of the light in metres."""
+    integrator = integrator or scene.integrator()
+    bins = np.array(integrator.render(scene, sensor=sensor, seed=0, spp=256)[1], dtype=float)[0, 0].sum(-1)
+    centers = AXIS["start"] + (np.arange(AXIS["bins"]) + 0.5) * AXIS["width"]
+    assert bins.sum() > 0
+    return float(bins @ centers / bins.sum())
+
+
+def described_first(scene):
+    arrival(scene)
+
+
+def other_values_first(scene):
+    move(scene, 50.0)
+    arrival(scene)
+
+
+def nothing_first(scene):
+    pass
+
+
+def other_integrator_first(scene):
+    move(scene, 20.0)
+    arrival(scene, mi.load_dict({"type": "transient_path", "max_depth": 2}))
+
+
+def another_scene_first(scene):
+    move(scene, 20.0)
+    other = load()
+    arrival(other, scene.integrator())
+
+
+def another_bsdf_first(scene):
+    scene.shapes()[0].set_bsdf(mi.load_dict({"type": "twosided", "b": {"type": "diffuse", "reflectance": 0.5}}))
+    move(scene, 20.0)
+    arrival(scene)
+
+
+def parameters_asked_for_first(scene):
+    mi.traverse(scene)
+    move(scene, 30.0)
+
+
+ORDERS = [
+    described_first, other_values_first, nothing_first, other_integrator_first, another_scene_first, another_bsdf_first,
+    parameters_asked_for_first,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("light", LIGHTS)
+def test_order_of_calls(light, order):
+    scene = load(light)
+    order(scene)
+    move(scene, 10.0)
+    got = arrival(scene)
+    sphere = scene.integrator().reference(scene)
+    assert sphere.radius == pytest.approx(np.sqrt(2 + 1.5**2), rel=1e-6) and sphere.center[2] == pytest.approx(-1.5)
+    expected = load(light)
+    arrival(expected)
+    move(expected, 10.0)
+    assert got == pytest.approx(arrival(expected), abs=1e-4)
+
+
+@pytest.mark.parametrize("order", ORDERS[:3])
+def test_scene_without_an_integrator_of_its_own(order):
+    """The film keeps the sphere for every integrator."""
+    scene = load(integrator=False)
+    integrators = [mi.load_dict({"type": kind, "max_depth": 2}) for kind in ("transient_path", "transient_prbvolpath")]
+    for distance, integrator in ((20.0, integrators[0]), (5.0, integrators[1]), (3.0, integrators[0])):
+        move(scene, distance)
+        arrival(scene, integrator)
+        assert integrator.reference(scene).center[2] == pytest.approx(-1.5)
+
+
+def test_two_integrators_in_turn():
+    """An integrator that meets another scene in between has not forgotten the first."""
+    scenes, outside = [load(), load(LIGHTS["directional"])], mi.load_dict({"type": "transient_path", "max_depth": 2})
+    for distance in (20.0, 7.0):
+        for scene in scenes:
+            move(scene, distance)
+            arrival(scene, outside)
+            assert outside.reference(scene).center[2] == pytest.approx(-1.5)
+
+
+@pytest.mark.parametrize("order", ORDERS[:3])
+def test_sensor_at_infinity(order):
+    sensor = {"type": "distant", "film": film(**AXIS), **looking_down(4.0), "target": [0.0, 0.0, 0.0]}
+    lamp = {"type": "point", "position": [0.0, 0.0, 1.0]}
+    scene = load(lamp, sensor)
+    order(scene)
+    move(scene, 10.0)
+    expected = load(lamp, sensor)
+    arrival(expected)
+    move(expected, 10.0)
+    assert arrival(scene) == pytest.approx(arrival(expected), abs=1e-4)
+
+
+def layer_arrival(renderer, distance, **call):
+    value = torch.tensor(square(0, -distance, 0.1)["to_world"], dtype=torch.float32)
+    out = renderer({"far.to_world": value}, seed=0, spp=256, **call)
+    bins = out.transient.detach().double().sum((0, 2, 3))
+    centers = AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]
+    return float(bins @ centers.double() / bins.sum())
+
+
+def layer(light="directional"):
+    scene = tt.load(description(light), variant=VARIANT)
+    return tt.TransientRenderer(scene, parameters=["far.to_world"], temporal_filter="box")
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_layer_does_not_depend_on_what_it_rendered_first(light):
+    first, second = layer(light), layer(light)
+    expected = layer_arrival(first, 3.0)  # the values described
+    assert layer_arrival(second, 40.0) == pytest.approx(expected, abs=0.02)
+    assert layer_arrival(second, 3.0) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))], ids=["deepcopy", "pickle"])
+def test_copies_of_a_layer(copied):
+    first = layer()
+    expected = layer_arrival(first, 3.0)
+    second = copied(layer())
+    layer_arrival(second, 40.0)
+    third = copied(second)
+    assert layer_arrival(third, 40.0) == pytest.approx(expected, abs=0.02)
+    assert layer_arrival(second, 3.0) == pytest.approx(expected, abs=1e-4)
+
+
+def test_batch_starts_with_the_description():
+    renderer, alone = layer(), layer()
+    expected = layer_arrival(alone, 3.0)
+    values = torch.tensor(np.stack([square(0, -d, 0.1)["to_world"] for d in (40.0, 3.0)]), dtype=torch.float32)
+    out = renderer({"far.to_world": values}, seed=0, spp=256)
+    bins = out.transient.double().sum((1, 3, 4))
+    centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
+    np.testing.assert_allclose((bins @ centers / bins.sum(-1)).detach(), expected, atol=0.02)
+
+
+def test_renderers_with_and_without_parameters_share_a_clock():
+    """Merged shapes for the one, separate ones with installed values for the other."""
+    scene = tt.load(description("directional"), variant=VARIANT)
+    keys = tt.TransientRenderer(scene, parameters=["far.to_world"], temporal_filter="box")
+    moved = layer_arrival(keys, 40.0)
+    out = tt.TransientRenderer(scene)(seed=0, spp=256)
+    bins = out.transient.double().sum((0, 2, 3))
+    centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
+    assert float(bins @ centers / bins.sum()) == pytest.approx(moved, abs=0.02)
+
+
+def test_a_film_on_the_only_shape_is_freed():
+    """The film keeps what the scene was like, and the shape keeps the film."""
+    mi.set_variant(VARIANT)
+    plugins.sync()
+    meter = square(0, 0) | {"to_world": mi.ScalarTransform4f(), "meter": {"type": "irradiancemeter", "film": film()}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "transient_path"}, "meter": meter})
+    mi.traverse(scene)
+    scene.integrator().render(scene, spp=1)
+    gone = weakref.ref(scene.sensors()[0].film())
+    assert gone() is not None
+    del scene
+    gc.collect()
+    assert gone() is None

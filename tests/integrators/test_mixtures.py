@@ -1,0 +1,84 @@
+"""What masks and blends scatter: the weighed sum of their parts, whatever they hold and are held by.
+
+Paths that meet the mixture once see light that is linear in its weight, so that the mixture's transient is the weighed
+sum of those of its parts. The bound is derived: three standard errors of independent renders.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.gradient_cases.cases_mixtures import (
+    DIFFUSE,
+    GLASS,
+    METAL,
+    MIRROR,
+    PLASTIC,
+    blend,
+    bump,
+    mask,
+    mirror_room,
+    normal_map,
+    two_sided,
+)
+
+VARIANT = "llvm_ad_mono"
+SEEDS = 6
+
+
+def bare(bsdf):
+    return bsdf
+
+
+def around_a_blend(wrapper, first=DIFFUSE, second=MIRROR, weight=0.3):
+    mixture = wrapper(blend(first, second, weight))
+    return mixture, [(1 - weight, wrapper(first)), (weight, wrapper(second))]
+
+
+def blend_of_blends():
+    inner = blend(MIRROR, METAL, 0.25)
+    return blend(DIFFUSE, inner, 0.4), [(0.6, DIFFUSE), (0.3, MIRROR), (0.1, METAL)]
+
+
+def masked(nested, opacity=0.7):
+    return mask(nested, opacity), [(opacity, nested), (1 - opacity, {"type": "null"})]
+
+
+MIXTURES = {
+    "diffuse and mirror": lambda: around_a_blend(bare),
+    "mirror and diffuse": lambda: around_a_blend(bare, MIRROR, DIFFUSE),
+    "diffuse and glass": lambda: around_a_blend(bare, DIFFUSE, GLASS),
+    "plastic and mirror": lambda: around_a_blend(bare, PLASTIC, MIRROR),
+    "two-sided": lambda: around_a_blend(two_sided),
+    "under bumps": lambda: around_a_blend(bump),
+    "under normals": lambda: around_a_blend(normal_map),
+    "weight 0": lambda: around_a_blend(bare, weight=0.0),
+    "weight 1": lambda: around_a_blend(bare, weight=1.0),
+    "blend of blends": blend_of_blends,
+    "mask of a mirror": lambda: masked(MIRROR),
+    "mask of plastic": lambda: masked(PLASTIC),
+    "mask of a blend": lambda: masked(blend(DIFFUSE, MIRROR)),
+}
+
+
+def rows(bsdf):
+    """Sums over the film of each time bin, by seed."""
+    scene = mirror_room(bsdf)
+    scene["integrator"]["max_depth"] = 3
+    scene = mi.load_dict(scene, optimize=False)
+    renders = [scene.integrator().render(scene, seed=seed, spp=512)[1] for seed in range(SEEDS)]
+    return np.array([np.array(cube).sum((0, 1, 3)) for cube in renders])
+
+
+@pytest.mark.parametrize("name", MIXTURES)
+def test_mixture_is_the_weighed_sum_of_its_parts(name):
+    mixture, parts = MIXTURES[name]()
+    found = rows(mixture).sum(1)
+    # The parts use other seeds than the mixture only in that they draw other numbers; their errors count as well.
+    weighed = [weight * rows(bsdf).sum(1) for weight, bsdf in parts if weight > 0]
+    expected = sum(part.mean() for part in weighed)
+    error = np.sqrt(sum(part.var(ddof=1) for part in [found, *weighed]) / SEEDS)
+    assert abs(found.mean() - expected) < 3 * error + 1e-6 * expected
+    assert error < 0.02 * expected

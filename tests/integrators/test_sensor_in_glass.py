@@ -1,0 +1,272 @@
+"""Sensors inside of refracting bodies: each length counts with the index of its medium, from the sensor on."""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.runs import T
+from torchtransient import plugins
+
+N, WATER = 1.5, 1.33
+# From the wall (at z = 3) to the lamp, which no glass stands before.
+LAMP = (0.5, 0.0, 2.2)
+TO_LAMP = math.hypot(0.5, 0.8)
+BIN, START = 2e-3, 1.0
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant("llvm_ad_mono")
+    plugins.sync()
+
+
+def film(size=1, start=START):
+    return {
+        "type": "transient_hdr_film", "width": size, "height": 1, "temporal_bins": 5000, "bin_width_opl": BIN,
+        "start_opl": start, "rfilter": {"type": "box"},
+    }  # fmt: skip
+
+
+def at(z=0.0, near=0.1, **more):
+    """A narrow camera on the axis that looks along it."""
+    pose = T().look_at(origin=[0, 0, z], target=[0, 0, z + 1], up=[0, 1, 0])
+    return {"type": "perspective", "fov": 0.02, "near_clip": near, "to_world": pose, "film": film(), **more}
+
+
+def glass(plugin="dielectric", inside=N, outside=1.0, **more):
+    return {"type": plugin, "int_ior": inside, "ext_ior": outside, **more}
+
+
+def ball(radius, bsdf=None, **more):
+    return {"type": "sphere", "radius": radius, "bsdf": bsdf or glass(), **more}
+
+
+def scene(sensor, integrator="transient_path", depth=3, **objects):
+    """A wall at z = 3 that a lamp lights; what surrounds the sensor reaches no farther than z = 2."""
+    described = {
+        "type": "scene", "integrator": {"type": integrator, "max_depth": depth}, "sensor": sensor,
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([0, 1, 0], 180).scale(2)},
+        "lamp": {"type": "point", "position": list(LAMP), "intensity": 10.0}, **objects,
+    }  # fmt: skip
+    return mi.load_dict(described, optimize=False)
+
+
+def arrivals(loaded, spp=256):
+    """First arrival of each pixel."""
+    bins = np.array(loaded.integrator().render(loaded, seed=0, spp=spp)[1], dtype=float)[0, :, :, 0]
+    centers = START + (np.arange(bins.shape[-1]) + 0.5) * BIN
+    assert (bins.sum(-1) > 0).all()
+    return centers[np.argmax(bins > 0, axis=-1)]
+
+
+def check(loaded, *lengths, spp=256):
+    expected = np.array(lengths) + TO_LAMP
+    np.testing.assert_allclose(arrivals(loaded, spp), expected, atol=1.5 * BIN)
+
+
+CUBE = {"type": "cube"}
+
+
+def in_a_group(bsdf):
+    group = {"type": "shapegroup", "part": {**CUBE, "to_world": T().scale(0.5), "bsdf": bsdf}}
+    copied = {"type": "instance", "to_world": T().scale(2.0), "group": {"type": "ref", "id": "group"}}
+    return {"group": group, "copy": copied}
+
+
+def flat_heights():
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((2, 2, 1), dtype=np.float32)), "raw": True}
+
+
+BODIES = {
+    "cube": lambda: {"body": CUBE | {"bsdf": glass()}},
+    "ball": lambda: {"body": ball(1.0)},
+    "far away": lambda: {"body": ball(1.0), "other": ball(0.4, center=[5, 0, 0]), "more": ball(0.4, center=[0, 4, 1])},
+    "instance": lambda: in_a_group(glass()),
+    "differentiable": lambda: {"body": CUBE | {"bsdf": glass("diff_dielectric")}},
+    "masked": lambda: {"body": CUBE | {"bsdf": {"type": "mask", "opacity": 0.9, "nested": glass()}}},
+    "blended": lambda: {"body": CUBE | {"bsdf": {"type": "blendbsdf", "weight": 0.3, "a": glass(), "b": glass()}}},
+    "bumpy": lambda: {"body": CUBE | {"bsdf": {"type": "bumpmap", "flat": flat_heights(), "nested": glass()}}},
+    "turned inside out": lambda: {"body": ball(1.0, glass("dielectric", 1.0, N), flip_normals=True)},
+    "behind a window": lambda: {"body": CUBE | {"bsdf": glass()}, "window": {
+        "type": "rectangle", "to_world": T().translate([0, 0, 1.5]), "bsdf": {"type": "thindielectric"}}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_bodies(body):
+    check(scene(at(), depth=4, **BODIES[body]()), N * 1.0 + 2.0)
+
+
+@pytest.mark.parametrize("plugin", ["roughdielectric", "diff_rough_dielectric"])
+def test_rough_body(plugin):
+    """Nearly smooth: the first light comes from a point of the wall a little nearer to the lamp."""
+    rough = glass(plugin, alpha=0.005)
+    first = arrivals(scene(at(), body=CUBE | {"bsdf": rough}), 4096)[0]
+    assert N * 1.0 + 2.0 + TO_LAMP - 0.01 < first < N * 1.0 + 2.0 + TO_LAMP + BIN
+
+
+def test_principled_body():
+    bsdf = {"type": "principled", "spec_trans": 1.0, "eta": N, "roughness": 0.05}
+    straight = N * 1.0 + math.hypot(0.5, 1.2)  # from the face of the cube to the lamp: it scatters that far
+    assert arrivals(scene(at(), body=CUBE | {"bsdf": bsdf}), 1 << 14)[0] == pytest.approx(straight, abs=1.5 * BIN)
+
+
+def test_bodies_within_bodies():
+    """A drop of water in glass: its relative index says what lies around it."""
+    objects = {"drop": ball(0.4, glass("dielectric", WATER, N)), "body": ball(1.0)}
+    check(scene(at(), depth=4, **objects), WATER * 0.4 + N * 0.6 + 2.0)
+    check(scene(at(0.6), depth=4, **objects), N * 0.4 + 2.0)
+
+
+def test_shells_of_one_material():
+    """A bubble in glass in the same glass: twice inside."""
+    objects = {"inner": ball(0.4), "outer": ball(1.0)}
+    check(scene(at(), depth=4, **objects), N * N * 0.4 + N * 0.6 + 2.0)
+
+
+@pytest.mark.parametrize("near", [1e-3, 0.1, 0.9])
+def test_near_clip_lies_in_glass(near):
+    check(scene(at(near=near), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
+
+
+def test_outside_of_bodies():
+    """Entered and left again, seen or not, ahead or behind."""
+    ahead, behind = ball(0.3, center=[0, 0, 1.0]), ball(0.3, center=[0, 0.05, -1.0])
+    check(scene(at(), depth=4, behind=behind), 3.0)
+    check(scene(at(), depth=4, ahead=ahead, behind=behind), 3.0 + 0.6 * (N - 1))
+
+
+@pytest.mark.parametrize("z", [0.0, -0.5])
+def test_under_an_open_surface(z):
+    """A lake: its surface has no other side."""
+    surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(20.0), "bsdf": glass(inside=WATER)}
+    check(scene(at(z), lake=surface), WATER * (1.0 - z) + 2.0)
+    small = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.1), "bsdf": glass(inside=WATER)}
+    check(scene(at(z), window=small), WATER * (1.0 - z) + 2.0)
+
+
+def test_above_an_open_surface():
+    """Entered and never left: air around the sensor, water below."""
+    surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
+    loaded = scene(at(), lake=surface | {"bsdf": glass(inside=WATER)})
+    np.testing.assert_allclose(arrivals(loaded), 1.0 + WATER * (2.0 + TO_LAMP), atol=1.5 * BIN)
+
+
+def test_body_of_two_faces():
+    """A pane of two rectangles: outside, the one is entered and the other left."""
+    front = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
+    back = {"type": "rectangle", "to_world": T().translate([0, 0, 1.5]).scale(20.0)}
+    faces = {"glass": glass() | {"id": "glass"}, "front": front, "back": back}
+    for face in (front, back):
+        face["bsdf"] = {"type": "ref", "id": "glass"}
+    check(scene(at(), depth=4, **faces), 1.0 + N * 0.5 + 1.5)
+    check(scene(at(1.2), depth=4, **faces), N * 0.3 + 1.5)
+
+
+# ------------------------------------------------------------------------------------------------------------- sensors
+
+
+def kinds():
+    pose = at()["to_world"]
+    lens = at(type="thinlens", aperture_radius=1e-4, focus_distance=3.0)
+    plane = {"type": "orthographic", "near_clip": 0.1, "to_world": pose @ T().scale([1e-3, 1e-3, 1]), "film": film()}
+    meter = {"type": "radiancemeter", "to_world": pose, "film": film()}
+    return {"thinlens": lens, "orthographic": plane, "radiancemeter": meter}
+
+
+@pytest.mark.parametrize("kind", ["thinlens", "orthographic", "radiancemeter"])
+def test_sensors(kind):
+    check(scene(kinds()[kind], body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
+
+
+def test_each_sensor_of_a_batch():
+    inside, outside = at(0.0), at(-2.0)
+    for sensor in (inside, outside):
+        sensor["film"] = {"type": "hdrfilm", "rfilter": {"type": "box"}}
+    batch = {"type": "batch", "film": film(2), "inside": inside, "outside": outside}
+    check(scene(batch, depth=4, body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0, 1.0 + N * 2.0 + 2.0)
+
+
+def test_irradiance_meter_in_glass():
+    """A patch inside that looks at the wall: its first light is that along the axis."""
+    patch = {"type": "rectangle", "to_world": T().scale(1e-3), "meter": {"type": "irradiancemeter", "film": film()}}
+    loaded = mi.load_dict({
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3}, "patch": patch,
+        "body": CUBE | {"bsdf": glass()},
+        "lamp": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([0, 1, 0], 180).scale(0.05),
+                 "emitter": {"type": "area", "radiance": 1.0}},
+    }, optimize=False)  # fmt: skip
+    assert arrivals(loaded, 1 << 17)[0] == pytest.approx(N + 2.0, abs=2 * BIN)
+
+
+def test_meter_on_the_outside_of_glass_stands_in_air():
+    sphere = ball(1.0, sensor={"type": "irradiancemeter", "film": film()})
+    loaded = mi.load_dict({
+        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 2}, "ball": sphere,
+        "lamp": {"type": "rectangle", "to_world": T().translate([0, 0, 4]).rotate([0, 1, 0], 180).scale(0.05),
+                 "emitter": {"type": "area", "radiance": 1.0}},
+    }, optimize=False)  # fmt: skip
+    assert arrivals(loaded, 1 << 18)[0] == pytest.approx(3.0, abs=2 * BIN)
+
+
+def test_distant_sensor_stands_in_nothing():
+    """Its rays start on the sphere around the scene, in which glass may reach."""
+    pose = T().look_at(origin=[0, 0, 0], target=[0, 0, 1], up=[0, 1, 0])
+    sensor = {"type": "distant", "to_world": pose, "target": [0.0, 0.0, 3.0], "film": film()}
+    body = ball(1.0)
+    with_body, without = scene(sensor, depth=4, body=body), scene(sensor, depth=4, body=ball(1.0, {"type": "null"}))
+    first, second = arrivals(with_body)[0], arrivals(without)[0]
+    assert first - second == pytest.approx(2 * (N - 1), abs=3 * BIN)
+
+
+def test_sensor_in_a_medium_in_glass():
+    fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.5}
+    sensor = at() | {"medium": {"type": "ref", "id": "fog"}}
+    body = CUBE | {"bsdf": glass(), "interior": {"type": "ref", "id": "fog"}}
+    described = {"fog": fog | {"id": "fog"}, "body": body}
+    loaded = mi.load_dict({
+        "type": "scene", "integrator": {"type": "transient_prbvolpath", "max_depth": 3}, **described, "sensor": sensor,
+        "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([0, 1, 0], 180).scale(2)},
+        "lamp": {"type": "point", "position": list(LAMP), "intensity": 10.0},
+    }, optimize=False)  # fmt: skip
+    bins = np.array(loaded.integrator().render(loaded, seed=0, spp=1 << 14)[1], dtype=float)[0, 0, :, 0]
+    # The light that was not scattered stands out of that which was.
+    assert START + (np.argmax(bins) + 0.5) * BIN == pytest.approx(N + 2.0 + TO_LAMP, abs=1.5 * BIN)
+
+
+@pytest.mark.parametrize("where", ["outside", "inside"])
+def test_light_in_glass(where):
+    """A lamp in the glass, seen through its face or from within."""
+    pose = T().translate([0, 0, 0.5]).rotate([0, 1, 0], 180).scale(0.1)
+    lamp = {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": 1.0}}
+    z, expected = (-2.0, 1.0 + N * 1.5) if where == "outside" else (-0.8, N * 1.3)
+    loaded = scene(at(z), body=CUBE | {"bsdf": glass()}, light=lamp)
+    assert arrivals(loaded)[0] == pytest.approx(expected, abs=1.5 * BIN)
+
+
+def test_polarized():
+    mi.set_variant("llvm_ad_mono_polarized")
+    plugins.sync()
+    check(scene(at(), body=CUBE | {"bsdf": glass("diff_dielectric")}), N * 1.0 + 2.0)
+
+
+def test_path_lengths_without_the_leg_to_the_sensor():
+    """``camera_unwarp`` leaves the first leg out; the legs behind it keep their index."""
+    loaded = scene(at(), body=CUBE | {"bsdf": glass()})
+    loaded.integrator().camera_unwarp = True
+    np.testing.assert_allclose(arrivals(loaded), 2.0 + TO_LAMP, atol=1.5 * BIN)
+
+
+def test_values_move_the_glass_around_the_sensor():
+    """The index is that of the scene as it is, not as it was first."""
+    loaded = scene(at(), body=CUBE | {"to_world": T().translate([5, 0, 0]), "bsdf": glass()})
+    check(loaded, 3.0)
+    params = mi.traverse(loaded)
+    v = np.array(params["body.vertex_positions"]).reshape(-1, 3) - [5, 0, 0]
+    params["body.vertex_positions"] = v.astype(np.float32).ravel()
+    params.update()
+    check(loaded, N * 1.0 + 2.0)

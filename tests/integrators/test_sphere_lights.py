@@ -1,0 +1,234 @@
+"""Spherical lights of any size, against closed forms: what they emit, its derivatives, and their densities."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.runs import T, runs
+from torchtransient import plugins
+from torchtransient.plugins.sampling.sphere_lights import SphereLights
+from torchtransient.testing.statistics import two_sample_z_test
+
+RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
+RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    mi.set_variant("llvm_ad_mono")
+    plugins.sync()
+
+
+def film(bins=400, width=0.02, start=2.0):
+    return {
+        "type": "transient_hdr_film", "width": 1, "height": 1, "temporal_bins": bins, "bin_width_opl": width,
+        "start_opl": start, "temporal_filter": "tent", "rfilter": {"type": "box"},
+    }  # fmt: skip
+
+
+def lamp(ratio, distance=DISTANCE, emitter=None, **more):
+    emitter = emitter or {"type": "area", "radiance": RADIANCE}
+    return {"type": "sphere", "center": [0, 0, distance], "radius": ratio * distance, "emitter": emitter, **more}
+
+
+def over_a_plane(*lights, bsdf=None, depth=2, integrator="transient_path", **more):
+    """A point of a plane seen from close by and from the side, with lights above it."""
+    bsdf = bsdf or {"type": "diffuse", "reflectance": RHO}
+    lights = {f"light_{n}": light for n, light in enumerate(lights)}
+    return mi.load_dict({
+        "type": "scene", "integrator": {"type": integrator, "max_depth": depth},
+        "sensor": {
+            "type": "perspective", "fov": 0.02, "near_clip": 1e-4, "film": film(),
+            "to_world": T().look_at(origin=[0.01, 0, 0.003], target=[0, 0, 0], up=[0, 1, 0]),
+        },
+        "plane": {"type": "rectangle", "to_world": T().scale(0.02), "bsdf": bsdf},
+        **lights, **more,
+    }, optimize=False)  # fmt: skip
+
+
+def close_to(values, expected, slack=2e-5):
+    """Mean of ``values`` is ``expected``, up to noise that could show a percent."""
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    assert error < 2e-3 * abs(expected)
+    assert abs(np.mean(values) - expected) < 4.5 * error + slack * abs(expected)
+
+
+def steady(scene, count=6, spp=1 << 14):
+    return runs(scene, count, spp)[0].mean((1, 2, 3))
+
+
+@pytest.mark.parametrize("distance", [3.0, 300.0])
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_irradiance_below_a_sphere(ratio, distance):
+    """E = pi L (r / d)^2, for any sphere that is above the horizon."""
+    close_to(steady(over_a_plane(lamp(ratio, distance))), RHO * RADIANCE * ratio**2)
+
+
+@pytest.mark.parametrize("kind", ["inside", "on the surface"])
+def test_irradiance_inside_a_sphere(kind):
+    """E = pi L everywhere in a sphere that shines inwards."""
+    center = {"inside": 0.0, "on the surface": 2.0 - 1e-5}[kind]
+    shell = {"type": "sphere", "center": [0, 0, center], "radius": 2.0, "flip_normals": True}
+    shell["emitter"] = {"type": "area", "radiance": RADIANCE}
+    close_to(steady(over_a_plane(shell), 8), RHO * RADIANCE, slack=2e-4)
+
+
+def test_lights_beside_it():
+    """Choice by weights, among lights of other kinds."""
+    lights = [
+        lamp(1e-4, emitter={"type": "area", "radiance": 1e8, "sampling_weight": 3.0}),
+        lamp(1e-3, 2.0, emitter={"type": "area", "radiance": 1e6, "sampling_weight": 0.5}) | {"center": [0, 2.0, 2.0]},
+        {"type": "point", "position": [0, -5.0, 5.0], "intensity": 10.0},
+        {"type": "constant", "radiance": 0.3},
+    ]
+    slanted = 0.5**1.5  # the cosine, over twice the squared height
+    E_over_pi = 1.0 + slanted + slanted * 10.0 / 25.0 / np.pi + 0.3
+    close_to(steady(over_a_plane(*lights), 8, 1 << 16), RHO * E_over_pi, slack=1e-4)
+
+
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "llvm_ad_rgb", "llvm_ad_spectral"])
+def test_other_variants(variant, ratio):
+    mi.set_variant(variant)
+    plugins.sync()
+    scene = over_a_plane(lamp(ratio))
+    images = runs(scene, 8, 1 << 14)[0][:, 0, 0]
+    intensity = images[:, 0] if "polarized" in variant else images.mean(-1)
+    expected = RHO * RADIANCE * ratio**2
+    spectral = "spectral" in variant  # its white point is a quadrature
+    close_to(intensity, expected, slack=1e-2 if spectral else 5e-5)
+
+
+def stripes():
+    """A texture whose mean over the sphere is one, since it changes along the equator alone."""
+    data = np.tile(np.array([0.5, 1.5, 0.2, 1.8], dtype=np.float32)[None, :, None], (2, 1, 3))
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
+
+
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1])
+def test_texture_seen_from_the_pole(ratio):
+    """From below all meridians are seen alike."""
+    light = lamp(ratio, emitter={"type": "area", "radiance": stripes()})
+    close_to(steady(over_a_plane(light), 8, 1 << 16), RHO * ratio**2, slack=1e-4)
+
+
+def on_its_side(weight):
+    turned = T().translate([0, 0, 1]).rotate([0.6, 0.8, 0.0], 70).scale(0.4)
+    emitter = {"type": "area", "radiance": stripes(), "sampling_weight": weight}
+    return {"type": "sphere", "to_world": turned, "emitter": emitter}
+
+
+DARK = {"type": "point", "position": [0, 0, 1], "intensity": 1e-30}
+
+
+def test_texture_of_a_turned_sphere():
+    """The meridians differ: which texel is where, as rays find it that run into the sphere."""
+    sampled, found = (steady(over_a_plane(on_its_side(weight), DARK), 8, 1 << 15) for weight in (1.0, 0.0))
+    assert two_sample_z_test(sampled[:, None], found[:, None]).passed
+    assert abs(sampled.mean() / (RHO * 0.16) - 1) > 0.02  # the texture shows
+
+
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 1e-2])
+def test_angular_light(ratio):
+    """Emission into a cone of half angle c: as if the sphere had the radius r sin(c), up to r / d."""
+    emitter = {"type": "angulararea", "radiance": RADIANCE, "cutoff_angle": 30.0}
+    close_to(steady(over_a_plane(lamp(ratio, emitter=emitter)), 8, 1 << 18), RHO * RADIANCE * ratio**2 / 4, 2 * ratio)
+
+
+@pytest.mark.parametrize("ratio", [1e-4, 0.1, 0.7, 0.95])
+@pytest.mark.parametrize("alpha", [0.02, 0.5])
+def test_found_and_sampled_light_share_the_weight(ratio, alpha):
+    """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
+    if ratio < 1e-3 and alpha < 0.1:
+        alpha = 0.1
+    bsdf = {"type": "roughconductor", "alpha": alpha, "distribution": "ggx", "material": "none"}
+    alone = over_a_plane(lamp(ratio), bsdf=bsdf)
+    unsampled = {"type": "area", "radiance": RADIANCE, "sampling_weight": 0.0}
+    found = over_a_plane(lamp(ratio, emitter=unsampled), DARK, bsdf=bsdf)
+    spp = 1 << 18 if ratio > 1e-3 else 1 << 12
+    both = steady(alone, 8, spp)
+    if ratio > 1e-3:
+        assert two_sample_z_test(both[:, None], steady(found, 8, spp)[:, None]).passed
+    assert both.mean() > 0
+
+
+def densities(table, scene, p, u):
+    """Samples towards a light from ``p``, their weights, and the densities that are asked for."""
+    ref = dr.zeros(mi.Interaction3f, dr.width(u))
+    ref.p = p
+    ds, weight = table.sample(scene, ref, u, mi.Bool(True))
+    return ds, weight, table.pdf(scene, ref, ds, mi.Bool(True))
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+@pytest.mark.parametrize("ratio", [*RATIOS, 1.5, 100.0])
+def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
+    scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
+    table = SphereLights.of(scene).read(scene)
+    n = 1 << 18
+    x = (dr.arange(mi.Float, n) + 0.5) / n
+    turns = 0.61803 * mi.Float(dr.arange(mi.UInt32, n) % 4096)
+    ds, weight, pdf = densities(table, scene, mi.Point3f(0.1, 0, 0), mi.Point2f(0.5 * x, turns - dr.floor(turns)))
+    lit = dr.dot(ds.d, ds.n) < 0
+    assert bool(dr.all(lit)) == ((ratio > 1) == flipped)
+    if not dr.any(lit)[0]:
+        assert dr.all(pdf == 0)
+        return
+    np.testing.assert_allclose(np.array(pdf), np.array(ds.pdf), rtol=2e-4 if ratio < 1 else 1e-2)
+    away = ratio * DISTANCE / np.hypot(DISTANCE, 0.1)
+    expected = 4 * np.pi if ratio > 1 else 2 * np.pi * away**2 / (1 + np.sqrt(max(1 - away**2, 0)))
+    # One of two lights is chosen: half of the samples bring twice their light.
+    assert float(dr.mean(weight.x)[0]) / 2 == pytest.approx(RADIANCE * expected, rel=2e-3)
+    # Points lie on the sphere, in the direction and at the distance that is said.
+    p = mi.Point3f(0.1, 0, 0) + ds.d * ds.dist
+    off = dr.norm(p - mi.Point3f(0, 0, DISTANCE)) - ratio * DISTANCE
+    assert float(dr.max(dr.abs(off))[0]) < 3e-6 * max(1, ratio) * DISTANCE
+
+
+@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1, 0.9])
+@pytest.mark.parametrize("key", ["radius", "height", "radiance"])
+def test_derivatives(ratio, key):
+    """Of rho L (r / d)^2, in both modes."""
+    scene = over_a_plane(lamp(ratio))
+    params = mi.traverse(scene)
+    expected = RHO * RADIANCE * ratio**2 * {"radius": 2.0, "height": -2.0, "radiance": 1.0}[key]
+
+    def install():
+        x = mi.Float(1.0)
+        dr.enable_grad(x)
+        r, d, L = (mi.Float(v) for v in (ratio * DISTANCE, DISTANCE, RADIANCE))
+        r, d, L = (v * x if key == k else v for v, k in ((r, "radius"), (d, "height"), (L, "radiance")))
+        params["light_0.to_world"] = mi.Transform4f().translate(mi.Point3f(0, 0, d)).scale(mi.Point3f(r))
+        params["light_0.emitter.radiance.value"] = L
+        params.update()
+        return x
+
+    reverse, forward = [], []
+    for seed in range(4):
+        x = install()
+        scene.integrator().render_backward(scene, params, (mi.TensorXf([[[1.0]]]), None), seed=seed, spp=1 << 14)
+        for name in ("light_0.to_world", "light_0.emitter.radiance.value"):
+            value = params[name]
+            value = value.matrix if hasattr(value, "matrix") else value
+            if dr.grad_enabled(value):
+                dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
+        reverse.append(float(dr.grad(x)[0]))
+        x = install()
+        dr.set_grad(x, 1.0)
+        derivative, _ = scene.integrator().render_forward(scene, params, seed=seed, spp=1 << 14)
+        forward.append(float(np.array(derivative).sum()))
+    close_to(reverse, expected, slack=2e-4)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-3)
+
+
+def test_small_light_in_fog():
+    """Attenuated along the way: the connection ends at the sphere."""
+    fog = {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.0}
+    middle = T().translate([0, 0, 2.0]).scale([1, 1, 0.5])
+    box = {"type": "cube", "to_world": middle, "bsdf": {"type": "null"}, "interior": fog}
+    scene = over_a_plane(lamp(1e-4), integrator="transient_prbvolpath", box=box)
+    close_to(steady(scene), RHO * RADIANCE * 1e-8 * np.exp(-0.5), slack=1e-4)

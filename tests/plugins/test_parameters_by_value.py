@@ -1,0 +1,46 @@
+"""Rows of the table of parameters that depend on what the scene says: which phase function, which weight of a lobe."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from torchtransient import plugins
+from torchtransient.plugins.parameters import ParameterTracker
+
+
+@pytest.fixture(autouse=True)
+def rgb():
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+
+
+def effect_in(description, key):
+    """The effect of the one parameter of a scene whose name contains ``key``."""
+    scene = mi.load_dict({"type": "scene", "it": description})
+    tracker = ParameterTracker(scene)
+    ((_, _, node, flags),) = (entry for name, entry in named(scene) if key in name)
+    last = next(name for name, _ in named(scene) if key in name).rsplit(".", 1)[-1]
+    return tracker.effect_of(node, last, flags)
+
+
+def named(scene):
+    return list(mi.traverse(scene).properties.items())
+
+
+@pytest.mark.parametrize("medium", ["homogeneous", "heterogeneous"])
+@pytest.mark.parametrize(("phase", "attenuates"), [("sggx", True), ("tabphase", False)])
+def test_flakes_are_part_of_the_extinction(medium, phase, attenuates):
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2, 6), dtype=np.float32))}
+    function = {"type": "sggx", "S": grid} if phase == "sggx" else {"type": "tabphase", "values": "1,2"}
+    cube = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": medium, "phase": function}}
+    effect = effect_in(cube, "phase_function.S.data" if phase == "sggx" else "phase_function.values")
+    assert (effect.moves_medium, effect.role) == (attenuates, "medium" if attenuates else "value")
+
+
+@pytest.mark.parametrize(("weight", "biased"), [(0.0, True), (0.3, False)])
+def test_a_lobe_of_weight_zero_has_no_derivative(weight, biased):
+    ball = {"type": "sphere", "bsdf": {"type": "principled", "clearcoat": weight, "metallic": weight}}
+    assert effect_in(ball, "clearcoat.value").biased == biased
+    assert not effect_in(ball, "metallic.value").biased

@@ -1,0 +1,179 @@
+"""``torch.func`` and ``torch.autograd.functional`` on ``tt.render``, on a renderer, and on one made inside of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.autograd import functional
+
+import torchtransient as tt
+from torchtransient.testing.small_room import COLOUR
+from torchtransient.testing.small_room import VARIANT as VARIANT
+
+START = torch.tensor([0.8, 0.5, 0.2])
+XS = torch.stack([START, START * 0.5])
+TANGENT = torch.tensor([0.3, 0.1, -1.0])
+SETTINGS = {"spp": 4, "grad_seed": "same"}
+WAYS = ["render", "renderer", "made inside"]
+
+
+@pytest.fixture(params=WAYS)
+def groups(request, room_scene):
+    """A vector function of the colour: the transient's sum over six groups of bins."""
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], **SETTINGS)
+
+    def rendered(x, seed):
+        if request.param == "render":
+            return tt.render(room_scene, {COLOUR: x}, seed=seed, **SETTINGS)
+        if request.param == "renderer":
+            return renderer({COLOUR: x}, seed=seed)
+        return tt.TransientRenderer(room_scene, parameters=[COLOUR], **SETTINGS)({COLOUR: x}, seed=seed)
+
+    def f(x, seed=0):
+        return rendered(x, seed).transient.sum((-4, -2, -1)).reshape(6, 4).sum(1)
+
+    return f
+
+
+@pytest.fixture
+def jacobian(groups):
+    """The reference: one backward for each row."""
+    x = START.clone().requires_grad_()
+    out = groups(x)
+    return torch.stack([torch.autograd.grad(row, x, retain_graph=True)[0] for row in out])
+
+
+def close(found, expected):
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_products(groups, jacobian):
+    u = torch.arange(6.0)
+    assert jacobian.abs().max() > 0
+    out, pushed = torch.func.jvp(groups, (START,), (TANGENT,))
+    assert torch.equal(out, groups(START))
+    close(pushed, jacobian @ TANGENT)
+    close(torch.func.vjp(groups, START)[1](u)[0], u @ jacobian)
+    close(torch.func.grad(lambda x: groups(x) @ u)(START), u @ jacobian)
+    close(torch.func.grad_and_value(lambda x: groups(x) @ u)(START)[0], u @ jacobian)
+    close(functional.vjp(groups, START, u)[1], u @ jacobian)
+    close(functional.jvp(groups, START, TANGENT)[1], jacobian @ TANGENT)
+
+
+def test_jacobians(groups, jacobian):
+    close(torch.func.jacrev(groups)(START), jacobian)
+    close(torch.func.jacrev(groups, chunk_size=2)(START), jacobian)
+    close(torch.func.jacfwd(groups)(START), jacobian)
+    close(functional.jacobian(groups, START), jacobian)
+    close(functional.jacobian(groups, START, vectorize=True), jacobian)
+    close(functional.jacobian(groups, START, vectorize=True, strategy="forward-mode"), jacobian)
+
+
+def test_batched_cotangents_of_autograd(groups, jacobian):
+    x = START.clone().requires_grad_()
+    rows = torch.autograd.grad(groups(x), x, torch.eye(6), is_grads_batched=True)[0]
+    close(rows, jacobian)
+
+
+def test_nested_transforms(groups):
+    loop = torch.stack([groups(x) for x in XS])
+    each = torch.stack([torch.func.jacrev(groups)(x) for x in XS])
+    vmap, jvp = torch.func.vmap, torch.func.jvp
+    close(vmap(groups)(XS), loop)
+    close(vmap(vmap(groups))(torch.stack([XS, XS.flip(0)])), torch.stack([loop, loop.flip(0)]))
+    close(vmap(torch.func.jacrev(groups))(XS), each)
+    close(vmap(torch.func.jacfwd(groups))(XS), each)
+    close(vmap(lambda x: jvp(groups, (x,), (TANGENT,))[1])(XS), each @ TANGENT)
+    blocks = torch.zeros(2, 6, 2, 3)
+    blocks[0, :, 0], blocks[1, :, 1] = each
+    close(torch.func.jacfwd(vmap(groups))(XS), blocks)
+    close(torch.func.jacrev(vmap(groups))(XS), blocks)
+
+
+def test_products_of_gauss_and_newton(groups, jacobian):
+    """J^T J v, each factor a first derivative: the derivative of a tangent by the tangent, of a gradient by the
+    cotangent.
+    """
+
+    def push(v):
+        return torch.func.jvp(groups, (START,), (v,))[1]
+
+    close(torch.func.vjp(push, TANGENT)[1](push(TANGENT))[0], jacobian.T @ jacobian @ TANGENT)
+    pull = torch.func.vjp(groups, START)[1]
+    close(torch.func.jacrev(lambda u: pull(u)[0])(torch.ones(6)), jacobian.T)
+    close(torch.func.jacfwd(lambda u: pull(u)[0])(torch.ones(6)), jacobian.T)
+    close(torch.func.jacfwd(push)(TANGENT), jacobian)
+
+
+SECOND = {
+    "hessian": lambda f: torch.func.hessian(f)(START),
+    "reverse over reverse": lambda f: torch.func.jacrev(torch.func.jacrev(f))(START),
+    "forward over forward": lambda f: torch.func.jacfwd(torch.func.jacfwd(f))(START),
+    "reverse over forward": lambda f: torch.func.jacrev(torch.func.jacfwd(f))(START),
+    "autograd": lambda f: functional.hessian(f, START),
+    "autograd, vectorized": lambda f: functional.hessian(
+        f, START, vectorize=True, outer_jacobian_strategy="forward-mode"
+    ),
+    "hvp": lambda f: functional.hvp(f, START, TANGENT),
+    "vhp": lambda f: functional.vhp(f, START, TANGENT),
+}
+
+
+@pytest.mark.parametrize("way", SECOND)
+def test_second_derivatives_are_refused(groups, way):
+    with pytest.raises(tt.errors.GradientError, match="second derivatives of a render are not available"):
+        SECOND[way](lambda x: groups(x).square().sum())
+
+
+# ---------------------------------------------------------------------------------------------------- seeds of vmap
+
+
+def test_a_seed_that_is_not_given_under_vmap(groups):
+    with pytest.raises(tt.errors.UnitError, match=r"Pass seed=.*randomness='same'.*'different'"):
+        torch.func.vmap(lambda x: groups(x, seed=None))(XS)
+
+
+def test_same_randomness_is_one_seed(groups):
+    twice = torch.stack([START, START])
+    out = torch.func.vmap(lambda x: groups(x, seed=None), randomness="same")(twice)
+    assert torch.equal(out[0], out[1])
+
+
+def test_different_randomness_is_a_seed_for_each_entry(groups):
+    twice = torch.stack([START, START])
+
+    def seedless(x):
+        return groups(x, seed=None)
+
+    torch.manual_seed(5)
+    out = torch.func.vmap(seedless, randomness="different")(twice)
+    assert not torch.equal(out[0], out[1])
+    torch.manual_seed(5)
+    seeds = torch.randint(0, 2**32, (2,), dtype=torch.int64)
+    close(out, torch.stack([groups(START, seed=int(seed)) for seed in seeds]))
+    torch.manual_seed(5)
+    slopes = torch.func.vmap(torch.func.jacrev(seedless), randomness="different")(twice)
+    close(slopes, torch.stack([torch.func.jacrev(lambda x, s=int(s): groups(x, seed=s))(START) for s in seeds]))
+
+
+def test_seeds_may_be_what_is_mapped(groups):
+    seeds = torch.tensor([3, 8])
+    out = torch.func.vmap(groups)(XS, seeds)
+    close(out, torch.stack([groups(x, seed=int(seed)) for x, seed in zip(XS, seeds, strict=True)]))
+    slopes = torch.func.vmap(torch.func.jacrev(groups))(XS, seeds)
+    close(slopes[1], torch.func.jacrev(groups)(XS[1], 8))
+
+
+def test_statistics_under_vmap_are_those_of_all_entries(room_scene):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], time_axis=tt.TimeAxis(8.0, 0.25, 2), spp=4)
+    found = []
+
+    def f(x, seed):
+        out = renderer({COLOUR: x}, seed=seed)
+        found.append(out.stats)
+        return out.steady
+
+    torch.func.vmap(f)(XS, torch.tensor([3, 8]))
+    single = renderer({COLOUR: XS[1]}, seed=8).stats
+    assert found[0].seeds == (3, 8)
+    assert len(found[0].energy_after) == 2 and found[0].energy_after[1] == pytest.approx(single.energy_after[0])

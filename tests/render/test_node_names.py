@@ -1,0 +1,74 @@
+"""Keys are the same in every process: nothing is called after an address in memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import VARIANT, make_room
+
+MERGED = """<scene version="3.0.0">
+<integrator type="transient_path"/>
+<sensor type="perspective"><film type="transient_hdr_film"><integer name="width" value="2"/>
+<integer name="height" value="2"/><integer name="temporal_bins" value="4"/></film></sensor>
+<shape type="shapegroup" id="group"><shape type="merge"><shape type="cube"/>
+<shape type="cube"><transform name="to_world"><translate x="2"/></transform><bsdf type="diffuse"/></shape>
+</shape></shape>
+<shape type="merge"><shape type="cube"><bsdf type="conductor"/></shape>
+<shape type="merge"><shape type="cube" id="mine"><transform name="to_world"><translate x="3"/></transform>
+<bsdf type="diffuse"/></shape></shape></shape>
+<shape type="sphere"/>
+<emitter type="constant"/>
+</scene>"""
+
+
+@pytest.fixture
+def merged_file(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(MERGED)
+    return path
+
+
+def test_merged_shapes_have_names_and_transforms(merged_file):
+    scene = tt.load(merged_file, variant=VARIANT)
+    table = scene.parameters()
+    assert not [key for key in table if "object_" in key]
+    shapes = [key.rsplit(".", 1)[0] for key in table if key.endswith(".vertex_positions")]
+    assert sorted(shapes) == ["group.shape", "group.shape_1", "mine", "shape_0_0"]
+    moved = {shape: float(table[f"{shape}.to_world"].value[0, 3]) for shape in shapes}
+    assert moved == {"group.shape": 0.0, "group.shape_1": 2.0, "shape_0_0": 0.0, "mine": 3.0}
+    assert "shape_1.to_world" in table
+    for shape in shapes:
+        offset = float(np.mean(table[f"{shape}.vertex_positions"].value[:, 0]))
+        assert offset == pytest.approx(moved[shape], abs=1e-6)
+
+
+def test_keys_and_states_are_those_of_another_process(merged_file):
+    code = f"import torchtransient as tt; print(*tt.load({str(merged_file)!r}, variant={VARIANT!r}).parameters())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    scene = tt.load(merged_file, variant=VARIANT)
+    assert done.stdout.split() == list(scene.parameters())
+    key = "shape_0_0.vertex_positions"
+    first, second = (tt.TransientRenderer(tt.load(merged_file, variant=VARIANT), parameters=[key]) for _ in range(2))
+    second.load_state_dict(first.state_dict())
+
+
+def test_a_merged_scene_renders_as_one_that_is_not(room):
+    plain = make_room()
+    box = plain.pop("box")
+    merged = {**plain, "both": {"type": "merge", "box": box, "wall": {**box, "to_world": np.diag([0.1, 0.1, 0.1, 1])}}}
+    scene = tt.load(merged, variant=VARIANT)
+    keys = [key for key in scene.parameters() if key.endswith("vertex_positions")]
+    assert sorted(keys) == ["both_wall.vertex_positions", "box.vertex_positions"]
+    with_key = tt.TransientRenderer(scene, parameters=keys, spp=64)
+    apart = {**plain, "box": box, "other": merged["both"]["wall"]}
+    expected = tt.TransientRenderer(tt.load(apart, variant=VARIANT), spp=64)(seed=0)
+    with torch.no_grad():
+        found = with_key(seed=0)
+    torch.testing.assert_close(found.steady, expected.steady, rtol=0.2, atol=0.02)

@@ -1,0 +1,29 @@
+"""Messages of the library in the words of the command line: options instead of arguments and calls."""
+
+from __future__ import annotations
+
+from torchtransient.render.films.choices import all_films
+
+_WORDS = {
+    "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
+    "tt.plan(scene) finds a window": "`torchtransient plan SCENE` finds a window",
+    " RenderOutput.stats has the energies.": "",
+    ", for instance by .clamp(0, 1) or a sigmoid": "",
+    "tt.plan: outputs are some of": "--outputs takes some of",
+    "tt.plan: ": "",
+    "tt.load: ": "",
+    "temporal_filter: ": "--temporal-filter: ",
+    "sensors: the scene has": "--sensor: the scene has",
+    "neither the film nor the call has": "neither the film of the scene nor the command line has",
+}
+
+
+def in_options(message: str) -> str:
+    """The message without Python in it."""
+    for kind in all_films():
+        if kind.options:
+            flags = ", ".join(f"--{option.name.replace('_', '-')}" for option in kind.options)
+            message = message.replace(f"Give {kind.example}", f"Give {flags}")
+    for python, option in _WORDS.items():
+        message = message.replace(python, option)
+    return message

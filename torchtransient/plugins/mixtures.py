@@ -1,0 +1,226 @@
+"""Mixtures (``mask``, ``blendbsdf``, ``blendphase``): a path chooses one part of them and sees that part alone.
+
+Mitsuba samples such a mixture as a whole. Where a part has a delta lobe that goes wrong: a blend divides by the sum of
+a probability and a density (:func:`.mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
+part was chosen is lost. Here the choice is made outside of the BSDFs' methods, as between delayed and prompt light
+(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which
+the weight is attached and the probability is not.
+
+Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
+probability of its lobes. Where the weight itself has a derivative and is exactly zero or one, the part that would never
+be chosen is, at times: the slope there is not zero. All other mixtures are left to Mitsuba, whose sum over the parts
+has less noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, weight_slot
+from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
+from torchtransient.plugins.pointer_table import PointerTable, registry_number
+
+# Probability of a part whose weight is exactly zero, where the derivative by the weight is asked for.
+LEAST_PROBABILITY = 0.25
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A part; ``index`` among those of its mixture."""
+
+    index: int
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``second`` with the weight that ``texture`` has, ``first`` with the rest."""
+
+    texture: Any
+    first: Any
+    second: Any
+
+
+@dataclass(frozen=True)
+class Sides:
+    """A two-sided BSDF with different faces."""
+
+    front: Any
+    back: Any
+
+
+class Mixture:
+    """The parts of one BSDF or phase function of a scene.
+
+    ``always``: it is taken apart in renders, too. ``for_derivatives``: it is taken apart where there are derivatives.
+    """
+
+    def __init__(self, node: Any, kind: type) -> None:
+        self.node, self._kind = node, kind
+        self.parts: list[Any] = []
+        self.textures: list[Any] = []
+        # (the wrapper of the scene, the one around a part), whose plain numbers have to be kept equal
+        self.wrapped: list[tuple[Any, Any]] = []
+        self._null: Any = None
+        self.tree = self._tree_of(node, ())
+        self.always = any(mixes_delta(part) for part in [node, *objects_below(node, kind)])
+        self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
+
+    def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
+        slot = weight_slot(node)
+        nested = [value for _, value in objects_of(node) if isinstance(value, self._kind)]
+        if slot is not None:
+            texture = dict(objects_of(node))[slot]
+            self.textures.append(texture)
+            if len(nested) == 1:  # a mask: the rest passes straight through
+                self._null = self._null or mi.load_dict({"type": "null"})
+                nested = [self._null, *nested]
+            first, second = (self._tree_of(part, wrappers) for part in nested)
+            return Choice(texture, first, second)
+        if not any(is_mixture(part, self._kind) for part in nested):
+            return self._leaf(node, wrappers)
+        trees = [self._tree_of(part, (*wrappers, node)) for part in nested]
+        return trees[0] if len(trees) == 1 else Sides(*trees)
+
+    def _leaf(self, node: Any, wrappers: tuple[Any, ...]) -> Leaf:
+        for wrapper in reversed(wrappers):
+            node = rebuild_wrapper(wrapper, node)
+            self.wrapped.append((wrapper, node))
+        self.parts.append(node)
+        return Leaf(len(self.parts) - 1)
+
+    def follow(self) -> None:
+        """Hand changed numbers of the scene's wrappers on to those around parts."""
+        for original, copy in self.wrapped:
+            now, before = (
+                {shown.key: shown.read(node) for shown in shown_by(node)[0]} for node in (original, copy)
+            )
+            plain = {key: value for key, value in now.items() if isinstance(value, float) and value != before[key]}
+            if plain:
+                params = mi.traverse(copy)
+                for key, value in plain.items():
+                    params[key] = value
+                params.update()
+
+    def taken_apart(self, derivatives: bool) -> tuple[bool, bool]:
+        """(everywhere, where a weight is 0 or 1)."""
+        return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
+
+    def _has_derivative(self) -> bool:
+        """Whether one of its weights carries derivatives; asked with gradients enabled."""
+        return any(
+            dr.grad_enabled(shown.read(node))
+            for texture in self.textures
+            for node in (texture, *objects_below(texture, mi.Object))
+            for shown in shown_by(node)[0]
+        )
+
+
+def is_mixture(node: Any, kind: type) -> bool:
+    """Whether a BSDF or phase function is a mixture or holds one."""
+    return any(weight_slot(part) is not None for part in (node, *objects_below(node, kind)))
+
+
+class Mixtures:
+    """The mixtures of a scene: what of them does not change with their parameters."""
+
+    def __init__(self, mixtures: list[Mixture]) -> None:
+        self.mixtures = {mixture.node.ptr: mixture for mixture in mixtures}
+        firsts, numbers = [], []
+        for mixture in mixtures:
+            firsts.append(len(numbers))
+            numbers += [registry_number(part) for part in mixture.parts]
+        self._first = PointerTable([mixture.node for mixture in mixtures], firsts)
+        self._numbers = mi.UInt32(numbers)
+        dr.make_opaque(self._numbers)
+
+    def read(self, derivatives: bool) -> MixtureChoice | None:
+        """Which of them are taken apart in a job, None for none; ``derivatives``: it is one of derivatives."""
+        for mixture in self.mixtures.values():
+            mixture.follow()
+        with dr.resume_grad():
+            chosen = {ptr: mixture.taken_apart(derivatives) for ptr, mixture in self.mixtures.items()}
+        chosen = {ptr: how for ptr, how in chosen.items() if any(how)}
+        return MixtureChoice(self, chosen) if chosen else None
+
+    def number(self, pointer: Any, index: Any, active: Any) -> Any:
+        """Number in Dr.Jit's registry of the part ``index`` of what ``pointer`` points to."""
+        at = self._first.look_up(pointer, active) + index
+        return dr.gather(mi.UInt32, self._numbers, at, active)
+
+
+class MixtureChoice:
+    """Takes mixtures apart in one job. Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+
+    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is taken apart where a weight is 0 or 1).
+    """
+
+    def __init__(self, mixtures: Mixtures, chosen: dict[int, tuple[bool, bool]]) -> None:
+        self._of, self._chosen = mixtures, chosen
+
+    def take_part(self, sample: Any, si: Any, u: Any, active: Any) -> None:
+        """Change ``sample`` (a :class:`.bsdfs.delay_table.DelaySample`) to one part, chosen by the uniform number
+        ``u``.
+        """
+        sample.bsdf, weight = self.part_of(sample.bsdf, si, u, active)
+        sample.weight = weight if sample.weight is None else sample.weight * weight
+
+    def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
+        """(pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        kind = type(pointer)
+        pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
+        index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)
+        apart &= active
+        number = dr.select(apart, self._of.number(pointer, index, apart), dr.reinterpret_array(mi.UInt32, pointer))
+        return dr.reinterpret_array(kind, number), dr.select(apart, weight, 1)
+
+    def _choose(self, node: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(number of a part, its weight over its probability, whether it takes the place of ``node``)."""
+        everywhere, at_ends = self._chosen.get(node.ptr, (False, False))
+        if not (everywhere or at_ends):
+            return mi.UInt32(0), mi.Float(1), mi.Bool(False)
+        index, weight, end = _descend(self._of.mixtures[node.ptr].tree, interaction, u, active, at_ends)
+        return index, weight, mi.Bool(True) if everywhere else end
+
+
+def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
+    """(number of a part, its weight over its probability, whether a weight on the way or beside it is 0 or 1)."""
+    if isinstance(tree, Leaf):
+        return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
+    if isinstance(tree, Sides):
+        front = interaction.wi.z > 0
+        a, b = (_descend(side, interaction, u, active, at_ends) for side in (tree.front, tree.back))
+        return tuple(dr.select(front, x, y) for x, y in zip(a, b, strict=True))
+    w = tree.texture.eval_1(interaction, active)
+    # Its ends keep their derivative.
+    w = dr.select(w < 0, 0, dr.select(w > 1, 1, w))
+    p, end = dr.detach(w), mi.Bool(False)
+    if at_ends:
+        end = (p == 0) | (p == 1)
+        p = dr.select(end, dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY), p)
+    second = u < p
+    chance = dr.select(second, p, 1 - p)
+    u = dr.select(second, u, u - p) / dr.select(chance > 0, chance, 1)
+    a, b = (_descend(part, interaction, u, active, at_ends) for part in (tree.first, tree.second))
+    index, weight, below = (dr.select(second, y, x) for x, y in zip(a, b, strict=True))
+    weight *= dr.select(second, w, 1 - w) / dr.select(chance > 0, chance, 1)
+    return index, weight, end | a[2] | b[2] if at_ends else below
+
+
+def mixtures_of(nodes: list[Any], kind: type) -> tuple[list[Any], Mixtures | None]:
+    """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
+    apart is replaced by its parts, the parts of others join it.
+    """
+    met, mixtures = [], []
+    for node in nodes:
+        if not is_mixture(node, kind):
+            met.append(node)
+            continue
+        mixture = Mixture(node, kind)
+        mixtures.append(mixture)
+        met += mixture.parts if mixture.always else [node, *mixture.parts]
+    return met, Mixtures(mixtures) if mixtures else None

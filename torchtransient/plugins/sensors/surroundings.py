@@ -1,0 +1,128 @@
+"""The index of refraction of the medium that a sensor stands in.
+
+Surfaces tell the ratio of the indices on their two sides, so the medium at the sensor is found by following straight
+lines outwards, through everything, until nothing is hit: leaving a body multiplies by its index, a body that is entered
+and left cancels, and one that is entered and never left (an open surface such as that of a lake) was not around the
+sensor. Entered in all directions, it is a body that is turned inside out. Each material is decided on by itself, by
+lines along the sensor's rays and in all directions, so that neither a leak of a mesh nor a direction in which an open
+surface is missed decides.
+
+One index per sensor: of an orthographic camera, a lens or a meter that stands on both sides of a boundary, that of most
+of its rays. Of a blend of smooth glasses with different indices the first counts, a ``mask`` as what it masks.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.plugins.bsdfs.refraction_table import boundaries_of, index_of
+from torchtransient.plugins.mitsuba_compat import is_distant
+from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.sensors.origin import sensors_of
+
+# Lines per sensor: half of them along its rays.
+LINES = 64
+# The share of the lines that has to leave a body for the sensor to be inside: more than leaks do, less than an open
+# surface that is in view.
+SHARE = 1 / 16
+# The share of the lines in all directions that enter what surrounds the sensor; a flat surface is met by half of them.
+ENCLOSED = 0.9
+# Bodies of one material around each other that are told apart, and surfaces along one line.
+_NESTED, _SURFACES = 4, 1000
+
+
+class Surroundings:
+    """What may lie around the sensors behind ``sensor``: the refractive BSDFs of a scene. Does not change once built.
+
+    Sensors at infinity stand in nothing.
+    """
+
+    def __init__(self, sensor: Any, boundaries: list[tuple[Any, Any]]) -> None:
+        self._sensors = sensors_of(sensor)
+        self._leaves = [leaf for _, leaf in boundaries]
+        bsdfs = [bsdf for bsdf, _ in boundaries]
+        # Smooth glass often shares its BSDF, and parts may share a leaf: one slot for each leaf.
+        known = {leaf.ptr: leaf for leaf in self._leaves}
+        slots = {ptr: 1 + n for n, ptr in enumerate(known)}
+        self._slots = PointerTable(bsdfs, [slots[leaf.ptr] for leaf in self._leaves])
+        self._leaves = list(known.values())
+        rng = np.random.default_rng(0)
+        self._film, self._aperture = (mi.Point2f(rng.random((2, LINES), dtype=np.float32)) for _ in range(2))
+        around = rng.normal(size=(3, LINES))
+        self._around = mi.Vector3f((around / np.linalg.norm(around, axis=0)).astype(np.float32))
+        dr.make_opaque(self._film, self._aperture, self._around)
+
+    @staticmethod
+    def of(sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
+        """None where nothing in a scene of these outermost BSDFs refracts."""
+        boundaries = boundaries_of(bsdfs)
+        return Surroundings(sensor, boundaries) if boundaries else None
+
+    def indices(self, scene: Any) -> list[Any]:
+        """The index at each sensor as it is now, attached where the indices of the surfaces are. To be called outside
+        of loops, with gradients enabled.
+        """
+        count = len(self._leaves)
+        with dr.suspend_grad():
+            left, levels, entered = (dr.zeros(mi.Float, len(self._sensors) * count) for _ in range(3))
+            for number, sensor in enumerate(self._sensors):
+                if not is_distant(sensor):
+                    ray = self._lines(sensor)
+                    first = dr.opaque(mi.UInt32, number * count)
+                    _count_crossings(scene, self._slots, count, ray, first, left, levels, entered)
+            levels = dr.select(left > SHARE * LINES, dr.round(levels / dr.maximum(left, 1)), 0)
+            levels = dr.select((levels == 0) & (entered > ENCLOSED * LINES / 2), -1, levels)
+            dr.eval(levels)
+        etas = [index_of(leaf) for leaf in self._leaves]
+        found = []
+        for number in range(len(self._sensors)):
+            index = mi.Float(1)
+            for k, eta in enumerate(etas):
+                level = dr.gather(mi.Float, levels, mi.UInt32(number * count + k))
+                for depth in range(_NESTED):
+                    index = index * dr.select(level > depth, eta, 1)
+                index = index * dr.select(level < 0, dr.rcp(eta), 1)
+            found.append(index)
+        dr.make_opaque(*found)
+        return found
+
+    def _lines(self, sensor: Any) -> Any:
+        """From where the sensor's rays start, half of them along the rays."""
+        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, self._film, self._aperture)
+        return mi.Ray3f(dr.detach(ray.o), dr.select(_all_directions(), self._around, dr.detach(ray.d)))
+
+
+def _all_directions():
+    """Which lines do not follow a ray of the sensor."""
+    return (dr.arange(mi.UInt32, LINES) & 1) == 1
+
+
+@dr.syntax
+def _count_crossings(scene, slots, count, ray, first, left, levels, entered):
+    """For each material, how many lines leave bodies of it that they have not entered (``left``; ``levels`` counts the
+    bodies), and how many of those in all directions enter one that they never leave.
+    """
+    # Slot 0 is that of everything else.
+    now, most = (dr.alloc_local(mi.Int32, count + 1, value=mi.Int32(0)) for _ in range(2))
+    active, n = dr.full(mi.Bool, True, LINES), dr.zeros(mi.UInt32, LINES)
+    while dr.hint(active, label="surroundings of a sensor"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        slot = slots.look_up(si.bsdf(), active)
+        after = now.read(slot, active) + dr.select(si.wi.z < 0, mi.Int32(1), mi.Int32(-1))
+        now.write(after, slot, active)
+        most.write(dr.maximum(most.read(slot, active), after), slot, active)
+        ray = si.spawn_ray(ray.d)
+        n += 1
+        active &= n < _SURFACES
+    k = dr.zeros(mi.UInt32, LINES)
+    while dr.hint(k < count, label="materials around a sensor"):
+        bodies = most.read(k + 1)
+        dr.scatter_add(left, 1.0, k + first, bodies > 0)
+        dr.scatter_add(levels, mi.Float(bodies), k + first, bodies > 0)
+        dr.scatter_add(entered, 1.0, k + first, _all_directions() & (now.read(k + 1) < bodies))
+        k += 1

@@ -1,0 +1,160 @@
+"""Preliminary intersections with derivatives, for the shapes whose hit points Mitsuba leaves detached.
+
+The interactions of its ellipsoids and linear curves lie at the ray's point of the *detached* distance: they follow
+neither the shape nor a ray that moves. The rest of the interaction is computed from distance and place on the shape, so
+it is enough to attach these two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.mitsuba_compat import leaves_hits_detached
+from torchtransient.plugins.node_walk import shapes_of_scene, shown_by
+from torchtransient.plugins.pointer_table import PointerTable
+
+# Numbers per ellipsoid: centre, semi-axes, quaternion. Per control point of a curve: place, radius.
+_ELLIPSOID, _POINT = 10, 4
+
+
+class DetachedHits:
+    """The shapes of a scene that leave their hit points detached. Does not change once built."""
+
+    def __init__(self, shapes: Sequence[Any]) -> None:
+        shown = [(shape, {value.key: value for value in shown_by(shape)[0]}) for shape in shapes]
+        self._ellipsoids = [(shape, values) for shape, values in shown if "data" in values]
+        self._curves = [(shape, values) for shape, values in shown if "control_points" in values]
+        # Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none.
+        ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
+        segments = _starts([values["segment_indices"].read(shape) for shape, values in self._curves], 1)
+        self._first_ellipsoid = PointerTable([shape for shape, _ in self._ellipsoids], [1 + n for n in ellipsoids])
+        self._first_segment = PointerTable([shape for shape, _ in self._curves], [1 + n for n in segments])
+
+    @staticmethod
+    def of(scene: Any) -> DetachedHits | None:
+        """Those of ``scene``, shape groups included; None when it has none."""
+        found = [shape for shape in shapes_of_scene(scene) if leaves_hits_detached(shape)]
+        return DetachedHits(found) if found else None
+
+    def read(self) -> HitTable:
+        """Their parameters as they are now, attached where they are; to be called outside of loops, once a job."""
+        with dr.resume_grad():
+            kinds: list[Any] = []
+            if self._ellipsoids:
+                kinds.append(EllipsoidTable(self._ellipsoids, self._first_ellipsoid))
+            if self._curves:
+                kinds.append(CurveTable(self._curves, self._first_segment))
+            return HitTable(kinds)
+
+
+class HitTable:
+    """What attaches hit points, by kind of shape. A plain object, which Dr.Jit loops leave alone."""
+
+    def __init__(self, kinds: Sequence[Any]) -> None:
+        self._kinds = kinds
+
+    def tables(self) -> list[Any]:
+        """The arrays that are attached where parameters are."""
+        return [table for kind in self._kinds for table in kind.tables()]
+
+    def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> Any:
+        """The intersection ``pi`` of ``ray`` with ``shape``, attached to both."""
+        pi = mi.PreliminaryIntersection3f(pi)
+        for kind in self._kinds:
+            kind.attach(pi, shape, ray, active)
+        return pi
+
+
+class EllipsoidTable:
+    """The ellipsoids of all shapes, one after the other."""
+
+    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
+        self._first = first
+        self._data = dr.concat([_floats(values["data"].read(shape)) for shape, values in shapes])
+        self._extents = dr.concat([_extents(shape, values) for shape, values in shapes])
+
+    def tables(self) -> list[Any]:
+        return [self._data, self._extents]
+
+    def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> None:
+        first = self._first.look_up(shape, active)
+        here = active & (first > 0)
+        number = first - 1 + pi.prim_index
+        n = [dr.gather(mi.Float, self._data, number * _ELLIPSOID + k, here) for k in range(_ELLIPSOID)]
+        size = dr.gather(mi.Float, self._extents, number, here)
+        axes = dr.select(here, mi.Vector3f(n[3], n[4], n[5]) * size, 1)
+        turn = dr.quat_to_matrix(mi.Matrix3f, mi.Quaternion4f(*n[6:])).T
+        p = dr.select(here, ray.o + ray.d * pi.t, 0)
+        local = mi.Vector3f(turn @ (p - mi.Point3f(*n[:3]))) / axes
+        towards = mi.Vector3f(turn @ dr.select(here, ray.d, 0)) / axes
+        # Along the ray, |local|^2 = 1.
+        rate = 2 * dr.detach(dr.dot(local, towards))
+        meets = here & (rate != 0)
+        t = pi.t - (dr.squared_norm(local) - 1) / dr.select(meets, rate, 1)
+        pi.t = dr.replace_grad(pi.t, dr.select(meets, t, 0))
+
+
+class CurveTable:
+    """The segments of all linear curves, one after the other.
+
+    A segment is what spheres around the points of a line cover, whose radius changes along the line. At a hit ``p`` the
+    place ``v`` is where ``|p - c(v)|^2 - r(v)^2`` is zero and least.
+    """
+
+    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
+        points = [_floats(values["control_points"].read(shape)) for shape, values in shapes]
+        segments = [mi.UInt32(values["segment_indices"].read(shape)) for shape, values in shapes]
+        self._first = first
+        self._points = dr.concat(points)
+        self._segments = dr.concat([s + n for s, n in zip(segments, _starts(points, _POINT), strict=True)])
+
+    def tables(self) -> list[Any]:
+        return [self._points]
+
+    def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> None:
+        first = self._first.look_up(shape, active)
+        here = active & (first > 0)
+        segment = dr.gather(mi.UInt32, self._segments, first - 1 + pi.prim_index, here)
+        a, b = (
+            [dr.gather(mi.Float, self._points, (segment + end) * _POINT + k, here) for k in range(_POINT)]
+            for end in (0, 1)
+        )
+        v = dr.detach(pi.prim_uv.x)
+        along, r_slope = mi.Vector3f(*b[:3]) - mi.Vector3f(*a[:3]), b[3] - a[3]
+        c, r = mi.Vector3f(*a[:3]) + along * v, a[3] + r_slope * v
+        o, d = dr.select(here, mi.Vector3f(ray.o), 0), dr.select(here, ray.d, 0)
+        off = o + d * pi.t - c
+        rate = 2 * dr.detach(dr.dot(off, d))
+        meets = here & (rate != 0)
+        step = -(dr.squared_norm(off) - dr.square(r)) / dr.select(meets, rate, 1)
+        pi.t = dr.replace_grad(pi.t, dr.select(meets, pi.t + step, 0))
+        # Half of the slope by v, at the point that has moved; at the round ends v stays.
+        half = dr.dot(off + d * dr.replace_grad(mi.Float(0), step), along) + r * r_slope
+        bend = dr.detach(dr.squared_norm(along) - dr.square(r_slope))
+        inside = meets & (v > 0) & (v < 1) & (bend > 0)
+        pi.prim_uv.x = dr.replace_grad(v, dr.select(inside, v + half / dr.select(inside, bend, 1), 0))
+
+
+def _floats(value: Any) -> Any:
+    """A parameter as a flat array; tensors hand theirs out."""
+    return mi.Float(value.array if dr.is_tensor_v(value) else value)
+
+
+def _starts(arrays: Sequence[Any], size: int) -> list[int]:
+    """Where the entries of each array begin, when they follow each other; ``size``: numbers per entry."""
+    starts = [0]
+    for array in arrays:
+        starts.append(starts[-1] + dr.width(array) // size)
+    return starts[:-1]
+
+
+def _extents(shape: Any, values: dict[str, Any]) -> Any:
+    """By how much the axes of each ellipsoid are stretched: Mitsuba clamps where an opacity has faded to 1 %."""
+    extent = values["extent"].read(shape)
+    if values["extent_adaptive_clamping"].read(shape):
+        return dr.sqrt(2 * dr.log(_floats(values["opacities"].read(shape)) / 0.01)) * extent / 3
+    return dr.full(mi.Float, extent, dr.width(_floats(values["data"].read(shape))) // _ELLIPSOID)

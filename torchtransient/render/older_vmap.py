@@ -1,0 +1,33 @@
+"""The batches of ``torch.autograd``, which are not those of ``torch.func``.
+
+``torch.autograd.functional.jacobian(vectorize=True)``, ``hessian(vectorize=True)`` and ``torch.autograd.grad(
+is_grads_batched=True)`` hand on cotangents and tangents of an older kind of batch, for which an autograd function has
+no rule of its own: its ``forward`` is called with the batch as one tensor, which has no memory that could be rendered
+from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+
+def each_of_older_vmap(function: Callable[..., tuple[torch.Tensor, ...]], *tensors: Any) -> tuple[torch.Tensor, ...]:
+    """``function`` of tensors or None, called once for every entry of such a batch; once where there is none."""
+    private: Any = torch
+    batched = [t is not None and torch._C._functorch.is_legacy_batchedtensor(t) for t in tensors]
+    if not any(batched):
+        return function(*tensors)
+    level = private._C._vmapmode_increment_nesting() - 1
+    private._C._vmapmode_decrement_nesting()
+    pairs = list(zip(tensors, batched, strict=True))
+    # A tensor that is no batch of this level, but of one around it, is repeated as often as it is told.
+    size = max(private._remove_batch_dim(t, level, 1, 0).shape[0] for t, is_batch in pairs if is_batch)
+    opened = [private._remove_batch_dim(t, level, size, 0) if is_batch else None for t, is_batch in pairs]
+    columns = [
+        each_of_older_vmap(function, *(t if new is None else new[i] for t, new in zip(tensors, opened, strict=True)))
+        for i in range(size)
+    ]
+    return tuple(private._add_batch_dim(torch.stack(column), 0, level) for column in zip(*columns, strict=True))

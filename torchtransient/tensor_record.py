@@ -1,0 +1,236 @@
+"""Results as torch knows them: moved, detached, put into batches, taken apart and put together.
+
+A record is a dataclass with tensors among its fields. ``torch.utils._pytree``, on which ``torch.func``, DDP and FSDP
+rest, sees its tensors; ``torch.utils.data.default_collate`` stacks records as it stacks dictionaries.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch.utils import _pytree
+from torch.utils.data._utils.collate import collate, default_collate_fn_map
+
+from torchtransient.errors import ShapeError
+
+
+@dataclass(frozen=True)
+class TensorRecord:
+    """Base of a frozen dataclass whose fields, and the entries of whose ``others``, are tensors, settings or None.
+
+    ``notes``: fields that say how the record was made. They do not tell records apart, and become those of a batch by
+    :meth:`merged_notes`. All other settings must agree in a batch.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        _pytree.register_pytree_node(cls, _taken_apart, _put_together, flatten_with_keys_fn=_taken_apart_with_keys)
+        default_collate_fn_map[cls] = _collated
+
+    # ------------------------------------------------------------------------------------------------------ as torch
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """The tensors by name, those of ``others`` too."""
+        return {name: value for name, value in self._entries().items() if isinstance(value, torch.Tensor)}
+
+    def map(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Self:
+        """A copy in which every tensor is ``function`` of what it was."""
+        return self._with({name: function(tensor) for name, tensor in self.tensors().items()})
+
+    def to(self, *args: Any, **keywords: Any) -> Self:
+        """Every tensor through its ``to``. As in modules, a dtype is for real numbers; complex tensors take the complex
+        one of its precision, and whole numbers and truth values stay what they are.
+        """
+
+        def moved(tensor: torch.Tensor) -> torch.Tensor:
+            values = [_dtype_for(tensor, value) for value in args]
+            named = {name: _dtype_for(tensor, value) for name, value in keywords.items()}
+            return tensor.to(*values, **named)
+
+        return self.map(moved)
+
+    def cpu(self) -> Self:
+        """``to("cpu")``."""
+        return self.to("cpu")
+
+    def cuda(self, device: Any = None) -> Self:
+        """``to("cuda")``, or to the device of that number."""
+        return self.map(lambda tensor: tensor.cuda(device))
+
+    def detach(self) -> Self:
+        """Without gradients."""
+        return self.map(torch.Tensor.detach)
+
+    def clone(self) -> Self:
+        """In memory of its own, in torch's order."""
+        return self.map(lambda tensor: tensor.clone(memory_format=torch.contiguous_format))
+
+    def pin_memory(self) -> Self:
+        """In pinned memory, as ``DataLoader(pin_memory=True)`` asks for."""
+        return self.map(torch.Tensor.pin_memory)
+
+    @classmethod
+    def stack(cls, records: Sequence[Self]) -> Self:
+        """Records as one with a new leading dimension, as ``torch.stack``. Raises ``ShapeError`` where their settings
+        or shapes differ.
+        """
+        return cls._joined(records, lambda tensors: torch.stack(list(tensors)))
+
+    @classmethod
+    def cat(cls, records: Sequence[Self]) -> Self:
+        """Records with a leading dimension, one behind another along it, as ``torch.cat``. Raises as :meth:`stack`."""
+        return cls._joined(records, lambda tensors: torch.cat(list(tensors)))
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[Self]) -> dict[str, Any]:
+        """The ``notes`` of a batch. Raises ``ShapeError`` for records that were not made alike."""
+        return {}
+
+    @classmethod
+    def _joined(cls, records: Sequence[Self], join: Callable[[Sequence[torch.Tensor]], torch.Tensor]) -> Self:
+        if len(records) == 0:
+            raise ShapeError(f"a batch of {cls.__name__}: expected at least one, got none.")
+        first = records[0]
+        for other in records[1:]:
+            for (name, a), b in zip(first._settings().items(), other._settings().values(), strict=True):
+                if a != b:
+                    raise ShapeError(
+                        f"a batch of {cls.__name__}: expected the same {name} in all of them, got {a} and {b}. Put "
+                        "together the tensors alone, or records that mean the same."
+                    )
+        tensors = {}
+        for name in first.tensors():
+            shapes = [tuple(record.tensors()[name].shape) for record in records]
+            try:
+                tensors[name] = join([record.tensors()[name] for record in records])
+            except RuntimeError as error:
+                found = ", ".join(map(str, dict.fromkeys(shapes)))
+                raise ShapeError(
+                    f"a batch of {cls.__name__}: {name} cannot be put together, got {found}: {error}"
+                ) from error
+        return first._with(tensors | cls.merged_notes(records))
+
+    # -------------------------------------------------------------------------------------------------- taking apart
+
+    def _entries(self) -> dict[str, Any]:
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**found, **found.pop("others", {})}
+
+    def _settings(self) -> dict[str, Any]:
+        """What must agree in a batch: everything but tensors, of which there must be the same ones, and notes."""
+        return {
+            "tensors": tuple(self.tensors()),
+            **{
+                name: value
+                for name, value in self._entries().items()
+                if not isinstance(value, torch.Tensor) and name not in self.notes
+            },
+        }
+
+    def _with(self, entries: Mapping[str, Any]) -> Self:
+        """A copy with some entries replaced."""
+        others: Mapping[str, Any] = getattr(self, "others", {})
+        changes = {name: value for name, value in entries.items() if name not in others}
+        if others:
+            changes["others"] = {name: entries.get(name, value) for name, value in others.items()}
+        return replace(self, **changes)
+
+    # -------------------------------------------------------------------------------------------------------- shown
+
+    def _shown(self) -> dict[str, str]:
+        """What is shown, by name: a line for each tensor and for each setting that is there."""
+        shown = {name: _described(tensor) for name, tensor in self.tensors().items()}
+        for name, value in self._entries().items():
+            if name not in shown and name not in self.notes and value not in (None, (), {}):
+                shown[name] = "/".join(value) if name == "channels" else _short(value)
+        return {**shown, **self._shown_notes()}
+
+    def _shown_notes(self) -> dict[str, str]:
+        return {}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={text}' for name, text in self._shown().items())})"
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+            f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+            for name, text in self._shown().items()
+        )
+        return f"<table><caption>{html.escape(type(self).__name__)}</caption>{rows}</table>"
+
+
+def _described(tensor: torch.Tensor) -> str:
+    kind = str(tensor.dtype).removeprefix("torch.")
+    where = "" if tensor.device.type == "cpu" else f" on {tensor.device}"
+    return f"{kind} {tuple(tensor.shape)}{where}{', with gradient' if tensor.requires_grad else ''}"
+
+
+def _short(value: Any) -> str:
+    text = f"{len(value)} of them" if isinstance(value, tuple) and len(value) > 4 else str(value)
+    return text if len(text) <= 100 else text[:97] + "..."
+
+
+def _dtype_for(tensor: torch.Tensor, value: Any) -> Any:
+    if not isinstance(value, torch.dtype):
+        return value
+    if tensor.is_complex():
+        return value if value.is_complex else value.to_complex()
+    return value if tensor.is_floating_point() else tensor.dtype
+
+
+class _Rest:
+    """What is left of a record without its tensors. Equal where the settings are, however the records were made."""
+
+    def __init__(self, record: TensorRecord):
+        self.names = _leaves_of(record)
+        self.record = record._with(dict.fromkeys(self.names))
+        settings = self.record._settings()
+        self._settings = {"class": type(record), **settings, "tensors": tuple(self.names)}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Rest) and self._settings == other._settings
+
+    def __hash__(self) -> int:
+        return hash((self._settings["class"], *self.names))
+
+
+def _leaves_of(record: TensorRecord) -> list[str]:
+    """Names of what a tree takes out of a record: its tensors, or what another tree has put in their places."""
+    found: list[str] | None = record.__dict__.get("_leaves")
+    return list(record.tensors()) if found is None else found
+
+
+def _taken_apart(record: TensorRecord) -> tuple[list[Any], _Rest]:
+    entries, rest = record._entries(), _Rest(record)
+    return [entries[name] for name in rest.names], rest
+
+
+def _taken_apart_with_keys(record: TensorRecord) -> tuple[list[Any], _Rest]:
+    leaves, rest = _taken_apart(record)
+    return [(_pytree.GetAttrKey(name), leaf) for name, leaf in zip(rest.names, leaves, strict=True)], rest
+
+
+def _put_together(leaves: Any, rest: _Rest) -> Any:
+    given = dict(zip(rest.names, leaves, strict=True))
+    record = rest.record._with(given)
+    if not all(isinstance(leaf, torch.Tensor) for leaf in given.values()):
+        # Trees carry anything: dimensions, names, objects that stand for tensors.
+        object.__setattr__(record, "_leaves", rest.names)
+    return record
+
+
+def _collated(batch: Any, *, collate_fn_map: Any = None) -> Any:
+    def join(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
+        # Torch's own way: in a worker process the batch is made in shared memory.
+        together: torch.Tensor = collate(list(tensors), collate_fn_map=collate_fn_map)
+        return together
+
+    return type(batch[0])._joined(batch, join)
