@@ -16,7 +16,9 @@ import torch
 import torchtransient as tt
 from torchtransient.plugins import _registry
 from torchtransient.plugins.swept_parameters import FILE, is_checked
+from torchtransient.testing.every_plugin import every_plugin
 from torchtransient.testing.gradient_sweep import compare, runner
+from torchtransient.testing.gradient_sweep.bsdfs import HOLDERS
 from torchtransient.testing.gradient_sweep.compare import QUICK, Runs, judge
 from torchtransient.testing.gradient_sweep.measure import Subject, Tangent, tangents_of
 from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, swept
@@ -42,10 +44,10 @@ BY_ANOTHER_NAME = {"srgb", "merge"}
 
 def plugins_in(description):
     """The types of a description and of what it holds."""
-    if isinstance(description, dict):
-        if "type" in description:
-            yield description["type"]
-        for value in description.values():
+    if isinstance(description, dict) and "type" in description:
+        yield description["type"]
+    if isinstance(description, dict | list):
+        for value in description.values() if isinstance(description, dict) else description:
             yield from plugins_in(value)
 
 
@@ -65,10 +67,13 @@ def rows():
 def test_no_plugin_is_forgotten(folder):
     """Of Mitsuba, a later one that brings more too, and of this library."""
     installed = {path.stem for path in (Path(mi.__file__).parent / "plugins").glob("*.so")}
+    mi.set_variant("llvm_ad_rgb")
     kinds = ("bsdf", "emitter", "medium", "phase", "sensor", "shape", "texture")
     ours = {name for module in _registry.PLUGIN_MODULES for kind, name in module.plugins if kind in kinds}
     met = {plugin for setting in SETTINGS.values() for plugin in plugins_in(setting.make(folder))}
-    missing = installed | ours
+    described = set(plugins_in(list(every_plugin(folder).values())))
+    assert ours - described == set()
+    missing = installed | ours | described
     assert missing - met - NO_PART_OF_A_SCENE - NOT_SWEPT - BY_ANOTHER_NAME == set()
 
 
@@ -79,6 +84,7 @@ def test_every_surface_is_nested_in_every_holder():
             inside.setdefault(setting.plugin, set()).add(setting.inside)
     assert inside["diffuse"] == {"", "mask", "blendbsdf", "bumpmap", "normalmap", "twosided", "instance"}
     assert inside["dielectric"] == inside["diffuse"] - {"twosided"}
+    assert inside["mask"] == set(HOLDERS) - {"twosided"} and inside["bumpmap"] == set(HOLDERS)
 
 
 def offered(setting, folder):
@@ -188,6 +194,12 @@ def test_directions():
     assert isinstance(first, Tangent) and torch.equal(first.direction, again.direction)
     assert first.direction.square().mean().sqrt() == pytest.approx(0.5)
     assert len(tangents_of("lamp.position", "vector", torch.zeros(3))) == 2
+
+
+@pytest.mark.parametrize(("value", "sign"), [(0.0, 1), (1.0, -1)])
+def test_directions_lead_inwards(value, sign):
+    (tangent,) = tangents_of("plate.bsdf.opacity.value", "number", torch.tensor(value))
+    assert tangent.one_sided and float(tangent.direction) == sign
 
 
 # ----------------------------------------------------------------------------------------------------- the sweep itself

@@ -80,6 +80,7 @@ def surfaces() -> dict[str, Surface]:
         "plastic": one("plastic", PLASTIC, polarizes=True),
         "plastic (nonlinear)": one("plastic", {**PLASTIC, "nonlinear": True}),
         "roughplastic": one("roughplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
+        "diff_rough_plastic": one("diff_rough_plastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "pplastic": one("pplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}, grazing=True),
         "principled (without lobes)": one(
@@ -110,6 +111,35 @@ def surfaces() -> dict[str, Surface]:
         "delayed (elastic part)": Surface(
             lambda: late() | {"elastic": {"type": "conductor", **METAL}}, outermost=True
         ),
+        **at_the_ends(),
+    }  # fmt: skip
+
+
+def at_the_ends() -> dict[str, Surface]:
+    """Surfaces with a number at the end of its range, where a part of them is never chosen."""
+    mirror = {"type": "conductor", **METAL}
+
+    def alone(make: Callable[[], Description]) -> Surface:
+        return Surface(make, bare_only=True)
+
+    return {
+        "mask (opacity 0)": alone(lambda: mask(matte()) | {"opacity": 0.0}),
+        "mask (opacity 1)": alone(lambda: mask(mirror) | {"opacity": 1.0}),
+        "blendbsdf (weight 0)": alone(lambda: blend(mirror) | {"weight": 0.0}),
+        "blendbsdf (weight 1)": alone(lambda: blend(mirror) | {"weight": 1.0}),
+        "diffuse (black)": alone(lambda: matte(0.0)),
+        "roughplastic (black lobes)": alone(
+            lambda: {"type": "roughplastic", **PLASTIC, "alpha": 0.3, "specular_reflectance": 0.0}
+        ),
+        "dielectric (black transmission)": alone(
+            lambda: {"type": "dielectric", **GLASS, "specular_transmittance": 0.0}
+        ),
+        "thindielectric (black reflection)": alone(
+            lambda: {"type": "thindielectric", **GLASS, "specular_reflectance": 0.0}
+        ),
+        "twosided (two faces)": alone(
+            lambda: {"type": "twosided", "front": matte(), "back": {"type": "roughconductor", **METAL, "alpha": 0.3}}
+        ),
     }  # fmt: skip
 
 
@@ -121,10 +151,6 @@ def blend(inner: Description) -> Description:
     """With paint; paint with a mirror."""
     other = {"type": "conductor", **METAL} if inner["type"] == "diffuse" else matte(0.4)
     return {"type": "blendbsdf", "weight": 0.4, "a": inner, "b": other}
-
-
-def blend_with_mirror(inner: Description) -> Description:
-    return {"type": "blendbsdf", "weight": 0.6, "a": {"type": "conductor", **METAL}, "b": inner}
 
 
 def bump(inner: Description) -> Description:
@@ -146,3 +172,12 @@ HOLDERS: dict[str, Callable[[Description], Description]] = {
     "normalmap": normal_map,
     "twosided": two_sided,
 }
+
+
+def holders() -> dict[str, Surface]:
+    """Every BSDF that holds others, around a mirror, to be held in turn."""
+    mirror = {"type": "conductor", **METAL}
+    return {
+        name: Surface(lambda wrap=wrap: wrap(mirror), transmits=name == "mask", outermost=name == "twosided")
+        for name, wrap in HOLDERS.items()
+    }

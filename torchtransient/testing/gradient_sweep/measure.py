@@ -33,7 +33,7 @@ STOKES = (0.2, 1.0, -0.7, 1.3)
 @dataclass(frozen=True)
 class Tangent:
     """A direction in the entries of a parameter. ``step``: of the differences, in units of the direction's length.
-    ``one_sided``: the parameter is at the lower end of its range.
+    ``one_sided``: the parameter is at an end of its range, and the direction leads inwards.
     """
 
     name: str
@@ -134,6 +134,8 @@ _FIXED_AXES = ("SDFGrid.to_world",)
 # Numbers that may be negative; of all others zero is the least.
 _SIGNED = ("g", "theta", "delta", "scale_tilt", *_SIZES)
 _PLACES = ("position", "sun_direction")
+# Shares, of which one is the largest.
+_SHARES = ("opacity", "weight")
 
 
 def generator_of(key: str) -> np.random.Generator:
@@ -164,8 +166,11 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True, mo
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
     direction *= size / np.sqrt(np.mean(direction**2))
     words = "relative change" if value.numel() == 1 else "random"
-    at_zero = not value.any() and name not in _SIGNED
-    return [Tangent(f"{words}, from zero" if at_zero else words, _tensor(direction), step, at_zero)]
+    if not value.any() and name not in _SIGNED:
+        return [Tangent(f"{words}, from zero", _tensor(direction), step, True)]
+    if bool((value == 1).all()) and any(share in key.split(".") for share in _SHARES):
+        return [Tangent(f"{words}, down from one", _tensor(-direction), step, True)]
+    return [Tangent(words, _tensor(direction), step)]
 
 
 def _tensor(array: Array) -> torch.Tensor:

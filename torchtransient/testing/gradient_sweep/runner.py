@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -27,7 +28,7 @@ SILENCE = 1800.0
 
 
 class ResultFile:
-    """JSON lines: results, and a line ``{"done": setting}`` behind the last one of each setting."""
+    """JSON lines: results, and a line ``{"done": setting}`` behind the last one of each setting, with its time."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -134,10 +135,12 @@ def work(quick: bool) -> None:
     sys.stdout = sys.stderr  # what others print must not come between the lines
     with tempfile.TemporaryDirectory() as folder:
         for name in sys.stdin.read().splitlines():
+            started, computed = time.monotonic(), time.process_time()
             try:
                 for result in results_of(by_name[name], Path(folder), QUICK if quick else Effort()):
                     print(json.dumps(result.as_dict()), file=output, flush=True)
             except Exception as error:  # noqa: BLE001  a scene that cannot be built is a result
                 failed = Result(name, "", "", "error", note=f"{type(error).__name__}: {error}")
                 print(json.dumps(failed.as_dict()), file=output, flush=True)
-            print(json.dumps({"done": name}), file=output, flush=True)
+            took = {"seconds": time.monotonic() - started, "cpu_seconds": time.process_time() - computed}
+            print(json.dumps({"done": name, **took}), file=output, flush=True)

@@ -67,6 +67,10 @@ def bsdf_settings() -> Iterator[Setting]:
                     "bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make()), s.grazing), PLATE
                 )
         yield Setting("bsdf", name, "instance", lambda _, s=surface: in_a_group(s.make(), None, s.grazing), GROUP)
+    for name, surface in bsdfs.holders().items():
+        for holder, wrap in bsdfs.HOLDERS.items():
+            if not (surface.outermost or (holder == "twosided" and surface.transmits)):
+                yield Setting("bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make())), PLATE)
 
 
 def shape_settings() -> Iterator[Setting]:
@@ -104,9 +108,20 @@ def emitter_settings() -> Iterator[Setting]:
             yield Setting(
                 "emitter", name, shape, lambda folder, e=light, m=make: lit_by(m(folder) | {"emitter": e()}), LAMP
             )
+    for name in lights.area_emitters():
+        yield Setting("emitter", name, "small sphere", lambda _, n=name: _small_lamp(n), LAMP)
     for name in ("area", "directionalarea"):
         yield Setting("emitter", name, "rectangle, textured", lambda folder, n=name: _picture_lamp(folder, n), LAMP)
-    yield Setting("emitter", "area", "ply, textured", lambda folder: _picture_lamp(folder, "area", "ply"), LAMP)
+    for shape in ("ply", "sphere"):
+        yield Setting(
+            "emitter", "area", f"{shape}, textured", lambda folder, s=shape: _picture_lamp(folder, "area", s), LAMP
+        )
+
+
+def _small_lamp(emitter: str) -> Description:
+    """A millimetre, as bright as the larger lamps."""
+    light = lights.area_emitters()[emitter]() | {"radiance": bsdfs.rgb(9e4, 8e4, 7e4)}
+    return lit_by({"type": "sphere", "center": [0.8, 0.3, 2.5], "radius": 0.001, "emitter": light})
 
 
 def _picture_lamp(folder: Path, emitter: str, shape: str = "rectangle") -> Description:
