@@ -18,7 +18,8 @@ TEXELS = 16
 class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
     be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be
-    swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles.
+    swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles. ``only``: the beginning of
+    the names of its parameters that matter.
     """
 
     make: Callable[[], Description]
@@ -27,6 +28,7 @@ class Surface:
     bare_only: bool = False
     polarizes: bool = False
     grazing: bool = False
+    only: str = ""
 
 
 def picture(channels: int = 3, low: float = 0.3, high: float = 0.7, seed: int = 5) -> Description:
@@ -119,28 +121,25 @@ def at_the_ends() -> dict[str, Surface]:
     """Surfaces with a number at the end of its range, where a part of them is never chosen."""
     mirror = {"type": "conductor", **METAL}
 
-    def alone(make: Callable[[], Description]) -> Surface:
-        return Surface(make, bare_only=True)
+    def alone(make: Callable[[], Description], only: str) -> Surface:
+        return Surface(make, bare_only=True, only=only)
 
+    metal = {"type": "roughconductor", **METAL, "alpha": 0.3}
+    rough_plastic = {"type": "roughplastic", **PLASTIC, "alpha": 0.3}
+    thin_glass = {"type": "thindielectric", **GLASS}
+    two_faces = {"type": "twosided", "front": matte(), "back": metal}
     return {
-        "mask (opacity 0)": alone(lambda: mask(matte()) | {"opacity": 0.0}),
-        "mask (opacity 1)": alone(lambda: mask(mirror) | {"opacity": 1.0}),
-        "blendbsdf (weight 0)": alone(lambda: blend(mirror) | {"weight": 0.0}),
-        "blendbsdf (weight 1)": alone(lambda: blend(mirror) | {"weight": 1.0}),
-        "diffuse (black)": alone(lambda: matte(0.0)),
-        "roughplastic (black lobes)": alone(
-            lambda: {"type": "roughplastic", **PLASTIC, "alpha": 0.3, "specular_reflectance": 0.0}
-        ),
-        "dielectric (black transmission)": alone(
-            lambda: {"type": "dielectric", **GLASS, "specular_transmittance": 0.0}
-        ),
-        "thindielectric (black reflection)": alone(
-            lambda: {"type": "thindielectric", **GLASS, "specular_reflectance": 0.0}
-        ),
-        "twosided (two faces)": alone(
-            lambda: {"type": "twosided", "front": matte(), "back": {"type": "roughconductor", **METAL, "alpha": 0.3}}
-        ),
-    }  # fmt: skip
+        "mask (opacity 0)": alone(lambda: mask(matte()) | {"opacity": 0.0}, "opacity"),
+        "mask (opacity 1)": alone(lambda: mask(mirror) | {"opacity": 1.0}, "opacity"),
+        "blendbsdf (weight 0)": alone(lambda: blend(mirror) | {"weight": 0.0}, "weight"),
+        "blendbsdf (weight 1)": alone(lambda: blend(mirror) | {"weight": 1.0}, "weight"),
+        "diffuse (black)": alone(lambda: matte(0.0), "reflectance"),
+        "roughplastic (black coat)": alone(lambda: rough_plastic | {"specular_reflectance": 0.0}, "specular"),
+        "roughplastic (black base)": alone(lambda: rough_plastic | {"diffuse_reflectance": 0.0}, "diffuse"),
+        "dielectric (black)": alone(lambda: {"type": "dielectric", **GLASS, "specular_transmittance": 0.0}, "specular"),
+        "thindielectric (black)": alone(lambda: thin_glass | {"specular_reflectance": 0.0}, "specular"),
+        "twosided (two faces)": alone(lambda: mask(two_faces), ""),
+    }
 
 
 def mask(inner: Description) -> Description:

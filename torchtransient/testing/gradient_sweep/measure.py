@@ -17,7 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.render.build import BuildOptions
-from torchtransient.render.engine import Item, RenderJob, jvp, primal, vjp
+from torchtransient.render.engine import RenderJob, jvp, primal, vjp
+from torchtransient.render.physics import PhysicsWatch
+from torchtransient.render.seeds import Item, Seeding
 from torchtransient.render.variant import active_variant
 
 if TYPE_CHECKING:
@@ -58,9 +60,18 @@ class Subject:
             self.pixels = int(np.prod(sensors[0].film().crop_size()))
 
     def _job(self, seed: int, spp: int, derivative: bool) -> RenderJob:
-        items = (Item(0, 0, seed, seed),)
         return RenderJob(
-            self.scene, self.options, (self.key,), items, (False,), spp, spp, None, (True,) if derivative else ()
+            scene=self.scene,
+            options=self.options,
+            keys=(self.key,),
+            items=(Item(0, 0, seed, seed),),
+            seeding=Seeding((0,), 1, "same"),
+            batched=(False,),
+            spp=spp,
+            spp_grad=spp,
+            temporal_filter=None,
+            watch=PhysicsWatch("ignore", set()),
+            needs=(True,) if derivative else (),
         )
 
     def losses(self, value: torch.Tensor, seed: int, spp: int) -> tuple[float, float]:

@@ -20,6 +20,8 @@ from torchtransient.testing.gradient_sweep.stages import (
 RGB, SPECTRAL, POLARIZED = "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"
 GROUP = ("group.", "copy.")
 PLATE, LAMP, SENSOR, MEDIUM = ("plate.",), ("lamp.",), ("sensor.",), ("slab.interior_medium.",)
+# Mitsuba paints a lamp without a surface black; of it one sees what it emits.
+PAINT_OF_LAMPS = ("lamp.bsdf.",)
 # What a plugin is inside of that cannot stand alone.
 BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinction", "constvolume as albedo")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
@@ -37,6 +39,8 @@ class Setting:
     make: Callable[[Path], Description]
     keys: tuple[str, ...]
     variant: str = RGB
+    # Beginnings of keys that mean nothing there.
+    without: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -51,14 +55,15 @@ class Setting:
 
     def takes(self, key: str) -> bool:
         """Whether a parameter is to be looked at."""
-        return key.startswith(self.keys)
+        return key.startswith(self.keys) and not key.startswith(self.without)
 
 
 def bsdf_settings() -> Iterator[Setting]:
     """Surfaces, bare and in others."""
     for name, surface in bsdfs.surfaces().items():
         for variant in (RGB, POLARIZED) if surface.polarizes else (RGB,):
-            yield Setting("bsdf", name, "", lambda _, s=surface: between_lights(s.make(), s.grazing), PLATE, variant)
+            keys = (f"plate.bsdf.{surface.only}",) if surface.only else PLATE
+            yield Setting("bsdf", name, "", lambda _, s=surface: between_lights(s.make(), s.grazing), keys, variant)
         if surface.bare_only:
             continue
         for holder, wrap in bsdfs.HOLDERS.items():
@@ -106,16 +111,19 @@ def emitter_settings() -> Iterator[Setting]:
     for name, light in lights.area_emitters().items():
         for shape, make in shapes.lamp_shapes().items():
             yield Setting(
-                "emitter", name, shape, lambda folder, e=light, m=make: lit_by(m(folder) | {"emitter": e()}), LAMP
+                "emitter",
+                name,
+                shape,
+                lambda folder, e=light, m=make: lit_by(m(folder) | {"emitter": e()}),
+                LAMP,
+                without=PAINT_OF_LAMPS,
             )
     for name in lights.area_emitters():
-        yield Setting("emitter", name, "small sphere", lambda _, n=name: _small_lamp(n), LAMP)
+        yield Setting("emitter", name, "small sphere", lambda _, n=name: _small_lamp(n), LAMP, without=PAINT_OF_LAMPS)
     for name in ("area", "directionalarea"):
-        yield Setting("emitter", name, "rectangle, textured", lambda folder, n=name: _picture_lamp(folder, n), LAMP)
-    for shape in ("ply", "sphere"):
-        yield Setting(
-            "emitter", "area", f"{shape}, textured", lambda folder, s=shape: _picture_lamp(folder, "area", s), LAMP
-        )
+        for shape in ("rectangle", "ply", "sphere") if name == "area" else ("rectangle",):
+            make = lambda folder, n=name, s=shape: _picture_lamp(folder, n, s)  # noqa: E731
+            yield Setting("emitter", name, f"{shape}, textured", make, LAMP, without=PAINT_OF_LAMPS)
 
 
 def _small_lamp(emitter: str) -> Description:
@@ -124,7 +132,7 @@ def _small_lamp(emitter: str) -> Description:
     return lit_by({"type": "sphere", "center": [0.8, 0.3, 2.5], "radius": 0.001, "emitter": light})
 
 
-def _picture_lamp(folder: Path, emitter: str, shape: str = "rectangle") -> Description:
+def _picture_lamp(folder: Path, emitter: str, shape: str) -> Description:
     light = {"type": emitter, "radiance": bsdfs.picture(3, 5.0, 9.0)}
     return lit_by(shapes.lamp_shapes()[shape](folder) | {"emitter": light})
 
