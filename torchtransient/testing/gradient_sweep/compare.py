@@ -31,8 +31,8 @@ CONFIRMING_SEEDS = 12
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done for one parameter: seconds for one direction, seeds and samples per pixel to begin with, at
-    most so many directions.
+    """How much is done for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
+    begin with, at most so many directions.
     """
 
     seconds: float = 30.0
@@ -134,16 +134,16 @@ def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float)
 
 def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int]:
     """More and more samples, until errors are small or time is over."""
-    deadline = time.monotonic() + effort.seconds
+    deadline = time.process_time() + effort.seconds
     spp = effort.spp * max(1, FILM // subject.pixels)
     while True:
-        started = time.monotonic()
+        started = time.process_time()
         runs = run(subject, tangent, range(effort.seeds), spp, tangent.step)
-        lasted = time.monotonic() - started
+        lasted = time.process_time() - started
         if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED or runs.is_nothing:
             return runs, spp
         factor = 2 ** int(np.ceil(np.log2(min(max(1.5 * (runs.worst_error / RESOLVED) ** 2, 2), 16))))
-        if spp * factor * subject.pixels > MOST_PATHS or time.monotonic() + 0.5 * lasted * factor > deadline:
+        if spp * factor * subject.pixels > MOST_PATHS or time.process_time() + 0.5 * lasted * factor > deadline:
             return runs, spp
         spp *= factor
 
@@ -168,7 +168,7 @@ def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, 
 
 def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
     """Compare the derivative of a parameter along a direction with finite differences."""
-    started = time.monotonic()
+    started = time.process_time()
     runs, spp = resolved_runs(subject, tangent, effort)
     note = ""
     if runs.contradicts and not (effort is QUICK and subject.info.biased):
@@ -186,7 +186,7 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
         differences_error=runs.error_of(runs.differences),
         scale=runs.scale,
         spp=spp,
-        seconds=time.monotonic() - started,
+        seconds=time.process_time() - started,
         note=note,
     )
 
