@@ -112,6 +112,9 @@ POLARIZED_PLUGINS = {
     **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
     "roughdielectric": "diff_rough_dielectric",
 }
+# These stand in for Mitsuba's always, which lack methods that every plugin of their kind may be asked for:
+# `eval_direction` of a `directionalarea`, which raises while kernels are traced, for the other lights of a scene too.
+COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea"}
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights
 
@@ -137,6 +140,11 @@ def samples_its_shape(emitter: Any) -> bool:
     point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
     """
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
+
+
+def is_dark(emitter: Any) -> bool:
+    """Whether no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
+    return bool(emitter.class_name() == "DirectionalArea" or getattr(emitter, "stays_dark", False))
 
 
 def leaves_hits_detached(shape: Any) -> bool:

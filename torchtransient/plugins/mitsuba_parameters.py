@@ -8,7 +8,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, SKIPPED_AT, is_bump_map, normal_texture
+from torchtransient.plugins.mitsuba_compat import (
+    DIFFERENTIABLE_PLUGINS,
+    SKIPPED_AT,
+    is_bump_map,
+    is_dark,
+    normal_texture,
+)
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.parameter_effect import (
     ANY_KEY,
@@ -58,6 +64,10 @@ COATING = ParameterEffect(
 SKIPPED = ParameterEffect(
     biased=True,
     reason="biased: Mitsuba skips a lobe whose weight is exactly zero, and its derivative with it; start from 1e-6",
+)
+DARK = ParameterEffect(
+    supported=False,
+    reason="directionalarea shines in one direction, which no path from the sensor meets: it stays dark",
 )
 # Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
 _EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
@@ -174,9 +184,17 @@ def _skips_a_lobe(site: Site) -> bool:
     return any(bool(dr.any(entries == value, axis=None)) for value in values)
 
 
+def _is_of_a_dark_light(site: Site) -> bool:
+    """Whether a texture is that of lights that stay dark, and of nothing else."""
+    kinds = (mi.BSDF, mi.Emitter, mi.Medium)
+    holders = [holder for holder, _ in site.owners if isinstance(holder, kinds)]
+    return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
+
+
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
+OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
 AT_ZERO = Row(SKIPPED, _skips_a_lobe, "the weight of a lobe of principled or principledthin, where a lobe vanishes")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
@@ -233,7 +251,7 @@ declare_effects("ThinDielectric", {"eta": VALUE})
 declare_effects("Hair", {"eta": VALUE})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO)})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, AT_ZERO, OF_A_DARK_LIGHT)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

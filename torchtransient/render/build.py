@@ -17,7 +17,7 @@ from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.described_scene import check_scene
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
+from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS, DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
@@ -304,7 +304,9 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
 
 
 def _substitute_plugins(state: Any, options: BuildOptions) -> None:
-    """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
+    """Build plugins as their differentiable or complete twins, which take the same parameters, and bitmaps with a
+    derivative.
+    """
     import mitsuba as mi
 
     for node in state.nodes:
@@ -313,6 +315,8 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
         elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
+        elif plugin in COMPLETED_PLUGINS:
+            node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"
 
