@@ -171,7 +171,7 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
     started = time.process_time()
     runs, spp = resolved_runs(subject, tangent, effort)
     note = ""
-    if runs.contradicts and not (effort is QUICK and subject.info.biased):
+    if runs.contradicts and not subject.info.biased:
         runs, note = confirmed_runs(subject, tangent, spp)
     forward, reverse = subject.forward(tangent.direction, runs.first_seed, spp), float(runs.reverse[0])
     return Result(
