@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
     be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be
     swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles. ``only``: the beginning of
-    the names of its parameters that matter.
+    the names of its parameters that matter; ``without``: of those that do not.
     """
 
     make: Callable[[], Description]
@@ -29,6 +30,7 @@ class Surface:
     polarizes: bool = False
     grazing: bool = False
     only: str = ""
+    without: tuple[str, ...] = ()
 
 
 def picture(channels: int = 3, low: float = 0.3, high: float = 0.7, seed: int = 5) -> Description:
@@ -67,7 +69,7 @@ def late() -> Description:
 def surfaces() -> dict[str, Surface]:
     """Every BSDF that holds no other, by the name of its plugin; a word behind the name for what it is made of."""
 
-    def one(plugin: str, properties: Description, **marks: bool) -> Surface:
+    def one(plugin: str, properties: Description, **marks: Any) -> Surface:
         return Surface(lambda: {"type": plugin, **properties}, **marks)
 
     thin = {"transmits": True, "polarizes": True}
@@ -86,7 +88,11 @@ def surfaces() -> dict[str, Surface]:
         "pplastic": one("pplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}, grazing=True),
         "principled (without lobes)": one(
-            "principled", {"roughness": 0.5, "specular": 0.6}, bare_only=True, grazing=True
+            "principled",
+            {"base_color": rgb(0.5, 0.4, 0.3), "roughness": 0.5, "specular": 0.6},
+            bare_only=True,
+            grazing=True,
+            without=("clearcoat_gloss", "sheen_tint"),
         ),
         "principled (transmitting)": one(
             "principled", {**PRINCIPLED, **COATED, "spec_trans": 0.6, "eta": 1.4}, transmits=True, grazing=True

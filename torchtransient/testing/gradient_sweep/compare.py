@@ -26,6 +26,8 @@ FILM = 16
 MOST_PATHS = 2**21
 # How often a step is halved when its length makes a difference.
 SHORTER_STEPS = 4
+# How many times as long a step may become where it lessens the noise.
+LONGER_STEPS = 4.0
 CONFIRMING_SEEDS = 12
 
 
@@ -35,7 +37,7 @@ class Effort:
     begin with, at most so many directions.
     """
 
-    seconds: float = 30.0
+    seconds: float = 45.0
     seeds: int = 6
     spp: int = 2048
     directions: int = 2
@@ -132,20 +134,28 @@ def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float)
     return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)), seeds[0])
 
 
-def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int]:
-    """More and more samples, until errors are small or time is over."""
+def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int, Tangent]:
+    """More and more samples, and longer steps where it is the differences that are noisy, until errors are small or
+    time is over. Returns the samples per pixel and the tangent with its step, too.
+    """
     deadline = time.process_time() + effort.seconds
-    spp = effort.spp * max(1, FILM // subject.pixels)
+    spp, longest = effort.spp * max(1, FILM // subject.pixels), LONGER_STEPS * tangent.step
     while True:
         started = time.process_time()
         runs = run(subject, tangent, range(effort.seeds), spp, tangent.step)
         lasted = time.process_time() - started
         if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED or runs.is_nothing:
-            return runs, spp
-        factor = 2 ** int(np.ceil(np.log2(min(max(1.5 * (runs.worst_error / RESOLVED) ** 2, 2), 16))))
+            return runs, spp, tangent
+        needed = 1.5 * (runs.worst_error / RESOLVED) ** 2
+        noisy = runs.error_of(runs.differences) > 2 * runs.error_of(runs.reverse) and 2 * tangent.step <= longest
+        if noisy:
+            # Paths that differ between the two sides are as many as the step is long.
+            needed /= 2
+        factor = float(np.clip(needed, 1 if noisy else 1.5, 16))
         if spp * factor * subject.pixels > MOST_PATHS or time.process_time() + 0.5 * lasted * factor > deadline:
-            return runs, spp
-        spp *= factor
+            return runs, spp, tangent
+        spp = int(np.ceil(spp * factor / 16) * 16)
+        tangent = replace(tangent, step=2 * tangent.step) if noisy else tangent
 
 
 def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, str]:
@@ -169,7 +179,7 @@ def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, 
 def judge(subject: Subject, tangent: Tangent, effort: Effort) -> Result:
     """Compare the derivative of a parameter along a direction with finite differences."""
     started = time.process_time()
-    runs, spp = resolved_runs(subject, tangent, effort)
+    runs, spp, tangent = resolved_runs(subject, tangent, effort)
     note = ""
     if runs.contradicts and not subject.info.biased:
         runs, note = confirmed_runs(subject, tangent, spp)

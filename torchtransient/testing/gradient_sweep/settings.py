@@ -63,7 +63,9 @@ def bsdf_settings() -> Iterator[Setting]:
     for name, surface in bsdfs.surfaces().items():
         for variant in (RGB, POLARIZED) if surface.polarizes else (RGB,):
             keys = (f"plate.bsdf.{surface.only}",) if surface.only else PLATE
-            yield Setting("bsdf", name, "", lambda _, s=surface: between_lights(s.make(), s.grazing), keys, variant)
+            without = tuple(f"plate.bsdf.{key}" for key in surface.without)
+            make = lambda _, s=surface: between_lights(s.make(), s.grazing)  # noqa: E731
+            yield Setting("bsdf", name, "", make, keys, variant, without)
         if surface.bare_only:
             continue
         for holder, wrap in bsdfs.HOLDERS.items():

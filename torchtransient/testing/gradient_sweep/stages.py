@@ -119,13 +119,14 @@ _FRONT, _BACK = move(0.4, 0.2, 5.0) @ turn(1, 180), move(-0.3, -0.2, -2.0)
 
 def between_lights(bsdf: Description, grazing: bool = False) -> Description:
     """A tilted plate without a rim in reach between two shining walls: it matters what it reflects and what it lets
-    through, in whichever direction. ``grazing``: seen and lit from opposite sides at grazing angles.
+    through, in whichever direction. ``grazing``: seen and lit from opposite sides at grazing angles, close to those of
+    the mirror.
     """
     return {
         "type": "scene",
         "integrator": path(4),
-        "sensor": camera((2.9, 0.0, 1.2), fov=4.0) if grazing else camera(),
-        "lamp": {"type": "point", "position": [-2.9, 0.3, 0.8] if grazing else [0.8, 0.5, 3.0], "intensity": 10.0},
+        "sensor": camera((-2.9, 0.0, 1.2), fov=4.0) if grazing else camera(),
+        "lamp": {"type": "point", "position": [3.0, 0.1, 0.3] if grazing else [0.8, 0.5, 3.0], "intensity": 10.0},
         "front": shining_wall(_FRONT, 1.0),
         "back": shining_wall(_BACK, 0.7),
         "plate": {"type": "rectangle", "to_world": plate_pose(), "bsdf": bsdf},
