@@ -7,12 +7,13 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint doctor environment clean help
+.PHONY: demo test test-slow lint doctor sweep environment clean help
 
 help:
 	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
 	@echo "make test       default tests          make test-slow  the long ones"
 	@echo "make lint       ruff and mypy          make doctor     check the machine"
+	@echo "make sweep      every parameter of every plugin against finite differences; writes docs/gradients_sweep.md"
 
 environment: $(READY)
 
@@ -38,6 +39,10 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow
+
+# Goes on where an earlier run has stopped: remove build/gradient_sweep.jsonl to begin anew.
+sweep: $(READY)
+	$(BIN)/python -m torchtransient.testing.gradient_sweep --write docs
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -60,8 +60,8 @@ def letters(effect):
 
 # plugins, keys, what they move (length, silhouette, medium) and their role; all other keys move nothing
 MOVES = [
-    ("rectangle sphere disk cylinder sdfgrid instance area directionalarea angulararea irradiancemeter", "to_world",
-     "LS", "shape"),
+    ("rectangle sphere disk cylinder sdfgrid instance irradiancemeter", "to_world", "LS", "shape"),
+    ("area directionalarea diff_directionalarea angulararea", "to_world", "LS", "shape"),
     ("cube obj ply instance", "vertex_positions vertex_normals", "LS", "shape"),
     ("cube obj ply instance", "vertex_texcoords", "S", "value"),
     ("bsplinecurve linearcurve", "control_points", "LS", "shape"),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import GradientError, PhysicsError, PhysicsWarning
+from torchtransient.errors import PhysicsError, PhysicsWarning
 from torchtransient.testing.small_room import COLOUR, GREY, VARIANT, WALL_POSE, pose
 
 
@@ -63,10 +63,8 @@ def test_a_light_that_no_path_meets(room):
         "emitter": {"type": "directionalarea", "id": "beam"},
     }
     scene = loaded(room)
-    renderer, messages = said(tt.TransientRenderer, scene, parameters=[COLOUR], spp=4)
+    _, messages = said(tt.TransientRenderer, scene, parameters=[COLOUR], spp=4)
     assert len(messages) == 1 and "angulararea" in messages[0] and "beam" in messages[0]
-    with pytest.raises(GradientError, match="angulararea"):
-        renderer(seed=0).steady.sum().backward()
 
 
 @pytest.mark.parametrize("case", SURFACES)

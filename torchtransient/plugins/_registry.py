@@ -76,6 +76,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
         (("integrator", "transient_prbvolpath"), ("integrator", "transient_volpath")),
     ),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
+    PluginModule("torchtransient.plugins.emitters.directional_area", (("emitter", "diff_directionalarea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
     PluginModule("torchtransient.plugins.bsdfs.plastic", (("bsdf", "diff_plastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.delayed", (("bsdf", "delayed"),)),

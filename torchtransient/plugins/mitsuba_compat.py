@@ -126,6 +126,9 @@ POLARIZED_PLUGINS = {
     **{name: f"diff_{name}" for name in ("dielectric", "conductor", "polarizer", "retarder", "circular")},
     "roughdielectric": "diff_rough_dielectric",
 }
+# These stand in for Mitsuba's always, which lack methods that every plugin of their kind may be asked for:
+# `eval_direction` of a `directionalarea`, which raises while kernels are traced, for the other lights of a scene too.
+COMPLETED_PLUGINS = {"directionalarea": "diff_directionalarea"}
 
 # ------------------------------------------------------------------------------------------------------ shapes, lights
 
@@ -153,10 +156,13 @@ def samples_its_shape(emitter: Any) -> bool:
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
 
 
-def is_never_met(emitter: Any) -> bool:
-    """Whether paths from a sensor never meet an emitter's light: Mitsuba's ``directionalarea`` has no value for the one
-    direction that it shines in, connections do not look for it, and it cannot be asked for the light in a direction.
-    """
+def is_dark(emitter: Any) -> bool:
+    """Whether no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
+    return bool(emitter.class_name() == "DirectionalArea" or getattr(emitter, "stays_dark", False))
+
+
+def lacks_directions(emitter: Any) -> bool:
+    """Whether an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
     return bool(emitter.class_name() == "DirectionalArea")
 
 

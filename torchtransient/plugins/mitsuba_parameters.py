@@ -15,6 +15,7 @@ from torchtransient.plugins.mitsuba_compat import (
     LOSING,
     PLASTICS,
     is_bump_map,
+    is_dark,
     lost_at,
     normal_texture,
 )
@@ -68,6 +69,10 @@ VARNISH = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
+)
+DARK = ParameterEffect(
+    supported=False,
+    reason="directionalarea shines in one direction, which no path from the sensor meets: it stays dark",
 )
 # Texture coordinates move no point, and what they move is smooth but for the edges of what a texture shows.
 _EDGES = "; the edges in a texture count as such (filter nearest, checkerboard)"
@@ -190,9 +195,17 @@ def _rows_of_weights() -> Iterator[Row]:
             yield Row(effect, partial(condition, cls), words)
 
 
+def _is_of_a_dark_light(site: Site) -> bool:
+    """Whether a texture is that of lights that stay dark, and of nothing else."""
+    kinds = (mi.BSDF, mi.Emitter, mi.Medium)
+    holders = [holder for holder, _ in site.owners if isinstance(holder, kinds)]
+    return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
+
+
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
+OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -247,7 +260,7 @@ declare_effects("Hair", {"eta": VALUE})
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights())})
+declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), OF_A_DARK_LIGHT)})
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

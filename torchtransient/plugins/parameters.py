@@ -22,6 +22,7 @@ from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
 from torchtransient.plugins.parameter_effect import Site, matching_effect
+from torchtransient.plugins.swept_parameters import location_of
 
 
 def effect_of(node: Any, key: str, flags: int = 0, owners: Sequence[tuple[Any, str]] = ()) -> ParameterEffect:
@@ -123,6 +124,10 @@ class ParameterTracker:
             return [node]
         holders = owners_of(node, self._holders)
         return [holder for holder, name in holders if lost_at(holder, name)]
+
+    def location_of(self, node: Any, key: str) -> tuple[str, ...]:
+        """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""
+        return location_of(Site(node, key.rsplit(".", 1)[-1], tuple(owners_of(node, self._holders))))
 
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]

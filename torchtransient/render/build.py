@@ -17,7 +17,12 @@ from torchtransient import plugins
 from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.described_scene import check_scene
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS, is_never_met
+from torchtransient.plugins.mitsuba_compat import (
+    COMPLETED_PLUGINS,
+    DIFFERENTIABLE_PLUGINS,
+    POLARIZED_PLUGINS,
+    is_dark,
+)
 from torchtransient.plugins.shares import described_shares
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
@@ -85,7 +90,7 @@ class BuiltScene:
     def findings(self) -> dict[str, str]:
         """What is unphysical in the description, by key."""
         if self._findings is None:
-            dark = [emitter.id() for emitter in self.scene.emitters() if is_never_met(emitter)]
+            dark = [emitter.id() for emitter in self.scene.emitters() if is_dark(emitter)]
             self._findings = scene_findings(described_shares(self.params), self.to_world, dark)
         return self._findings
 
@@ -305,7 +310,9 @@ def _override_samplers(state: Any, options: BuildOptions) -> None:
 
 
 def _substitute_plugins(state: Any, options: BuildOptions) -> None:
-    """Build BSDFs as their differentiable twins, which take the same parameters, and bitmaps with a derivative."""
+    """Build plugins as their differentiable or complete twins, which take the same parameters, and bitmaps with a
+    derivative.
+    """
     import mitsuba as mi
 
     for node in state.nodes:
@@ -314,6 +321,8 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
         elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
+        elif plugin in COMPLETED_PLUGINS:
+            node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"
 

@@ -17,6 +17,7 @@ import numpy as np
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.plugins.node_walk import ShownValue
 from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
+from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
 from torchtransient.render.build import BuiltScene
 
 _VERTEX_COLUMNS = {"vertex_positions": 3, "vertex_normals": 3, "vertex_texcoords": 2}
@@ -33,6 +34,9 @@ class ParameterInfo:
     visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
     boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: names of the materials
     that are built as others when the key is asked for.
+
+    ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
+    compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
     """
 
     key: str
@@ -46,6 +50,8 @@ class ParameterInfo:
     moves_silhouette: bool = False
     moves_medium: bool = False
     biased: bool = False
+    place: tuple[str, ...] = ()
+    checked: bool = True
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
@@ -112,10 +118,20 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
-        entries.append(_describe(built, tracker, key, node))
+        entries.append(_placed(_describe(built, tracker, key, node), tracker, node))
         if key.endswith(".vertex_positions"):
-            entries.append(_mesh_to_world(built, tracker, key, node))
+            entries.append(_placed(_mesh_to_world(built, tracker, key, node), tracker, node))
     return ParameterTable(entries)
+
+
+def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:
+    """With the place of the parameter, and whether the sweep of gradients has been there."""
+    if not info.differentiable:
+        return info
+    place = tracker.location_of(node, info.key)
+    if is_checked(place):
+        return replace(info, place=place)
+    return replace(info, place=place, checked=False, reason=f"{info.reason}; {UNCHECKED}")
 
 
 def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect: ParameterEffect) -> ParameterInfo:

@@ -79,7 +79,7 @@ def sensors() -> dict[str, dict[str, Any]]:
 
 def emitters() -> dict[str, dict[str, Any]]:
     """Emitters; those that need one sit on a shape."""
-    on_shapes = ("area", "directionalarea", "angulararea")
+    on_shapes = ("area", "directionalarea", "diff_directionalarea", "angulararea")
     return {
         **{name: {"type": "rectangle", "emitter": {"type": name}} for name in on_shapes},
         "point": {"type": "point"},

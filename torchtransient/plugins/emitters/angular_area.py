@@ -86,7 +86,8 @@ class AngularAreaLight(mi.Emitter):
         return ps, dr.select(mi.Bool(active) & (ps.pdf > 0), dr.rcp(ps.pdf), 0)
 
     def sample_wavelengths(self, si: Any, sample: Any, active: Any = True) -> Any:
-        return self.radiance.sample_spectrum(si, mi.sample_shifted(sample), active)
+        u = mi.sample_shifted(sample) if mi.is_spectral else dr.zeros(type(si.wavelengths))
+        return self.radiance.sample_spectrum(si, u, active)
 
     def bbox(self) -> Any:
         return self.get_shape().bbox()

@@ -275,11 +275,11 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
                 "finite number, for instance to where the remaining throughput no longer matters."
             )
-        if contents.never_met:
+        if contents.untraceable:
             raise GradientError(
-                f"{contents.never_met[0]!r}: paths from a sensor never meet the light of a directionalarea, and "
-                "Mitsuba cannot trace derivatives through its class. Leave it out, or describe it as an 'angulararea' "
-                "of a small cutoff_angle."
+                f"{contents.untraceable[0]!r}: Mitsuba's directionalarea cannot be asked for its light in a "
+                "direction, which derivatives ask all lights for. Describe it as 'diff_directionalarea', as tt.load "
+                "does, or leave it out: paths from a sensor never meet its light."
             )
         return contents, Wanted(effects, sensor, contents)
 

@@ -14,9 +14,9 @@ from torchtransient.plugins.mitsuba_compat import (
     has_vertices,
     hides_lobe_probability,
     is_flat,
-    is_never_met,
     is_patterned,
     is_two_sided,
+    lacks_directions,
 )
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
@@ -50,7 +50,7 @@ class SceneContents:
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
     some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
-    ``never_met``: names of the emitters that no path meets.
+    ``untraceable``: names of the emitters that derivatives cannot be traced beside.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -75,7 +75,7 @@ class SceneContents:
         self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
         self.patterned |= any(_is_patterned(bsdf) for bsdf in outermost)
-        self.never_met = [emitter.id() for emitter in scene.emitters() if is_never_met(emitter)]
+        self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:

@@ -1,0 +1,147 @@
+"""What the sweep writes: ``docs/gradients_sweep.md``, the same as JSON, and what the table of parameters reads."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchtransient.plugins.parameter_effect import SILHOUETTES
+from torchtransient.plugins.swept_parameters import FILE
+from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
+
+PAGE, DATA = "gradients_sweep.md", "gradients_sweep.json"
+# Columns of the JSON file, one row for a comparison.
+COLUMNS = (
+    "setting", "key", "tangent", "verdict", "reverse", "reverse_error", "forward", "differences", "differences_error",
+    "scale", "spp", "biased", "table", "note", "place",
+)  # fmt: skip
+DECIDED = ("agree", "contradict", "modes differ")
+UNDECIDED = ("unresolved", "no effect")
+TITLES = {
+    "bsdf": "Surfaces", "shape": "Shapes", "emitter": "Emitters", "sensor": "Sensors", "texture": "Textures",
+    "spectrum": "Spectra", "phase": "Phase functions", "medium": "Media",
+}  # fmt: skip
+# Places that say nothing of a plugin's derivative: that a shape has a surface, a light or a medium at all.
+_SLOTS_OF_SHAPES = (".bsdf", ".emitter", ".sensor", ".interior_medium", ".exterior_medium")
+
+HEAD = f"""# The sweep of gradients
+
+Every parameter that `scene.parameters()` offers for every plugin, bare and inside others, against central finite
+differences, in scenes in which no silhouette moves. Written by `make sweep`
+(`torchtransient/testing/gradient_sweep`); the numbers are in [{DATA}]({DATA}) too.
+
+- The loss is the transient of 4 x 4 pixels weighed by a sine of the optical path length. What is differentiated is the
+  loss along one fixed direction in the entries of a parameter: a change by its own size (textures and grids: another
+  one in each entry); poses and positions along two directions, a metre and a fifth of a radian.
+- Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
+- *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
+  and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.
+  An effect below {RESOLVED:.0%} of the scale counts beside {WEAK:g} times itself, or {RESOLVED:.0%} of the scale where
+  that is more. *No effect*: both are below that and the finite difference is zero within three errors, so that nothing
+  is proven.
+- *Contradict*: differs, seed by seed, by more than {SIGMAS} standard errors and more than {TOLERANCE:.0%} of the larger
+  of |finite difference| and scale, with fresh seeds again and extrapolated to a step of zero.
+- Forward mode uses the paths of reverse mode; *modes differ* when they disagree by more than rounding.
+- *Refused*: the table of parameters says that there is no derivative, and asking for it is an error.
+"""
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if value == value else "-"
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    decided = row["differences"] == row["differences"]
+    return [
+        f"`{row['key']}`" if row["key"] else "-",
+        row["tangent"] or "-",
+        f"{_number(row['reverse'])} ± {row['reverse_error']:.1g}" if decided else "-",
+        _number(row["forward"]),
+        f"{_number(row['differences'])} ± {row['differences_error']:.1g}" if decided else "-",
+        f"{row['scale']:.2g}" if decided else "-",
+        f"**{row['verdict']}**" if row["verdict"] in ("contradict", "modes differ", "error") else row["verdict"],
+        _state(row).replace("|", "/"),
+    ]
+
+
+def _state(row: dict[str, Any]) -> str:
+    """What the table of parameters says, in a few words."""
+    if row["biased"] or row["verdict"] == "refused":
+        return row["table"]
+    return "right, but for silhouettes" if row["table"].startswith(SILHOUETTES) else "right" if row["table"] else ""
+
+
+def _table(rows: Iterable[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| scene | key | direction | reverse | forward | finite differences | scale | verdict | table of parameters |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    before = ""
+    for row in rows:
+        # The name of the scene once, without its kind.
+        name = row["setting"].partition(" ")[2]
+        lines.append("| " + " | ".join([name if name != before else "", *_cells(row)]) + " |")
+        before = name
+    return lines
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """The page."""
+    lines = [HEAD, summary(rows), ""]
+    for kind, title in TITLES.items():
+        chosen = [row for row in rows if row["setting"].split(" ")[0] == kind]
+        if chosen:
+            lines += [f"## {title}", "", *_table(chosen), ""]
+    return "\n".join(lines)
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """How many comparisons there are of each outcome."""
+    counts = Counter(row["verdict"] for row in rows)
+    compared = sum(counts[v] for v in (*DECIDED, *UNDECIDED, "not finite"))
+    said = ", ".join(f"{counts[verdict]} {verdict}" for verdict in sorted(counts, key=lambda v: -counts[v]))
+    biased = sum(row["biased"] for row in rows if row["verdict"] == "contradict")
+    share = counts["unresolved"] / max(compared, 1)
+    return (
+        f"{compared} comparisons in {len({row['setting'] for row in rows})} scenes: {said}. Unresolved: {share:.1%}. "
+        f"Of what contradicts, {biased} are called biased by the table of parameters."
+    )
+
+
+def place_without_shapes(place: Sequence[str]) -> list[str]:
+    """A place by what counts in it."""
+    return [name for name in place if not name.endswith(_SLOTS_OF_SHAPES)]
+
+
+def swept(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the table of parameters reads: names that took part in a decided comparison, places of undecided ones.
+
+    A parameter is decided in a place when it is along one direction in one scene.
+    """
+    decided = {tuple(row["place"]) for row in rows if row["verdict"] in DECIDED}
+    names = sorted({name for place in decided for name in place})
+    reduced = {tuple(place_without_shapes(place)) for place in decided}
+    undecided = {
+        tuple(place_without_shapes(row["place"]))
+        for row in rows
+        if row["verdict"] not in (*DECIDED, "refused") and row["place"]
+    }
+    return {"checked": names, "undecided": sorted(list(place) for place in undecided - reduced)}
+
+
+def write_files(results: Iterable[dict[str, Any]], folder: Path) -> None:
+    """Page, data, and the file of the table of parameters."""
+    rows = list(results)
+    (folder / PAGE).write_text(page(rows), encoding="utf-8")
+    compact = ",\n".join(json.dumps([row.get(column) for column in COLUMNS]) for row in rows)
+    (folder / DATA).write_text(f'{{"columns": {json.dumps(COLUMNS)},\n"rows": [\n{compact}\n]}}\n', encoding="utf-8")
+    FILE.write_text(json.dumps(swept(rows), indent=1) + "\n", encoding="utf-8")
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """The rows of the data beside the page."""
+    data = json.loads((folder / DATA).read_text(encoding="utf-8"))
+    return [dict(zip(data["columns"], row, strict=True)) for row in data["rows"]]

@@ -1,0 +1,228 @@
+"""Every scene of the sweep, and which of its parameters are to be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchtransient.testing.gradient_sweep import bsdfs, lights, media, shapes, textures
+from torchtransient.testing.gradient_sweep.stages import (
+    Description,
+    between_lights,
+    filled,
+    in_a_group,
+    lit_by,
+    matte,
+    seen_by,
+)
+
+RGB, SPECTRAL, POLARIZED = "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"
+GROUP = ("group.", "copy.")
+PLATE, LAMP, SENSOR, MEDIUM = ("plate.",), ("lamp.",), ("sensor.",), ("slab.interior_medium.",)
+# Mitsuba paints a lamp without a surface black; of it one sees what it emits.
+PAINT_OF_LAMPS = ("lamp.bsdf.",)
+# What a plugin is inside of that cannot stand alone.
+BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinction", "constvolume as albedo")
+MIRROR = {"type": "conductor", **bsdfs.METAL}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A scene of the sweep: the plugin that it is for, what that one is inside of, and the parameters to look at, by
+    the beginnings of their keys. ``make`` takes a folder for the files that a scene reads.
+    """
+
+    kind: str
+    plugin: str
+    inside: str
+    make: Callable[[Path], Description]
+    keys: tuple[str, ...]
+    variant: str = RGB
+    # Beginnings of keys that mean nothing there.
+    without: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What messages and results call it."""
+        words = f"{self.kind} {self.plugin}" + (f" in {self.inside}" if self.inside else "")
+        return words if self.variant == RGB else f"{words}, {self.variant.removeprefix('llvm_ad_')}"
+
+    @property
+    def is_bare(self) -> bool:
+        """Whether it stands for its plugin alone, in the simplest place that it can be in."""
+        return self.inside in BARE and (self.variant == RGB or self.kind == "spectrum")
+
+    def takes(self, key: str) -> bool:
+        """Whether a parameter is to be looked at."""
+        return key.startswith(self.keys) and not key.startswith(self.without)
+
+
+def bsdf_settings() -> Iterator[Setting]:
+    """Surfaces, bare and in others."""
+    for name, surface in bsdfs.surfaces().items():
+        for variant in (RGB, POLARIZED) if surface.polarizes else (RGB,):
+            keys = (f"plate.bsdf.{surface.only}",) if surface.only else PLATE
+            without = tuple(f"plate.bsdf.{key}" for key in surface.without)
+            make = lambda _, s=surface: between_lights(s.make(), s.grazing)  # noqa: E731
+            yield Setting("bsdf", name, "", make, keys, variant, without)
+        if surface.bare_only:
+            continue
+        for holder, wrap in bsdfs.HOLDERS.items():
+            if not (surface.outermost or (holder == "twosided" and surface.transmits)):
+                yield Setting(
+                    "bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make()), s.grazing), PLATE
+                )
+        yield Setting("bsdf", name, "instance", lambda _, s=surface: in_a_group(s.make(), None, s.grazing), GROUP)
+    for name, surface in bsdfs.holders().items():
+        for holder, wrap in bsdfs.HOLDERS.items():
+            if not (surface.outermost or (holder == "twosided" and surface.transmits)):
+                yield Setting("bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make())), PLATE)
+
+
+def shape_settings() -> Iterator[Setting]:
+    """Shapes of paint, of metal, under a normal map; bare and in a group; as lamps."""
+    coats = {
+        "": matte(),
+        "mirror": MIRROR,
+        "rough metal": MIRROR | {"type": "roughconductor", "alpha": 0.3},
+        "normal map over a mirror": bsdfs.normal_map(MIRROR),
+        "texture": {"type": "diffuse", "reflectance": bsdfs.picture()},
+    }
+    textured = ("rectangle", "obj", "ply", "cube")
+
+    def coated(make: shapes.Maker, coat: Description) -> Callable[[Path], Description]:
+        return lambda folder: between_lights(coat) | {"plate": make(folder) | {"bsdf": coat}}
+
+    def grouped(make: shapes.Maker, coat: Description) -> Callable[[Path], Description]:
+        return lambda folder: in_a_group(coat, make(folder) | {"bsdf": coat})
+
+    for name, make in shapes.shapes().items():
+        for inside, coat in coats.items():
+            if inside not in ("normal map over a mirror", "texture") or name in textured:
+                yield Setting("shape", name, inside, coated(make, coat), ("plate.",))
+        if name not in shapes.NOT_IN_GROUPS:
+            yield Setting("shape", name, "instance", grouped(make, matte()), GROUP)
+            yield Setting("shape", name, "instance, mirror", grouped(make, MIRROR), GROUP)
+
+
+def emitter_settings() -> Iterator[Setting]:
+    """Lights that stand alone, and every area light on every shape that takes one."""
+    for name, light in lights.emitters().items():
+        yield Setting("emitter", name, "", lambda _, e=light, d=name in lights.DISTANT: lit_by(e(), d), LAMP)
+    for name, light in lights.area_emitters().items():
+        for shape, make in shapes.lamp_shapes().items():
+            yield Setting(
+                "emitter",
+                name,
+                shape,
+                lambda folder, e=light, m=make: lit_by(m(folder) | {"emitter": e()}),
+                LAMP,
+                without=PAINT_OF_LAMPS,
+            )
+    for name in lights.area_emitters():
+        yield Setting("emitter", name, "small sphere", lambda _, n=name: _small_lamp(n), LAMP, without=PAINT_OF_LAMPS)
+    for name in ("area", "directionalarea"):
+        for shape in ("rectangle", "ply", "sphere") if name == "area" else ("rectangle",):
+            make = lambda folder, n=name, s=shape: _picture_lamp(folder, n, s)  # noqa: E731
+            yield Setting("emitter", name, f"{shape}, textured", make, LAMP, without=PAINT_OF_LAMPS)
+
+
+def _small_lamp(emitter: str) -> Description:
+    """A millimetre, as bright as the larger lamps."""
+    light = lights.area_emitters()[emitter]() | {"radiance": bsdfs.rgb(9e4, 8e4, 7e4)}
+    return lit_by({"type": "sphere", "center": [0.8, 0.3, 2.5], "radius": 0.001, "emitter": light})
+
+
+def _picture_lamp(folder: Path, emitter: str, shape: str) -> Description:
+    light = {"type": emitter, "radiance": bsdfs.picture(3, 5.0, 9.0)}
+    return lit_by(shapes.lamp_shapes()[shape](folder) | {"emitter": light})
+
+
+def sensor_settings() -> Iterator[Setting]:
+    """Sensors before paint and before a mirror."""
+    for name, sensor in lights.sensors().items():
+        yield Setting("sensor", name, "", lambda _, s=sensor: seen_by(s), SENSOR)
+        if name in ("perspective", "thinlens", "orthographic"):
+            yield Setting(
+                "sensor", name, "before a mirror", lambda _, s=sensor: between_lights(MIRROR) | {"sensor": s}, SENSOR
+            )
+
+
+def texture_settings() -> Iterator[Setting]:
+    """Textures and spectra in every kind of slot."""
+    for slot_name, slot in textures.slots().items():
+        for name, texture in textures.textures().items():
+            yield Setting(
+                "texture",
+                name,
+                slot_name,
+                lambda folder, s=slot, t=texture: _on_a_mesh(folder, s.make(t(s.low, s.high, s.channels))),
+                (f"plate.bsdf.{slot.key}.", "plate.vertex_color"),
+            )
+        for name, spectrum in textures.spectra().items():
+            if slot.channels == 3:
+                yield Setting(
+                    "spectrum",
+                    name,
+                    slot_name,
+                    lambda _, s=slot, t=spectrum: between_lights(s.make(t(s.low, s.high, 3))),
+                    (f"plate.bsdf.{slot.key}.",),
+                    SPECTRAL,
+                )
+    for map_name, surface in textures.maps_of_normals().items():
+        for name, texture in textures.normal_textures().items():
+            yield Setting(
+                "texture",
+                name,
+                f"normal map over {map_name}",
+                lambda _, s=surface, t=texture: between_lights(s(t)),
+                ("plate.bsdf.normalmap.",),
+            )
+    for name, spectrum in textures.spectra().items():
+        yield Setting("spectrum", name, "radiance", lambda _, t=spectrum: _spectral_lamp(t), LAMP, SPECTRAL)
+
+
+def _on_a_mesh(folder: Path, bsdf: Description) -> Description:
+    """The plate as a mesh that has colours at its vertices."""
+    plate = shapes.shapes()["ply"](folder) | {"bsdf": bsdf, "face_normals": True}
+    return between_lights(bsdf) | {"plate": plate}
+
+
+def _spectral_lamp(spectrum: textures.Number) -> Description:
+    return lit_by({"type": "point", "position": [0.8, 0.5, 3.0], "intensity": spectrum(5.0, 10.0, 3)})
+
+
+def medium_settings() -> Iterator[Setting]:
+    """Phase functions and volumes in both kinds of media."""
+    constants = media.volumes()["constvolume"]
+    thin, bright = constants(0.4, 0.8), constants(0.6, 0.9)
+    for kind in ("homogeneous", "heterogeneous"):
+        for name, phase in media.phase_functions().items():
+            yield Setting("phase", name, kind, _fog(kind, thin, bright, phase()), MEDIUM)
+            if name != "blendphase":
+                blended = media.blended(phase())
+                yield Setting("phase", name, f"blendphase, {kind}", _fog(kind, thin, bright, blended), MEDIUM)
+        for name, volume in media.volumes().items():
+            if kind == "heterogeneous" or name.startswith("constvolume"):
+                phase = {"type": "hg", "g": 0.4}
+                yield Setting(
+                    "medium", kind, f"{name} as extinction", _fog(kind, volume(0.3, 0.8), bright, phase), MEDIUM
+                )
+            yield Setting("medium", kind, f"{name} as albedo", _fog(kind, thin, volume(0.5, 0.9), phase), MEDIUM)
+
+
+def _fog(kind: str, sigma_t: Description, albedo: Description, phase: Description) -> Callable[[Path], Description]:
+    return lambda _: filled(media.medium(kind, sigma_t, albedo, phase))
+
+
+def all_settings() -> list[Setting]:
+    """The whole sweep."""
+    return [
+        *bsdf_settings(),
+        *shape_settings(),
+        *emitter_settings(),
+        *sensor_settings(),
+        *texture_settings(),
+        *medium_settings(),
+    ]

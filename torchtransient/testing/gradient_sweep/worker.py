@@ -1,0 +1,59 @@
+"""One process of the sweep: settings in, results out."""
+
+from __future__ import annotations
+
+import gc
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torchtransient.errors import TorchTransientError
+from torchtransient.plugins.swept_parameters import UNCHECKED
+from torchtransient.render.parameters import ParameterInfo
+from torchtransient.render.scene_handle import load
+from torchtransient.testing.gradient_sweep.compare import Effort, Result, judge
+from torchtransient.testing.gradient_sweep.measure import Subject, quiet
+from torchtransient.testing.gradient_sweep.settings import Setting
+
+
+def results_of(setting: Setting, folder: Path, effort: Effort) -> Iterator[Result]:
+    """Everything that the sweep finds in one scene."""
+    import mitsuba as mi
+
+    from torchtransient import plugins
+
+    if mi.variant() != setting.variant:
+        mi.set_variant(setting.variant)
+    plugins.sync()
+    with quiet():
+        scene = load(setting.make(folder), variant=setting.variant)
+        for key, info in scene.parameters().items():
+            if setting.takes(key) and info.shape is not None and info.kind not in ("plain", "integer"):
+                for result in _results_of_key(scene, key, info, effort):
+                    result.setting = setting.name
+                    yield result
+    del scene
+    gc.collect()
+
+
+def _results_of_key(scene: Any, key: str, info: ParameterInfo, effort: Effort) -> Iterator[Result]:
+    for result in _judgements(scene, key, info, effort):
+        result.table = info.reason.removesuffix(f"; {UNCHECKED}")
+        result.biased = info.biased
+        result.place = list(info.place)
+        yield result
+
+
+def _judgements(scene: Any, key: str, info: ParameterInfo, effort: Effort) -> Iterator[Result]:
+    if not info.differentiable:
+        yield Result("", key, "", "refused")
+        return
+    try:
+        subject = Subject(scene, key)
+        for tangent in subject.tangents()[: effort.directions]:
+            yield judge(subject, tangent, effort)
+    except TorchTransientError as error:
+        yield Result("", key, "", "error", note=f"{type(error).__name__}: {error}")
+    except Exception:  # noqa: BLE001  one parameter that fails must not end the sweep
+        yield Result("", key, "", "error", note=traceback.format_exc(limit=3))
