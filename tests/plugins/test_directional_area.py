@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.plain_scenes import as_mitsuba
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
@@ -52,10 +53,11 @@ def test_its_radiance_has_no_derivative(tmp_path):
 def test_scenes_with_mitsubas_own_are_refused_by_derivatives(tmp_path):
     mi.set_variant("llvm_ad_rgb")
     plugins.sync()
-    bare = mi.load_dict(scene(tmp_path, "rectangle", True), optimize=False)
+    bare = mi.load_dict(as_mitsuba(scene(tmp_path, "rectangle", True)), optimize=False)
     params = mi.traverse(bare)
-    params[REFLECTANCE] = mi.Color3f(0.5)
-    dr.enable_grad(params[REFLECTANCE])
+    value = type(params[REFLECTANCE])(0.5)
+    dr.enable_grad(value)
+    params[REFLECTANCE] = value
     params.update()
     adjoint = dr.ones(mi.TensorXf, bare.sensors()[0].film().cube_shape())
     with pytest.raises(GradientError, match="diff_directionalarea"):
