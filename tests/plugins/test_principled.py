@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.gradient_cases.scenes import area_light, glass_slab, room
+from support.gradient_cases.scenes import area_light, camera, glass_slab, room
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 
@@ -208,6 +208,7 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
 def test_a_lobe_that_is_added_to_a_scene_that_was_rendered_refracts():
     """Of a scene of Mitsuba, where a changed weight adds the lobe."""
     description = glass_slab({"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9})
+    description["sensor"] = camera(fov=6.0, start=0.0, bins=300, width=0.05)
     images = []
     for first in (True, False):
         scene = mi.load_dict(description, optimize=False)
