@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.gradient_cases.scenes import area_light, glass_slab, room
+from support.gradient_cases.scenes import area_light, camera, glass_slab, room
 from torchtransient import plugins
 from torchtransient.errors import GradientError
 
@@ -172,6 +172,54 @@ def test_a_described_surface_is_built_anew():
         near, far = (float(renderer(values={key: torch.tensor(x)}, seed=0).steady.sum()) for x in (0.2, 0.4))
     # Brightness is linear in the weight of the coat.
     assert float(renderer.values[key].grad) == pytest.approx((far - near) / 0.2, rel=0.05)
+
+
+def arrival(image):
+    """Mean time bin of the light."""
+    light = image.sum((-1, -2)).flatten().double()
+    return float((light * torch.arange(len(light))).sum() / light.sum())
+
+
+@pytest.mark.parametrize("around", ["nothing", "mask", "twosided"])
+def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
+    """Light behind the surface counts with its index, although the description lacks the lobe."""
+
+    def scene(**more):
+        glass = {"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9, **more}
+        wrapped = {
+            "nothing": glass,
+            "mask": {"type": "mask", "opacity": 1.0, "nested": glass},
+            "twosided": {"type": "twosided", "allow_transmission": True, "nested": glass},
+        }
+        return tt.load(glass_slab(wrapped[around]), variant="llvm_ad_mono")
+
+    axis = tt.TimeAxis(start_opl=0.0, bin_width_opl=0.05, num_bins=300)
+    described, asked = scene(spec_trans=0.9), scene()
+    table = asked.parameters()
+    keys = {slot: next(key for key in table if key.endswith(f"{slot}.value")) for slot in ("spec_trans", "sheen")}
+    # What another renderer looked up before does not matter.
+    tt.TransientRenderer(asked, parameters=[keys["sheen"]], time_axis=axis, spp=4)(seed=0)
+    renderer = tt.TransientRenderer(asked, parameters=[keys["spec_trans"]], time_axis=axis, spp=20000)
+    found = renderer(values={keys["spec_trans"]: torch.tensor(0.9)}, seed=0).transient
+    expected = tt.TransientRenderer(described, time_axis=axis, spp=20000)(seed=0).transient
+    assert arrival(found.detach()) == pytest.approx(arrival(expected), rel=1e-4)
+
+
+def test_a_lobe_that_is_added_to_a_scene_that_was_rendered_refracts():
+    """Of a scene of Mitsuba, where a changed weight adds the lobe."""
+    description = glass_slab({"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9})
+    description["sensor"] = camera(fov=6.0, start=0.0, bins=300, width=0.05)
+    images = []
+    for first in (True, False):
+        scene = mi.load_dict(description, optimize=False)
+        if first:
+            scene.integrator().render(scene, seed=0, spp=4)
+        params = mi.traverse(scene)
+        params["slab.bsdf.spec_trans.value"] = mi.Float(0.9)
+        params.update()
+        _, image = scene.integrator().render(scene, seed=0, spp=256)
+        images.append(np.array(image))
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5 * images[1].max())
 
 
 @pytest.mark.parametrize(("kind", "slot"), [("principled", "spec_trans"), ("principledthin", "diff_trans")])

@@ -48,11 +48,14 @@ def scene_of(kind):
         result["small-box"] = small | {"bsdf": {"type": "diff_rough_dielectric", "alpha": 0.3}}
     if kind == "coating":  # its tables are no parameters
         result["small-box"] = small | {"bsdf": {"type": "diff_rough_plastic", "alpha": 0.3}}
+    if kind == "lobes":  # another plugin, which it asks, is no parameter
+        result["small-box"] = small | {"bsdf": {"type": "diff_principled", "spec_trans": 0.5, "clearcoat": 0.5}}
     return result
 
 
 KINDS = (
     "surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture", "coating",
+    "lobes",
 )  # fmt: skip
 
 

@@ -112,6 +112,9 @@ LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
     "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
+# Plugins that build only the lobes whose weights are given and not the number zero, and the others once their weight is
+# changed: too late for what holds them. Their twins take the names of weights to build lobes for.
+BUILDS_LOBES = ("principled", "principledthin", "diff_principled", "diff_principled_thin")
 
 
 def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:

@@ -116,14 +116,13 @@ class ParameterTracker:
         """As the function of this name, with everything that holds the plugin ``node``."""
         return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
 
-    def stood_in_for(self, node: Any) -> list[Any]:
+    def stood_in_for(self, node: Any) -> list[tuple[Any, str]]:
         """The plugins that are built as others where the derivative by a parameter of ``node`` is asked for, if there
-        is a ``stand_in``: itself, or the holders of a texture.
+        is a ``stand_in``: itself, or the holders of a texture, each with the name it has there.
         """
         if isinstance(node, mi.BSDF):
-            return [node]
-        holders = owners_of(node, self._holders)
-        return [holder for holder, name in holders if lost_at(holder, name)]
+            return [(node, "")]
+        return [(holder, name) for holder, name in owners_of(node, self._holders) if lost_at(holder, name)]
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
         """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""

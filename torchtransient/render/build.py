@@ -18,6 +18,7 @@ from torchtransient._collection import let_go
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins.described_scene import check_scene
 from torchtransient.plugins.mitsuba_compat import (
+    BUILDS_LOBES,
     COMPLETED_PLUGINS,
     DIFFERENTIABLE_PLUGINS,
     POLARIZED_PLUGINS,
@@ -54,7 +55,8 @@ class BuildOptions:
     """What is changed of a description when it is built.
 
     ``film``: what every film becomes, None to keep them. ``max_depth``: for the integrator, or None. ``substitute``:
-    names of BSDFs that are built as their differentiable twins. ``real_bitmaps``: store every bitmap as real numbers;
+    BSDFs that are built as their differentiable twins, by name, with the texture that is asked for or "".
+    ``real_bitmaps``: store every bitmap as real numbers;
     Mitsuba keeps 8-bit images in 8 bits, which have no derivative. ``merge``: let Mitsuba merge meshes and equal
     materials, which is faster to trace but takes parameters away. ``transient``: turn a steady film and integrator into
     transient ones. ``sampler``: plugin name of a sampler that replaces those of the sensors, with the same number of
@@ -66,7 +68,7 @@ class BuildOptions:
 
     film: FilmChoice | None = None
     max_depth: int | None = None
-    substitute: frozenset[str] = frozenset()
+    substitute: frozenset[tuple[str, str]] = frozenset()
     real_bitmaps: bool = False
     merge: bool = False
     transient: bool = False
@@ -315,16 +317,26 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
     """
     import mitsuba as mi
 
+    asked: dict[str, set[str]] = {}
+    for name, slot in options.substitute:
+        asked.setdefault(name, set()).add(slot)
     for node in state.nodes:
-        plugin = node.props.plugin_name()
+        plugin, name = node.props.plugin_name(), node.props.id()
         if mi.is_polarized and plugin in POLARIZED_PLUGINS:
             node.props.set_plugin_name(POLARIZED_PLUGINS[plugin])
-        elif plugin in DIFFERENTIABLE_PLUGINS and node.props.id() in options.substitute:
+        elif plugin in DIFFERENTIABLE_PLUGINS and name in asked:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
+            if plugin in BUILDS_LOBES:
+                node.props["lobes"] = ",".join(sorted(asked[name]))
         elif plugin in COMPLETED_PLUGINS:
             node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
         elif plugin == "bitmap" and options.real_bitmaps:
             node.props["format"] = "variant"
+        elif plugin == "twosided":
+            # A lobe that is built although its weight is zero may be one of transmission.
+            held = [state.nodes[index] for _, index in children(state, node)]
+            if any(child.props.id() in asked and child.props.plugin_name() in BUILDS_LOBES for child in held):
+                node.props["allow_transmission"] = True
 
 
 def _forget_queries(state: Any) -> None:

@@ -32,8 +32,8 @@ class ParameterInfo:
 
     ``moves_path_length``, ``moves_silhouette``, ``moves_medium``: whether it can change an optical path length, move a
     visibility edge, change an extinction. ``biased``: its derivative is known to be wrong somewhere, besides the
-    boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: names of the materials
-    that are built as others when the key is asked for.
+    boundary term of moving silhouettes, which is missing. ``reason`` says why. ``substitute``: the materials that are
+    built as others when the key is asked for, by name, with the name of the texture in them ("" for a number).
 
     ``place``: names of the parameter and of what its plugin is in. ``checked``: whether the sweep of gradients has
     compared it with finite differences in such a place (``docs/gradients_sweep.md``); the reason says when it has not.
@@ -46,7 +46,7 @@ class ParameterInfo:
     differentiable: bool
     moves_path_length: bool
     reason: str
-    substitute: frozenset[str] = frozenset()
+    substitute: frozenset[tuple[str, str]] = frozenset()
     moves_silhouette: bool = False
     moves_medium: bool = False
     biased: bool = False
@@ -171,7 +171,7 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
             # What stands in for the plugin has a number there, whatever Mitsuba's has.
             kind, shape, value = "number", (), float(np.reshape(value, ()))
             effect = tracker.effect_of(node, name)
-        exchanged = frozenset(plugin.id() for plugin in tracker.stood_in_for(node))
+        exchanged = frozenset((plugin.id(), slot) for plugin, slot in tracker.stood_in_for(node))
         return replace(_info(key, kind, shape, value, effect), substitute=exchanged)
     if kind == "plain":
         effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")

@@ -104,6 +104,7 @@ class DiffPrincipled(mi.BSDF):
     samples with weights that keep away from it. The last holds for weights that were changed since the plugin was
     built: those that a derivative is asked by. Without any, samples are those of Mitsuba.
 
+    ``lobes``: names of weights, separated by commas, whose lobes are built although they are zero or not given.
     ``sample`` draws a detached direction, its weight is value over density. Sampling rates are fixed when built.
     """
 
@@ -122,6 +123,7 @@ class DiffPrincipled(mi.BSDF):
         self._read_index(props)
         # Mitsuba leaves out what is not given, or given as the number zero, until it is changed.
         self.built = {name for name in self.slots if name in self.always or _is_given(props, name)}
+        self.built |= {name for name in str(props.get("lobes", "")).split(",") if name in self.slots}
         self.textures = {name: self._texture(props, name, default) for name, default in self.slots.items()}
         self.fixed = {name: float(props.get(name, 1.0)) for name in self.rates}
         self.reading = Reading()

@@ -50,7 +50,7 @@ class SeenScene:
 
 
     def _forget_replaced(self, scene: Any) -> None:
-        """Look up anew when a shape was given another BSDF (``shape.set_bsdf``)."""
+        """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""
         plugins = _plugins_of(scene)
         if plugins != self._plugins:
             self._plugins, self._tracker = plugins, None
@@ -58,6 +58,9 @@ class SeenScene:
 
 
 def _plugins_of(scene: Any) -> tuple[int, ...]:
-    """What surfaces and lights are made of, by address: those in use are kept by the scene."""
-    bsdfs = (shape.bsdf() for shape in scene.shapes())
-    return (*(0 if bsdf is None else bsdf.ptr for bsdf in bsdfs), *(emitter.ptr for emitter in scene.emitters()))
+    """What surfaces and lights are made of, by address: those in use are kept by the scene. With the kinds of lobes,
+    since changed parameters may add one.
+    """
+    bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if bsdf is not None]
+    lights = (emitter.ptr for emitter in scene.emitters())
+    return (*(bsdf.ptr for bsdf in bsdfs), *(bsdf.flags() for bsdf in bsdfs), *lights)
