@@ -6,9 +6,7 @@ import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from torchtransient.plugins.mitsuba_compat import has_surface, is_instance
 
@@ -58,42 +56,6 @@ def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
     collector = _collector(mi.TraversalCallback)()
     node.traverse(collector)
     return collector.values, collector.objects
-
-
-class NumbersOf:
-    """The numbers of some plugins, to be asked whether one of them was replaced, as by ``mi.traverse``.
-
-    The arrays are held until the next question, so that none is written in place meanwhile and no later one can be
-    taken for it because it got the same number from Dr.Jit. They are no arrays that kernels read: without a
-    ``__dict__`` they stay out of :mod:`.frozen_state`.
-    """
-
-    __slots__ = ("_nodes", "_seen")
-
-    def __init__(self, nodes: list[Any]) -> None:
-        self._nodes = nodes
-        self._seen: list[Any] | None = None
-
-    def have_changed(self) -> bool:
-        """Whether one was replaced since the last question; true for the first."""
-        before = self._seen
-        self._seen = [_told_apart(shown.read(node)) for node in self._nodes for shown in shown_by(node)[0]]
-        return before is None or [mark for _, mark in before] != [mark for _, mark in self._seen]
-
-
-def _told_apart(value: Any) -> tuple[Any, Any]:
-    """(copy of a parameter, what tells it apart from other ones for as long as the copy is held)."""
-    if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
-        value = value.matrix
-    if not dr.is_jit_v(value):
-        return None, np.array(value).tolist() if dr.is_array_v(value) else value
-    copy = dr.detach(type(value)(value))
-    return copy, _variables(copy.array if dr.is_tensor_v(copy) else copy)
-
-
-def _variables(value: Any) -> Any:
-    """The numbers that Dr.Jit has given to the variables of an array."""
-    return value.index if dr.depth_v(value) == 1 else [_variables(entry) for entry in value]
 
 
 def objects_of(node: Any) -> list[tuple[str, Any]]:

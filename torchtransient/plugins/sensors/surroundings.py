@@ -20,8 +20,9 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.bsdfs.refraction_table import boundaries_of, index_of
+from torchtransient.plugins.kept import Kept
 from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance
-from torchtransient.plugins.node_walk import NumbersOf, shapes_of_scene
+from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sensors.origin import sensors_of
 
@@ -55,12 +56,11 @@ class Surroundings:
         self._slots = PointerTable(bsdfs, [slots[leaf.ptr] for leaf in self._leaves])
         self._leaves = list(known.values())
         rng = np.random.default_rng(0)
-        self._film, self._aperture = (mi.Point2f(rng.random((2, LINES), dtype=np.float32)) for _ in range(2))
+        # One component at a time, it needs no kernel of its own.
+        self._film, self._aperture = (mi.Point2f(*map(mi.Float, rng.random((2, LINES)))) for _ in range(2))
         around = rng.normal(size=(3, LINES))
-        self._around = mi.Vector3f((around / np.linalg.norm(around, axis=0)).astype(np.float32))
-        dr.make_opaque(self._film, self._aperture, self._around)
-        self._moving = NumbersOf(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
-        self._known: list[int | None] | None = None
+        self._around = mi.Vector3f(*map(mi.Float, around / np.linalg.norm(around, axis=0)))
+        self._kept_levels = Kept(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
 
     @staticmethod
     def of(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
@@ -73,7 +73,7 @@ class Surroundings:
         of loops, with gradients enabled.
         """
         count = len(self._leaves)
-        levels = self._levels(scene)
+        levels = self._kept_levels.get(lambda: self._levels(scene))
         found = []
         for number in range(len(self._sensors)):
             pairs = zip(self._leaves, levels[number * count : (number + 1) * count], strict=True)
@@ -91,14 +91,10 @@ class Surroundings:
         is turned inside out, ``OUTSIDE`` for none: whole numbers, or arrays where a call is recorded, which has no
         numbers yet.
         """
+        levels = self._counted(scene)
         if dr.flag(dr.JitFlag.FreezingScope):
-            levels = self._counted(scene)
             return [dr.gather(mi.Float, levels, mi.UInt32(n)) for n in range(dr.width(levels))]
-        if self._moving.have_changed():
-            self._known = None
-        if self._known is None:
-            self._known = [int(level) or OUTSIDE for level in np.array(self._counted(scene))]
-        return self._known
+        return [int(level) or OUTSIDE for level in np.array(levels)]
 
     def _counted(self, scene: Any) -> Any:
         """As :meth:`_levels`, in one array."""
