@@ -12,7 +12,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from torchtransient.plugins.node_walk import shown_by
+from torchtransient.plugins.node_walk import ShownValue, shown_by
+from torchtransient.plugins.parameters import is_attribute
 
 
 class Kept:
@@ -24,35 +25,51 @@ class Kept:
     :mod:`.frozen_state`.
     """
 
-    __slots__ = ("_plugins", "_seen", "_value")
+    __slots__ = ("_anew", "_arrays", "_fixed", "_seen", "_value")
 
     def __init__(self, plugins: list[Any]) -> None:
-        self._plugins = plugins
-        self._seen: list[tuple[Any, Any]] | None = None
+        # As in a ParameterTracker: some values may be replaced by their owners, and are shown anew each time.
+        shown = [(node, shown_by(node)[0]) for node in plugins]
+        self._anew = [node for node, values in shown if any(_may_move(node, value) for value in values)]
+        self._fixed = [(node, value) for node, values in shown if node not in self._anew for value in values]
+        self._seen: Any = None
+        self._arrays: list[Any] = []
         self._value: Any = None
 
-    def get(self, compute: Callable[[], Any]) -> Any:
-        """The value, by ``compute`` where there is none or a number has been replaced."""
+    def get(self, compute: Callable[[], Any], also: Any = None) -> Any:
+        """The value, by ``compute`` where there is none or a number has been replaced, or something else that it
+        depends on (``also``, plain numbers) is not what it was.
+        """
         if dr.flag(dr.JitFlag.FreezingScope):
             return compute()
-        now = [_told_apart(shown.read(node)) for node in self._plugins for shown in shown_by(node)[0]]
-        if self._seen is None or [mark for _, mark in now] != [mark for _, mark in self._seen]:
+        values = [shown.read(node) for node, shown in self._fixed]
+        values += [shown.read(node) for node in self._anew for shown in shown_by(node)[0]]
+        seen = [also, *map(_variables, values)]
+        if seen != self._seen:
             self._seen = None
+            self._arrays = [_held(value) for value in values]
             self._value = compute()
-            self._seen = now
+            self._seen = seen
         return self._value
 
 
-def _told_apart(value: Any) -> tuple[Any, Any]:
-    """(copy of a parameter, what tells it apart from other ones for as long as the copy is held)."""
-    if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
-        value = value.matrix
-    if not dr.is_jit_v(value):
-        return None, np.array(value).tolist() if dr.is_array_v(value) else value
-    copy = dr.detach(type(value)(value))
-    return copy, _variables(copy.array if dr.is_tensor_v(copy) else copy)
+def _may_move(node: Any, value: ShownValue) -> bool:
+    return value.cpptype is None or is_attribute(node, value.key)
 
 
 def _variables(value: Any) -> Any:
-    """The numbers that Dr.Jit has given to the variables of an array."""
+    """What tells a parameter from others: the numbers that Dr.Jit has given to its variables, or itself."""
+    if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
+        value = value.matrix
+    if not dr.is_jit_v(value):
+        return np.array(value).tolist() if dr.is_array_v(value) else value
+    if dr.is_tensor_v(value):
+        value = value.array
     return value.index if dr.depth_v(value) == 1 else [_variables(entry) for entry in value]
+
+
+def _held(value: Any) -> Any:
+    """A copy of an array that does not change with it."""
+    if "Transform" in type(value).__name__:
+        value = value.matrix
+    return dr.detach(type(value)(value)) if dr.is_jit_v(value) else None

@@ -84,7 +84,7 @@ class SphereLightTable:
     """
 
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
-        self._lights, self._marks, self.all = lights, lights.marks, lights.all
+        self._marks, self.all = lights.marks, lights.all
         self._rows, self._width = rows, len(rows[0])
         # A light that is the only one is not looked up: kernels read its numbers as they are.
         self._only = rows[0] if lights.all and len(rows) == 1 else None

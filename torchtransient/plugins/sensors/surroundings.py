@@ -73,7 +73,7 @@ class Surroundings:
         of loops, with gradients enabled.
         """
         count = len(self._leaves)
-        levels = self._kept_levels.get(lambda: self._levels(scene))
+        levels = self._kept_levels.get(lambda: self._levels(scene), also=self._crops())
         found = []
         for number in range(len(self._sensors)):
             pairs = zip(self._leaves, levels[number * count : (number + 1) * count], strict=True)
@@ -85,6 +85,11 @@ class Surroundings:
                 dr.make_opaque(index)
             found.append(index)
         return found
+
+    def _crops(self) -> list[Any]:
+        """Which part of its film each sensor looks through."""
+        films = (sensor.film() for sensor in self._sensors)
+        return [[*film.size(), *film.crop_size(), *film.crop_offset()] for film in films]
 
     def _levels(self, scene: Any) -> list[Any]:
         """For each sensor and material how many bodies around each other the sensor is in, -1 for outside of one that
@@ -126,9 +131,8 @@ def _bodies(shapes: list[Any], bsdfs: list[Any]) -> list[Any]:
 
 
 def _with_shapes(sensors: list[Any]) -> list[Any]:
-    """Sensors, their films, which say where rays go, and the shapes that they sit on."""
-    films = [sensor.film() for sensor in sensors]
-    return [*sensors, *films, *(shape for shape in (one.get_shape() for one in sensors) if shape is not None)]
+    """Sensors, and the shapes that they sit on."""
+    return [*sensors, *(shape for shape in (one.get_shape() for one in sensors) if shape is not None)]
 
 
 def _index_inside(level: Any, eta: Any) -> Any:
