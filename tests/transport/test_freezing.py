@@ -40,6 +40,8 @@ def scene_of(kind):
     if kind == "mixture":
         blend = {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"}, "b": {"type": "conductor"}}
         result["small-box"] = small | {"bsdf": {"type": "mask", "opacity": 0.7, "nested": blend}}
+    if kind == "sphere light":
+        result["light"] = {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.2, "emitter": {"type": "area"}}
     if kind == "delayed":
         result["small-box"] = small | {"bsdf": {"type": "delayed", "lifetime": 0.3, "nested": {"type": "diffuse"}}}
     if kind == "filter":
@@ -55,7 +57,7 @@ def scene_of(kind):
 
 KINDS = (
     "surfaces", "media", "phasors", "gates", "pulse", "filter", "glass", "thin glass", "delayed", "mixture", "coating",
-    "lobes",
+    "lobes", "sphere light",
 )  # fmt: skip
 
 

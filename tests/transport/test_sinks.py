@@ -37,7 +37,7 @@ def traced(scene, sink_of):
         sensor, film = integrator.resolve(scene, 0)
         world = integrator.world(scene, integrator.contents(scene, sensor))
         job = integrator.passes(world, sensor, film, SEED, SPP)[0][0]
-        rays = integrator.start(scene, sensor, film, job)
+        rays = integrator.start(scene, world.contents, sensor, film, job)
         sink = sink_of(integrator, film, rays, job)
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), integrator.first_opl(film, rays), sink)
         dr.eval(kept)

@@ -107,7 +107,7 @@ class ParameterTracker:
 
     def _note(self, node: Any, values: list[ShownValue], inherited: int) -> None:
         differentiable = [v for v in values if can_carry_gradients(v.read(node))]
-        if any(v.cpptype is None or _is_attribute(node, v.key) for v in differentiable):
+        if any(v.cpptype is None or is_attribute(node, v.key) for v in differentiable):
             self._shown_anew.append((node, inherited))
         else:
             self._fixed += [(node, v._replace(flags=v.flags | inherited)) for v in differentiable]
@@ -153,7 +153,7 @@ def can_carry_gradients(value: Any) -> bool:
     return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
-def _is_attribute(node: Any, key: str) -> bool:
+def is_attribute(node: Any, key: str) -> bool:
     """Whether it is an attribute of a mesh, whose memory moves when another one is added."""
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in mitsuba_parameters.VERTICES
 

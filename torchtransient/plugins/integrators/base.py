@@ -143,7 +143,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """The launches of a job, and the largest number of samples per pixel."""
         return passes_of(sensor.sampler().clone(), film, seed, spp, world.most_events())
 
-    def start(self, scene, sensor, film, job: Pass) -> PrimaryRays:
+    def start(self, scene, contents, sensor, film, job: Pass) -> PrimaryRays:
         """The primary rays of one pass."""
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
@@ -170,7 +170,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
             if film.curves is not None:
                 ray, ray_weight = film.curves.draw(sensor, ray, ray_weight, wavelength)
-            η = index_at_sensor(seen, self.contents(scene, sensor).surroundings, scene)
+            η = index_at_sensor(seen, contents.surroundings, scene)
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
@@ -228,7 +228,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _render_pass(self, world, sensor, film, job):
-        rays = self.start(world.scene, sensor, film, job)
+        rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events())
@@ -290,7 +290,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         return sink.layout, store, count
 
     def _backward_pass(self, world, sensor, film, job, g_steady, g_transient):
-        rays = self.start(world.scene, sensor, film, job)
+        rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(film, rays)
         channels = film.channel_count()
         _, pixel = self.pixel_indices(film, job, rays)
@@ -343,7 +343,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             return film.develop() if develop else None
 
     def _forward_pass(self, world, sensor, film, job):
-        rays = self.start(world.scene, sensor, film, job)
+        rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events(), tangents=True)

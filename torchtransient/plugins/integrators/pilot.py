@@ -113,14 +113,15 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
     spp = sampler.sample_count()
     with dr.suspend_grad():
         job = Pass(band=0, first_row=0, rows=size[1], spp=spp, total=spp * size[0] * size[1], seed=seed_array(seed))
-        rays = integrator.start(scene, sensor, film, job)
+        contents = integrator.contents(scene, sensor)
+        rays = integrator.start(scene, contents, sensor, film, job)
         ray = dr.detach(rays.ray)
         match = ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves)
         sink = EventListSink(size[0] * size[1] * spp, slots, lambda value: _energy(match, value, film.curves))
         # Without a window: what the sensor's film would not count is asked for, too.
         settings = integrator.settings()
         settings = replace(settings, max_depth=PILOT_DEPTH, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
-        world = integrator.world(scene, integrator.contents(scene, sensor), settings=settings)
+        world = integrator.world(scene, contents, settings=settings)
         walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η))
         most = dr.max(sink.used)
         dr.eval(most, sink.opl, sink.energy, sink.depth)

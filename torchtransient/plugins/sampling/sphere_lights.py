@@ -8,11 +8,14 @@ numbers. Inside of a sphere its surface is sampled uniformly.
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from torchtransient.plugins.kept import Kept
 from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
@@ -22,40 +25,52 @@ _PLAIN, _WITH_MATRIX = 6, 15
 
 
 class SphereLights:
-    """The spherical lights of one scene. ``all``: there are no others. ``textured``: one of them has a texture."""
+    """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
+    others. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table, zero for all
+    others.
+    """
 
-    def __init__(self, emitters: list[Any], numbers: list[int], count: int) -> None:
-        self._emitters, self._numbers, self.all = emitters, numbers, len(numbers) == count
+    def __init__(self, lights: list[Any], numbers: list[int]) -> None:
+        emitters = [lights[n] for n in numbers]
+        self._numbers, self.all = numbers, len(numbers) == len(lights)
         self._shapes = [emitter.get_shape() for emitter in emitters]
         self._to_world = [next(v for v in shown_by(shape)[0] if v.key == "to_world") for shape in self._shapes]
         self.textured = any(t.is_spatially_varying() for e in emitters for t in objects_below(e, mi.Texture))
+        self.marks = PointerTable(emitters, [1 + n for n in range(len(emitters))])
+        self._table = Kept([*self._shapes, *lights])
 
     @staticmethod
     def of(scene: Any) -> SphereLights | None:
         """Those of ``scene``, None when it has none."""
         lights = scene.emitters()
         numbers = [n for n, emitter in enumerate(lights) if _is_sphere_light(emitter)]
-        return SphereLights([lights[n] for n in numbers], numbers, len(lights)) if numbers else None
+        return SphereLights(lights, numbers) if numbers else None
 
     def read(self, scene: Any) -> SphereLightTable:
         """Where they are now, attached where their shapes are; to be called outside of loops, once a job."""
+        table = self._table.get(lambda: self._detached(scene))
         with dr.resume_grad():
-            return SphereLightTable(self, [self._numbers_of(scene, n) for n in range(len(self._shapes))])
+            attached = [n for n in range(len(self._shapes)) if dr.grad_enabled(self._matrix(n))]
+            return table.attached({n: self._numbers_of(scene, n) for n in attached}) if attached else table
+
+    def _detached(self, scene: Any) -> SphereLightTable:
+        with dr.suspend_grad():
+            rows = [self._numbers_of(scene, n) for n in range(len(self._shapes))]
+            dr.make_opaque(rows)
+            return SphereLightTable(self, rows)
+
+    def _matrix(self, n: int) -> Any:
+        return self._to_world[n].read(self._shapes[n]).matrix
 
     def _numbers_of(self, scene: Any, n: int) -> list[Any]:
-        shape = self._shapes[n]
-        matrix = self._to_world[n].read(shape).matrix
-        outward = -1.0 if shape.has_flipped_normals() else 1.0
+        matrix = self._matrix(n)
+        outward = -1.0 if self._shapes[n].has_flipped_normals() else 1.0
         pmf = scene.pdf_emitter(mi.UInt32(self._numbers[n]))
         radius = dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
         numbers = [matrix[0, 3], matrix[1, 3], matrix[2, 3], radius, outward, pmf]
         if self.textured:
             numbers += [matrix[row, column] for row in range(3) for column in range(3)]
         return [mi.Float(number) for number in numbers]
-
-    def marks(self) -> PointerTable:
-        """One plus the place of each light in the table, zero for all others."""
-        return PointerTable(self._emitters, [1 + n for n in range(len(self._emitters))])
 
 
 def _is_sphere_light(emitter: Any) -> bool:
@@ -64,15 +79,39 @@ def _is_sphere_light(emitter: Any) -> bool:
 
 
 class SphereLightTable:
-    """Spherical lights as kernels read them. Not a dataclass on purpose: Dr.Jit loops would take it apart."""
+    """Spherical lights as kernels read them, one in each of ``rows``. Not a dataclass on purpose: Dr.Jit loops would
+    take it apart.
+    """
 
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
-        self.all, self.textured, self._marks = lights.all, lights.textured, lights.marks()
-        self._width = _WITH_MATRIX if lights.textured else _PLAIN
-        self.values = dr.zeros(mi.Float, self._width * len(rows))
-        for n, row in enumerate(rows):
+        self._marks, self.all = lights.marks, lights.all
+        self._rows, self._width = rows, len(rows[0])
+        # A light that is the only one is not looked up: kernels read its numbers as they are.
+        self._only = rows[0] if lights.all and len(rows) == 1 else None
+        self._values = None if self._only else self._laid_out(rows)
+
+    def _laid_out(self, rows: list[list[Any]]) -> Any:
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            return mi.Float(np.array(rows, dtype=np.float32).reshape(-1))
+        values = dr.zeros(mi.Float, self._width * len(rows))
+        self._write(values, dict(enumerate(rows)))
+        return values
+
+    def _write(self, values: Any, rows: dict[int, list[Any]]) -> None:
+        for n, row in rows.items():
             for k, number in enumerate(row):
-                dr.scatter(self.values, number, mi.UInt32(self._width * n + k))
+                dr.scatter(values, number, mi.UInt32(self._width * n + k))
+
+    def attached(self, rows: dict[int, list[Any]]) -> SphereLightTable:
+        """A table with other, attached rows in some places: gathered from one array, which derivatives come to."""
+        table = copy.copy(self)
+        table._only, table._values = None, mi.Float(self._laid_out(self._rows))
+        table._write(table._values, rows)
+        return table
+
+    def tables(self) -> list[Any]:
+        """The arrays that are attached where parameters are."""
+        return [] if self._values is None else [self._values]
 
     def lists(self, emitter: Any, active: Any = True) -> Any:
         """Which of an array of emitter pointers are spherical lights."""
@@ -99,22 +138,21 @@ class SphereLightTable:
 
     def pdf(self, scene: Any, ref: Any, ds: Any, active: Any) -> Any:
         """Density of :meth:`sample` per solid angle, as ``scene.pdf_emitter_direction(ref, ds, active)``."""
-        spherical = active & self.lists(ds.emitter, active)
+        spherical = active if self.all else active & self.lists(ds.emitter, active)
         sphere = _Sphere(self, ds.emitter, ref.p, spherical)
-        cos = -dr.dot(ds.d, ds.n)
-        over_area = dr.square(ds.dist) / (4 * dr.pi * dr.square(sphere.radius) * cos)
-        pdf = dr.select(sphere.outside, dr.rcp(sphere.solid_angle), over_area)
-        pdf = dr.select(spherical & (cos > 0) & (ds.dist > 0), pdf * sphere.pmf, 0)
+        pdf = dr.select(spherical, sphere.density(ds, -dr.dot(ds.d, ds.n)) * sphere.pmf, 0)
         if self.all:
             return pdf
         return dr.select(spherical, pdf, scene.pdf_emitter_direction(ref, ds, active & ~spherical))
 
     def numbers(self, emitter: Any, active: Any) -> list[Any]:
         """The numbers of the lights that an array of pointers points to."""
+        if self._only is not None:
+            return self._only
         slot = self._marks.look_up(emitter, active)
         known = slot > 0
         first = dr.select(known, slot - 1, 0) * self._width
-        return [dr.gather(mi.Float, self.values, first + k, known) for k in range(self._width)]
+        return [dr.gather(mi.Float, self._values, first + k, known) for k in range(self._width)]
 
 
 class _Sphere:
@@ -133,47 +171,53 @@ class _Sphere:
         self.distance = dr.sqrt(dr.select(self.outside, d2, dr.square(2 * self.radius)))
         self.sin_max = dr.minimum(self.radius / self.distance, 1)
         self.cos_max = dr.sqrt(dr.maximum((1 - self.sin_max) * (1 + self.sin_max), 1e-12))
-        self.solid_angle = 2 * dr.pi * dr.square(self.sin_max) / (1 + self.cos_max)
+        # (1 - cos_max) / sin_max^2
+        self.versine_over_square = dr.rcp(1 + self.cos_max)
+        self.solid_angle = 2 * dr.pi * dr.square(self.sin_max) * self.versine_over_square
+
+    def density(self, ds: Any, cos: Any) -> Any:
+        """Density per solid angle of a point whose normal makes an angle of this cosine with the way back, zero where
+        it shows its dark side.
+        """
+        lit = (cos > 0) & (ds.dist > 0)
+        from_inside = 4 * dr.pi * dr.square(self.radius) * dr.select(lit, cos, 1)
+        pdf = dr.select(self.outside, 1, dr.square(ds.dist)) / dr.select(self.outside, self.solid_angle, from_inside)
+        return dr.select(lit, pdf, 0)
 
     def sampled(self, u: Any, ref: Any) -> Any:
-        """The DirectionSample3f of two random numbers, without an emitter."""
-        direction, d_outside, distance = self._on_the_cone(u)
-        normal = dr.select(self.outside, direction, mi.warp.square_to_uniform_sphere(u))
+        """The DirectionSample3f of two random numbers, without an emitter.
+
+        Outside, the direction is uniform in the cone: with ``1 - cos = u (1 - cos_max)`` the sine is ``a sin_max``; the
+        law of sines gives the distance and the angle at the center. The root of ``u`` stands alone: that of a product
+        would have an infinite derivative at zero. Inside, the point is uniform on the sphere.
+        """
+        versine = u.x * dr.square(self.sin_max) * self.versine_over_square
+        share = (2 - versine) * self.versine_over_square
+        root = dr.sqrt(u.x)
+        a = root * dr.sqrt(share)
+        sin, cos = a * self.sin_max, 1 - versine
+        q = dr.sqrt(dr.maximum(1 - u.x * share, 1e-12))
+        near = cos - self.sin_max * q
+        sin_center = dr.select(self.outside, a * near, 2 * root * dr.safe_sqrt(1 - u.x))
+        cos_center = dr.select(self.outside, a * sin + cos * q, 1 - 2 * u.x)
+
+        sin_phi, cos_phi = dr.sincos(u.y * (2 * dr.pi))
+        frame = mi.Frame3f(dr.select(self.outside, self.to_center / self.distance, mi.Vector3f(0, 0, 1)))
+        across = frame.s * cos_phi + frame.t * sin_phi
+        normal = across * sin_center - frame.n * cos_center
         # From the center, since that of the sum below is lost where the sphere is far away and small.
         away = self.radius * normal + self.to_center
         inside_distance = dr.norm(dr.select(self.outside, mi.Vector3f(0, 0, 1), away))
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p = dr.fma(normal, self.radius, self.center)
         ds.n = normal * self.outward
-        ds.dist = dr.select(self.outside, distance, inside_distance)
-        ds.d = dr.select(self.outside, d_outside, away / inside_distance)
+        ds.dist = dr.select(self.outside, self.distance * near, inside_distance)
+        ds.d = dr.select(self.outside, across * sin + frame.n * cos, away / inside_distance)
         ds.time = ref.time
-        cos = dr.abs_dot(ds.d, ds.n)
-        over_area = dr.square(ds.dist) / (4 * dr.pi * dr.square(self.radius) * dr.select(cos > 0, cos, 1))
-        pdf = dr.select(self.outside, dr.rcp(self.solid_angle), dr.select(cos > 0, over_area, 0))
-        ds.pdf = dr.select(ds.dist > 0, pdf, 0)
+        ds.pdf = self.density(ds, dr.abs_dot(ds.d, ds.n))
         if self.matrix:
             ds.uv = self._uv(normal)
         return ds
-
-    def _on_the_cone(self, u: Any) -> tuple[Any, Any, Any]:
-        """(outward normal of the point, direction to it, distance) of a direction uniform in the cone.
-
-        With ``1 - cos = u (1 - cos_max)`` the sine is ``a sin_max``; the law of sines gives the distance and the angle
-        at the center. The root of ``u`` stands alone: that of a product would have an infinite derivative at zero.
-        """
-        s, two = self.sin_max, 1 + self.cos_max
-        versine = u.x * dr.square(s) / two
-        a = dr.sqrt(u.x) * dr.sqrt((2 - versine) / two)
-        sin, cos = a * s, 1 - versine
-        q = dr.sqrt(dr.maximum(1 - u.x * (2 - versine) / two, 1e-12))
-        near = cos - s * q
-        sin_center, cos_center = a * near, a * sin + cos * q
-        sin_phi, cos_phi = dr.sincos(u.y * (2 * dr.pi))
-        axis = self.to_center / self.distance
-        frame = mi.Frame3f(dr.select(self.outside, axis, mi.Vector3f(0, 0, 1)))
-        across = frame.s * cos_phi + frame.t * sin_phi
-        return across * sin_center - frame.n * cos_center, across * sin + frame.n * cos, self.distance * near
 
     def _uv(self, normal: Any) -> Any:
         """Texture coordinates of the point with an outward normal: ``to_world`` is a similarity."""

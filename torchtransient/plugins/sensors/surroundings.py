@@ -20,7 +20,9 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.bsdfs.refraction_table import boundaries_of, index_of
-from torchtransient.plugins.mitsuba_compat import is_distant
+from torchtransient.plugins.kept import Kept
+from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance
+from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sensors.origin import sensors_of
 
@@ -33,15 +35,18 @@ SHARE = 1 / 16
 ENCLOSED = 0.9
 # Bodies of one material around each other that are told apart, and surfaces along one line.
 _NESTED, _SURFACES = 4, 1000
+# Stands for no body: nothing has to be asked of its material.
+OUTSIDE = None
 
 
 class Surroundings:
-    """What may lie around the sensors behind ``sensor``: the refractive BSDFs of a scene. Does not change once built.
+    """What may lie around the sensors behind ``sensor``: the refractive BSDFs of a scene.
 
-    Sensors at infinity stand in nothing.
+    Sensors at infinity stand in nothing. The lines are followed when a sensor or a body of these BSDFs has moved, and
+    not for every render; a sensor in air then leaves nothing of the question in a kernel.
     """
 
-    def __init__(self, sensor: Any, boundaries: list[tuple[Any, Any]]) -> None:
+    def __init__(self, sensor: Any, boundaries: list[tuple[Any, Any]], shapes: list[Any]) -> None:
         self._sensors = sensors_of(sensor)
         self._leaves = [leaf for _, leaf in boundaries]
         bsdfs = [bsdf for bsdf, _ in boundaries]
@@ -51,21 +56,53 @@ class Surroundings:
         self._slots = PointerTable(bsdfs, [slots[leaf.ptr] for leaf in self._leaves])
         self._leaves = list(known.values())
         rng = np.random.default_rng(0)
-        self._film, self._aperture = (mi.Point2f(rng.random((2, LINES), dtype=np.float32)) for _ in range(2))
+        # One component at a time, it needs no kernel of its own.
+        self._film, self._aperture = (mi.Point2f(*map(mi.Float, rng.random((2, LINES)))) for _ in range(2))
         around = rng.normal(size=(3, LINES))
-        self._around = mi.Vector3f((around / np.linalg.norm(around, axis=0)).astype(np.float32))
-        dr.make_opaque(self._film, self._aperture, self._around)
+        self._around = mi.Vector3f(*map(mi.Float, around / np.linalg.norm(around, axis=0)))
+        self._kept_levels = Kept(_bodies(shapes, bsdfs) + _with_shapes(self._sensors))
 
     @staticmethod
-    def of(sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
+    def of(scene: Any, sensor: Any, bsdfs: list[Any]) -> Surroundings | None:
         """None where nothing in a scene of these outermost BSDFs refracts."""
         boundaries = boundaries_of(bsdfs)
-        return Surroundings(sensor, boundaries) if boundaries else None
+        return Surroundings(sensor, boundaries, shapes_of_scene(scene)) if boundaries else None
 
     def indices(self, scene: Any) -> list[Any]:
         """The index at each sensor as it is now, attached where the indices of the surfaces are. To be called outside
         of loops, with gradients enabled.
         """
+        count = len(self._leaves)
+        levels = self._kept_levels.get(lambda: self._levels(scene), also=self._crops())
+        found = []
+        for number in range(len(self._sensors)):
+            pairs = zip(self._leaves, levels[number * count : (number + 1) * count], strict=True)
+            around = [_index_inside(level, index_of(leaf)) for leaf, level in pairs if level is not OUTSIDE]
+            index = mi.Float(1)
+            for factor in around:
+                index = index * factor
+            if around:  # or else it stays a number in the kernels
+                dr.make_opaque(index)
+            found.append(index)
+        return found
+
+    def _crops(self) -> list[Any]:
+        """Which part of its film each sensor looks through."""
+        films = (sensor.film() for sensor in self._sensors)
+        return [[*film.size(), *film.crop_size(), *film.crop_offset()] for film in films]
+
+    def _levels(self, scene: Any) -> list[Any]:
+        """For each sensor and material how many bodies around each other the sensor is in, -1 for outside of one that
+        is turned inside out, ``OUTSIDE`` for none: whole numbers, or arrays where a call is recorded, which has no
+        numbers yet.
+        """
+        levels = self._counted(scene)
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return [dr.gather(mi.Float, levels, mi.UInt32(n)) for n in range(dr.width(levels))]
+        return [int(level) or OUTSIDE for level in np.array(levels)]
+
+    def _counted(self, scene: Any) -> Any:
+        """As :meth:`_levels`, in one array."""
         count = len(self._leaves)
         with dr.suspend_grad():
             left, levels, entered = (dr.zeros(mi.Float, len(self._sensors) * count) for _ in range(3))
@@ -77,23 +114,33 @@ class Surroundings:
             levels = dr.select(left > SHARE * LINES, dr.round(levels / dr.maximum(left, 1)), 0)
             levels = dr.select((levels == 0) & (entered > ENCLOSED * LINES / 2), -1, levels)
             dr.eval(levels)
-        etas = [index_of(leaf) for leaf in self._leaves]
-        found = []
-        for number in range(len(self._sensors)):
-            index = mi.Float(1)
-            for k, eta in enumerate(etas):
-                level = dr.gather(mi.Float, levels, mi.UInt32(number * count + k))
-                for depth in range(_NESTED):
-                    index = index * dr.select(level > depth, eta, 1)
-                index = index * dr.select(level < 0, dr.rcp(eta), 1)
-            found.append(index)
-        dr.make_opaque(*found)
-        return found
+        return levels
 
     def _lines(self, sensor: Any) -> Any:
         """From where the sensor's rays start, half of them along the rays."""
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, self._film, self._aperture)
         return mi.Ray3f(dr.detach(ray.o), dr.select(_all_directions(), self._around, dr.detach(ray.d)))
+
+
+def _bodies(shapes: list[Any], bsdfs: list[Any]) -> list[Any]:
+    """The shapes with one of these BSDFs, and the instances that may move them."""
+    known = {bsdf.ptr for bsdf in bsdfs}
+    surfaces = ((shape, shape.bsdf()) for shape in shapes if has_surface(shape))
+    bodies = [shape for shape, bsdf in surfaces if bsdf is not None and bsdf.ptr in known]
+    return bodies + [shape for shape in shapes if is_instance(shape)]
+
+
+def _with_shapes(sensors: list[Any]) -> list[Any]:
+    """Sensors, and the shapes that they sit on."""
+    return [*sensors, *(shape for shape in (one.get_shape() for one in sensors) if shape is not None)]
+
+
+def _index_inside(level: Any, eta: Any) -> Any:
+    """Index of refraction in ``level`` bodies of relative index ``eta`` around each other."""
+    index = mi.Float(1)
+    for depth in range(_NESTED):
+        index = index * dr.select(level > depth, eta, 1)
+    return index * dr.select(level < 0, dr.rcp(eta), 1)
 
 
 def _all_directions():

@@ -65,7 +65,7 @@ class SceneContents:
         infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters())
         self.distant = reference if infinite else None
         self.refraction = RefractiveBSDFs.of(scene, self.bsdfs)
-        self.surroundings = Surroundings.of(sensor, outermost)
+        self.surroundings = Surroundings.of(scene, sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)

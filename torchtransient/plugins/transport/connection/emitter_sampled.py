@@ -30,7 +30,7 @@ class EmitterSampled(Connection):
         self.sun = None if sky is None else MovingSun(sky)
 
     def tables(self):
-        return [] if self.spheres is None else [self.spheres.values]
+        return [] if self.spheres is None else self.spheres.tables()
 
     def sample(self, world, ref, u, active):
         """(direction sample, emission over density) towards an emitter."""
