@@ -20,7 +20,8 @@ class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
     be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be
     swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles. ``only``: the beginning of
-    the names of its parameters that matter; ``without``: of those that do not.
+    the names of its parameters that matter; ``without``: of those that do not. ``filters``: it lets polarized light
+    through unbent, and hardly matters to other light.
     """
 
     make: Callable[[], Description]
@@ -31,6 +32,7 @@ class Surface:
     grazing: bool = False
     only: str = ""
     without: tuple[str, ...] = ()
+    filters: bool = False
 
 
 def picture(channels: int = 3, low: float = 0.3, high: float = 0.7, seed: int = 5) -> Description:
@@ -73,6 +75,8 @@ def surfaces() -> dict[str, Surface]:
         return Surface(lambda: {"type": plugin, **properties}, **marks)
 
     thin = {"transmits": True, "polarizes": True}
+    # In polarized variants Mitsuba's are built as those of this library.
+    filters = {**thin, "filters": True}
     return {
         "diffuse": one("diffuse", {"reflectance": rgb(0.6, 0.5, 0.4)}, polarizes=True),
         "dielectric": one("dielectric", GLASS, **thin),
@@ -105,16 +109,16 @@ def surfaces() -> dict[str, Surface]:
         ),
         "hair": one("hair", {}, transmits=True),
         "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
-        "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **thin),
-        "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
-        "circular": one("circular", {"transmittance": 0.8}, **thin),
+        "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters),
+        "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters),
+        "circular": one("circular", {"transmittance": 0.8}, **filters),
         "diff_dielectric": one("diff_dielectric", GLASS, **thin),
         "diff_rough_dielectric": one("diff_rough_dielectric", ROUGH_GLASS, **thin),
         "diff_conductor": one("diff_conductor", METAL, polarizes=True),
-        "diff_polarizer": one("diff_polarizer", {"theta": 20.0, "transmittance": 0.8}, **thin),
-        "diff_retarder": one("diff_retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
-        "diff_circular": one("diff_circular", {"transmittance": 0.8}, **thin),
-        "null": one("null", {}, transmits=True),
+        "diff_polarizer": one("diff_polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters, bare_only=True),
+        "diff_retarder": one("diff_retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters, bare_only=True),
+        "diff_circular": one("diff_circular", {"transmittance": 0.8}, **filters, bare_only=True),
+        "null": one("null", {}, transmits=True, bare_only=True),
         "delayed": Surface(lambda: late() | {"elastic_fraction": 0.3, "quantum_yield": 0.8}, outermost=True),
         "delayed (elastic part)": Surface(
             lambda: late() | {"elastic": {"type": "conductor", **METAL}}, outermost=True
