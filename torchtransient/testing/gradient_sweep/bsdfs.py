@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS, POLARIZED_PLUGINS
 from torchtransient.testing.gradient_sweep.stages import Description, matte
 
 # Pitch of a texel on the plate, whose texture spans it once: what the camera sees lies within one patch, since the
 # slope of a bilinear texture jumps from patch to patch.
 TEXELS = 16
+# Plugins of this library that stand in for Mitsuba's and take the same parameters.
+TWINS = {**DIFFERENTIABLE_PLUGINS, **POLARIZED_PLUGINS}
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,8 @@ class Surface:
     """A BSDF of the sweep. ``transmits``: what it lets through cannot be inside ``twosided``. ``outermost``: it cannot
     be inside others. ``bare_only``: its parameters are those of another one, at other values. ``polarizes``: to be
     swept in a polarized variant too. ``grazing``: its parameters matter at grazing angles. ``only``: the beginning of
-    the names of its parameters that matter; ``without``: of those that do not.
+    the names of its parameters that matter; ``without``: of those that do not. ``filters``: it lets polarized light
+    through unbent, and hardly matters to other light.
     """
 
     make: Callable[[], Description]
@@ -31,6 +35,7 @@ class Surface:
     grazing: bool = False
     only: str = ""
     without: tuple[str, ...] = ()
+    filters: bool = False
 
 
 def picture(channels: int = 3, low: float = 0.3, high: float = 0.7, seed: int = 5) -> Description:
@@ -73,7 +78,8 @@ def surfaces() -> dict[str, Surface]:
         return Surface(lambda: {"type": plugin, **properties}, **marks)
 
     thin = {"transmits": True, "polarizes": True}
-    return {
+    filters = {**thin, "filters": True}
+    found = {
         "diffuse": one("diffuse", {"reflectance": rgb(0.6, 0.5, 0.4)}, polarizes=True),
         "dielectric": one("dielectric", GLASS, **thin),
         "thindielectric": one("thindielectric", GLASS, **thin),
@@ -84,7 +90,6 @@ def surfaces() -> dict[str, Surface]:
         "plastic": one("plastic", PLASTIC, polarizes=True),
         "plastic (nonlinear)": one("plastic", {**PLASTIC, "nonlinear": True}),
         "roughplastic": one("roughplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
-        "diff_rough_plastic": one("diff_rough_plastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "pplastic": one("pplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),
         "principled": one("principled", {**PRINCIPLED, **COATED, "specular": 0.6}, grazing=True),
         "principled (without lobes)": one(
@@ -105,22 +110,21 @@ def surfaces() -> dict[str, Surface]:
         ),
         "hair": one("hair", {}, transmits=True),
         "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
-        "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **thin),
-        "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
-        "circular": one("circular", {"transmittance": 0.8}, **thin),
-        "diff_dielectric": one("diff_dielectric", GLASS, **thin),
-        "diff_rough_dielectric": one("diff_rough_dielectric", ROUGH_GLASS, **thin),
-        "diff_conductor": one("diff_conductor", METAL, polarizes=True),
-        "diff_polarizer": one("diff_polarizer", {"theta": 20.0, "transmittance": 0.8}, **thin),
-        "diff_retarder": one("diff_retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **thin),
-        "diff_circular": one("diff_circular", {"transmittance": 0.8}, **thin),
-        "null": one("null", {}, transmits=True),
+        "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters),
+        "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters),
+        "circular": one("circular", {"transmittance": 0.8}, **filters),
         "delayed": Surface(lambda: late() | {"elastic_fraction": 0.3, "quantum_yield": 0.8}, outermost=True),
         "delayed (elastic part)": Surface(
             lambda: late() | {"elastic": {"type": "conductor", **METAL}}, outermost=True
         ),
         **at_the_ends(),
     }  # fmt: skip
+    return {**found, **{twin: _twin(found[plugin], twin) for plugin, twin in TWINS.items()}}
+
+
+def _twin(surface: Surface, plugin: str) -> Surface:
+    # In polarized variants Mitsuba's filters are built as their twins: those have been looked at.
+    return replace(surface, make=lambda: surface.make() | {"type": plugin}, bare_only=surface.filters)
 
 
 def at_the_ends() -> dict[str, Surface]:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from torchtransient.testing.gradient_sweep import bsdfs, lights, media, shapes, textures
+from torchtransient.testing.gradient_sweep.shapes import Maker
 from torchtransient.testing.gradient_sweep.stages import (
     Description,
     between_lights,
     filled,
-    in_a_group,
+    grouped,
     lit_by,
     matte,
+    polarizing_sheet,
     seen_by,
 )
 
@@ -24,6 +28,8 @@ PLATE, LAMP, SENSOR, MEDIUM = ("plate.",), ("lamp.",), ("sensor.",), ("slab.inte
 PAINT_OF_LAMPS = ("lamp.bsdf.",)
 # What a plugin is inside of that cannot stand alone.
 BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinction", "constvolume as albedo")
+# Plugins with parameters that matter to polarized light alone.
+FILTERS = ("polarizer", "retarder", "diff_polarizer", "diff_retarder")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
 
 
@@ -36,7 +42,7 @@ class Setting:
     kind: str
     plugin: str
     inside: str
-    make: Callable[[Path], Description]
+    make: Maker
     keys: tuple[str, ...]
     variant: str = RGB
     # Beginnings of keys that mean nothing there.
@@ -51,7 +57,7 @@ class Setting:
     @property
     def is_bare(self) -> bool:
         """Whether it stands for its plugin alone, in the simplest place that it can be in."""
-        return self.inside in BARE and (self.variant == RGB or self.kind == "spectrum")
+        return self.inside in BARE and (self.variant == RGB or self.kind == "spectrum" or self.plugin in FILTERS)
 
     def takes(self, key: str) -> bool:
         """Whether a parameter is to be looked at."""
@@ -62,22 +68,42 @@ def bsdf_settings() -> Iterator[Setting]:
     """Surfaces, bare and in others."""
     for name, surface in bsdfs.surfaces().items():
         for variant in (RGB, POLARIZED) if surface.polarizes else (RGB,):
-            keys = (f"plate.bsdf.{surface.only}",) if surface.only else PLATE
-            without = tuple(f"plate.bsdf.{key}" for key in surface.without)
-            make = lambda _, s=surface: between_lights(s.make(), s.grazing)  # noqa: E731
-            yield Setting("bsdf", name, "", make, keys, variant, without)
-        if surface.bare_only:
-            continue
-        for holder, wrap in bsdfs.HOLDERS.items():
-            if not (surface.outermost or (holder == "twosided" and surface.transmits)):
-                yield Setting(
-                    "bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make()), s.grazing), PLATE
-                )
-        yield Setting("bsdf", name, "instance", lambda _, s=surface: in_a_group(s.make(), None, s.grazing), GROUP)
+            yield _bare(name, surface, variant)
+        if not surface.bare_only:
+            yield from _nested(name, surface)
     for name, surface in bsdfs.holders().items():
-        for holder, wrap in bsdfs.HOLDERS.items():
-            if not (surface.outermost or (holder == "twosided" and surface.transmits)):
-                yield Setting("bsdf", name, holder, lambda _, s=surface, w=wrap: between_lights(w(s.make())), PLATE)
+        yield from (setting for setting in _nested(name, surface) if setting.inside != "instance")
+    # It has no parameters, and is everywhere the same.
+    yield Setting("bsdf", "null", "blendbsdf", _between_lights(bsdfs.blend({"type": "null"})), ("plate.bsdf.",))
+
+
+def _bare(name: str, surface: bsdfs.Surface, variant: str) -> Setting:
+    keys = (f"plate.bsdf.{surface.only}",) if surface.only else PLATE
+    without = surface.without
+    if surface.filters and variant == RGB:
+        keys, without = ("plate.bsdf.",), ("theta", "delta")
+    where = _before_a_filter if surface.filters else _between_lights
+    parts = tuple(f"plate.bsdf.{key}" for key in without)
+    return Setting("bsdf", name, "", where(surface.make(), surface.grazing), keys, variant, parts)
+
+
+def _nested(name: str, surface: bsdfs.Surface) -> Iterator[Setting]:
+    where = _before_a_filter if surface.filters else _between_lights
+    variant = POLARIZED if surface.filters else RGB
+    for holder, wrap in bsdfs.HOLDERS.items():
+        if not (surface.outermost or (holder == "twosided" and surface.transmits)):
+            yield Setting("bsdf", name, holder, where(wrap(surface.make()), surface.grazing), PLATE, variant)
+    make = where(surface.make(), surface.grazing)
+    yield Setting("bsdf", name, "instance", lambda folder: grouped(make(folder)), GROUP, variant)
+
+
+def _between_lights(bsdf: Description, grazing: bool = False) -> Maker:
+    return lambda _: between_lights(bsdf, grazing)
+
+
+def _before_a_filter(bsdf: Description, grazing: bool = False) -> Maker:
+    """What is behind the plate is polarized."""
+    return lambda _: between_lights(bsdf, grazing) | {"sheet": polarizing_sheet()}
 
 
 def shape_settings() -> Iterator[Setting]:
@@ -91,19 +117,19 @@ def shape_settings() -> Iterator[Setting]:
     }
     textured = ("rectangle", "obj", "ply", "cube")
 
-    def coated(make: shapes.Maker, coat: Description) -> Callable[[Path], Description]:
+    def coated(make: Maker, coat: Description) -> Maker:
         return lambda folder: between_lights(coat) | {"plate": make(folder) | {"bsdf": coat}}
 
-    def grouped(make: shapes.Maker, coat: Description) -> Callable[[Path], Description]:
-        return lambda folder: in_a_group(coat, make(folder) | {"bsdf": coat})
+    def copied(make: Maker, coat: Description) -> Maker:
+        return lambda folder: grouped(coated(make, coat)(folder), np.eye(4))
 
     for name, make in shapes.shapes().items():
         for inside, coat in coats.items():
             if inside not in ("normal map over a mirror", "texture") or name in textured:
                 yield Setting("shape", name, inside, coated(make, coat), ("plate.",))
         if name not in shapes.NOT_IN_GROUPS:
-            yield Setting("shape", name, "instance", grouped(make, matte()), GROUP)
-            yield Setting("shape", name, "instance, mirror", grouped(make, MIRROR), GROUP)
+            yield Setting("shape", name, "instance", copied(make, matte()), GROUP)
+            yield Setting("shape", name, "instance, mirror", copied(make, MIRROR), GROUP)
 
 
 def emitter_settings() -> Iterator[Setting]:
@@ -212,7 +238,7 @@ def medium_settings() -> Iterator[Setting]:
             yield Setting("medium", kind, f"{name} as albedo", _fog(kind, thin, volume(0.5, 0.9), phase), MEDIUM)
 
 
-def _fog(kind: str, sigma_t: Description, albedo: Description, phase: Description) -> Callable[[Path], Description]:
+def _fog(kind: str, sigma_t: Description, albedo: Description, phase: Description) -> Maker:
     return lambda _: filled(media.medium(kind, sigma_t, albedo, phase))
 
 

@@ -133,16 +133,20 @@ def between_lights(bsdf: Description, grazing: bool = False) -> Description:
     }
 
 
-def in_a_group(bsdf: Description, plate: Description | None = None, grazing: bool = False) -> Description:
-    """The same plate, or another shape, as the copy of a group."""
-    scene = between_lights(bsdf, grazing)
-    pose = np.eye(4)
-    if plate is None:
-        plate, pose = scene["plate"] | {"to_world": stretch(30.0)}, turn(1, 8)
-    del scene["plate"]
+def grouped(scene: Description, pose: Matrix | None = None) -> Description:
+    """A scene whose plate is the copy of a group; ``pose``: of the copy, which otherwise does what the plate's did."""
+    plate = scene["plate"]
+    if pose is None:
+        plate, pose = plate | {"to_world": stretch(30.0)}, turn(1, 8)
     group = {"type": "shapegroup", "plate": plate}
     copy = {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}
-    return {**scene, "group": group, "copy": copy}
+    return {**{name: part for name, part in scene.items() if name != "plate"}, "group": group, "copy": copy}
+
+
+def polarizing_sheet() -> Description:
+    """A polarizer behind the plate."""
+    pose = move(z=-1.0) @ stretch(30.0)
+    return {"type": "rectangle", "to_world": pose, "bsdf": {"type": "polarizer", "theta": 15.0}}
 
 
 def lit_by(lamp: Description, distant: bool = False) -> Description:
