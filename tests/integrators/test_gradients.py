@@ -20,7 +20,11 @@ ROUNDING = 2e-3
 # Cases of more than a second that need many samples; the set of slow tests runs them.
 LONG = {
     "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",
-    "phasor_glass_index", "meter_moves", "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
+    "phasor_glass_index", "meter_moves", "camera_before_an_instance", "instance_of_a_grid_turns",
+    "camera_before_a_curve", "pattern_and_light_move", "gap_lamp_with_a_cone_tilts", "gap_lamp_with_a_cone",
+    "gap_tube_with_a_cone", "gap_plates_tilt", "gap_polarized", "gap_block", "gap_fog", "gap_lamp_with_stripes",
+    "gap_lamp_with_stripes_moves", "gap_corner_floor", "gap_lamp_tilts", "bare_light_with_a_cone_grows",
+    "no_transmission_of_a_sheet", "instance_and_its_mirror_turn", "phase_of_weight_1", "normals_in_an_instance", "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
 }  # fmt: skip
 
 

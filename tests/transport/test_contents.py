@@ -133,8 +133,8 @@ def test_wanted_follows_what_parameters_move(scene):
     colour = wanted("side.bsdf.reflectance.value")
     assert colour.carried == ("β",) and not colour.geometry
     pose = wanted("wall.to_world")
-    assert pose.geometry and not pose.ray and pose.carried == ("β", "slope", "w")
+    assert pose.geometry and pose.plain and not pose.ray and pose.carried == ("β", "slope", "w", "o")
     camera = wanted("sensor.to_world")
-    assert camera.sensor and camera.ray and set(camera.carried) == {"β", "slope", "w", "o", "d"}
+    assert camera.sensor and camera.ray and not camera.plain and set(camera.carried) == {"β", "slope", "w", "o", "d"}
     light = wanted("light.position")
     assert light.light and light.geometry and not light.emitter_shape
