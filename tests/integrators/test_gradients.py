@@ -24,7 +24,8 @@ LONG = {
     "camera_before_a_curve", "pattern_and_light_move", "gap_lamp_with_a_cone_tilts", "gap_lamp_with_a_cone",
     "gap_tube_with_a_cone", "gap_plates_tilt", "gap_polarized", "gap_block", "gap_fog", "gap_lamp_with_stripes",
     "gap_lamp_with_stripes_moves", "gap_corner_floor", "gap_lamp_tilts", "bare_light_with_a_cone_grows",
-    "no_transmission_of_a_sheet", "instance_and_its_mirror_turn", "phase_of_weight_1", "normals_in_an_instance", "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
+    "no_transmission_of_a_sheet", "instance_and_its_mirror_turn", "phase_of_weight_1", "normals_in_an_instance",
+    "polarized_fluorescent_yield", "area_light_over_a_delayed_wall_moves",
 }  # fmt: skip
 
 
