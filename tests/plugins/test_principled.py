@@ -233,3 +233,35 @@ def test_lost_lobes_of_mitsubas_own_are_refused(kind, slot):
     adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
     with pytest.raises(GradientError, match="diff_principled"):
         scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)
+
+
+def slope_at(description, key, value, step):
+    """(derivative of the value of a BSDF between two directions on opposite sides, forward difference)."""
+    bsdf = mi.load_dict(description)
+    params, si = mi.traverse(bsdf), dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = at(ABOVE)
+
+    def value_at(x):
+        params[key] = x
+        params.update()
+        return mi.Float(bsdf.eval(mi.BSDFContext(), si, at((0.4, -0.1, 0.7)))[0])
+
+    x = mi.Float(value)
+    dr.enable_grad(x)
+    dr.backward(value_at(x))
+    return float(dr.grad(x)[0]), float((value_at(mi.Float(value + step)) - value_at(mi.Float(value)))[0]) / step
+
+
+def test_a_black_base_under_tints_and_transmission_has_a_finite_slope():
+    tints = {"sheen": 0.5, "sheen_tint": 0.5, "spec_tint": 0.5, "spec_trans": 0.5, "eta": 1.4}
+    description = {"type": "diff_principled", "base_color": {"type": "uniform", "value": 0.0}, **tints}
+    found, difference = slope_at(description, "base_color.value", 0.0, 0.01)
+    assert found == pytest.approx(difference, rel=1e-2)
+
+
+def test_a_specular_of_zero_has_a_slope():
+    """Mitsuba takes 1e-3 for it; a difference from there."""
+    found, _ = slope_at({"type": "diff_principled", "specular": 0.0}, "specular", 0.0, 0.01)
+    _, difference = slope_at({"type": "diff_principled", "specular": 1e-3}, "specular", 1e-3, 1e-3)
+    lost, _ = slope_at({"type": "principled", "specular": 0.0}, "specular", 0.0, 0.01)
+    assert lost == 0 and found == pytest.approx(difference, rel=2e-2) and found > 1e-3

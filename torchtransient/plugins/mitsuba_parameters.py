@@ -13,9 +13,12 @@ import mitsuba as mi
 from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
     LOSING,
+    LOST_AT,
     PLASTICS,
     is_bump_map,
     is_dark,
+    is_polarized_plastic,
+    is_rough_conductor,
     lost_at,
     normal_texture,
 )
@@ -59,6 +62,13 @@ INDEX = ParameterEffect(
 )
 # Directions are held fixed while the index moves, so what is seen through the surface stays where it is.
 PRINCIPLED_INDEX = ParameterEffect(moves_length=True, role="index", trusted=True)
+EXCHANGED_INDEX = replace(
+    PRINCIPLED_INDEX,
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['principled']} when asked for, since Mitsuba takes 1.001 for "
+    "an index of 1 and loses the derivative",
+    stand_in=DIFFERENTIABLE_PLUGINS["principled"],
+    stand_in_needed=False,
+)
 COATING = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['roughplastic']} when asked for, which differentiates the "
     "tables of its coating",
@@ -164,6 +174,13 @@ def _attenuates(medium: Any, name: str) -> bool:
     return name != "albedo"
 
 
+def _is_an_index_of_one(site: Site) -> bool:
+    """Whether the index of a principled surface is (what Mitsuba takes for) one."""
+    now = dr.detach(mi.traverse(site.node)[site.key])
+    taken_for = (0, 1e-3) if site.key == "specular" else (1, 1.001)
+    return any(bool(dr.any(dr.abs(now - value) < 1e-7)) for value in taken_for)
+
+
 def _is_weight_in(cls: str, site: Site) -> bool:
     """Whether a texture is the weight of a lobe that a BSDF of the class ``cls`` loses at some value."""
     return any(holder.class_name() == cls and lost_at(holder, name) for holder, name in site.owners)
@@ -189,9 +206,9 @@ def _rows_of_weights() -> Iterator[Row]:
     for condition, now in ((_is_lost_in, True), (_is_weight_in, False)):
         for cls, plugin in LOSING.items():
             twin = DIFFERENTIABLE_PLUGINS[plugin]
-            reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives of lobes of weight zero"
+            reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives at zero"
             effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=now)
-            words = f"the weight of a lobe of {plugin}" + (", where one is zero" if now else "")
+            words = f"in {plugin}, {', '.join(LOST_AT[cls])}" + (" where a lobe is lost" if now else "")
             yield Row(effect, partial(condition, cls), words)
 
 
@@ -202,6 +219,41 @@ def _is_of_a_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
+def _is_black_in_pplastic(site: Site) -> bool:
+    """Whether a texture is a black lobe of ``pplastic``."""
+    lobes = [holder for holder, _ in site.owners if is_polarized_plastic(holder)]
+    names = ("diffuse_reflectance", "specular_reflectance")
+    held = [texture for lobe in lobes for name, texture in objects_of(lobe) if name in names]
+    with dr.suspend_grad():
+        black = [texture for texture in held if dr.all(mi.Float(texture.mean()) <= 0)]
+    return any(site.node is t or any(site.node is n for n in objects_below(t, mi.Texture)) for t in black)
+
+
+def _is_index_of_rough_metal_at_zero(site: Site) -> bool:
+    if not any(is_rough_conductor(holder) and name == "eta" for holder, name in site.owners):
+        return False
+    shown = dr.detach(mi.traverse(site.node)[site.key])
+    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
+        return False
+    return bool(dr.any((shown.array if dr.is_tensor_v(shown) else shown) == 0, axis=None))
+
+
+BLACK_PPLASTIC = Row(
+    ParameterEffect(
+        biased=True,
+        reason="biased: Mitsuba never samples a lobe of pplastic that is black; only samples of the other lobe find it",
+    ),
+    _is_black_in_pplastic,
+    "the reflectance of a black lobe of pplastic",
+)
+METAL_AT_ZERO = Row(
+    ParameterEffect(
+        biased=True,
+        reason="biased: Mitsuba's Fresnel term of a metal has no slope by an index of zero; start from 0.01",
+    ),
+    _is_index_of_rough_metal_at_zero,
+    "the index of roughconductor, where it is zero",
+)
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
@@ -253,14 +305,22 @@ declare_effects("SunskyEmitter", {"sun_direction": SUN})
 declare_effects("BSDF", {"eta": INDEX})
 declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})
 declare_effects("RoughDielectric", {"eta": index_by_stand_in("roughdielectric")})
-declare_effects("Principled", {"eta": PRINCIPLED_INDEX, "specular": PRINCIPLED_INDEX})
+_LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_of_one, "an index of one")
+declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
 declare_effects("Hair", {"eta": VALUE})
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects("Texture", {ANY_KEY: (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), OF_A_DARK_LIGHT)})
+declare_effects(
+    "Texture",
+    {
+        ANY_KEY: (
+            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), BLACK_PPLASTIC, METAL_AT_ZERO, OF_A_DARK_LIGHT,
+        )
+    },
+)  # fmt: skip
 declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -319,4 +319,42 @@ CASES = [
         spp=8192,
         fd_spp=65536,
     ),
+    Case(
+        "black_base_of_a_sheet",
+        "colour of a thin principled sheet",
+        lambda: principled("diff_principled_thin", sheet, "base_color", 0.0, eta=1.4, spec_trans=0.5, diff_trans=0.7),
+        set_color("slab.bsdf.base_color.value"),
+        0.0,
+        0.02,
+        side=1,
+        spp=16384,
+        fd_spp=65536,
+    ),
+    Case(
+        "metal_of_index_zero",
+        "complex index of a conductor",
+        lambda: mirror_room({"type": "diff_conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}),
+        set_color("wall.bsdf.eta.value"),
+        0.0,
+        0.01,
+        side=1,
+        spp=2048,
+    ),
+    # Samples of the reflecting lobe that end behind the surface are thrown away: 0.1709 when they counted.
+    Case(
+        "black_transmission_of_rough_glass",
+        "specular transmittance (rough glass)",
+        lambda: sheet(
+            {
+                "type": "roughdielectric", "alpha": 0.7, "int_ior": 1.3, "ext_ior": 1.0,
+                "specular_transmittance": {"type": "uniform", "value": 0.0},
+            }  # fmt: skip
+        ),
+        set_color("slab.bsdf.specular_transmittance.value"),
+        0.0,
+        0.3,
+        side=1,
+        spp=65536,
+        fd_spp=65536,
+    ),
 ]

@@ -104,8 +104,11 @@ def metal_reflection(cos_theta_i: Any, eta: Any, k: Any) -> Any:
     n2_re, n2_im = (eta - k) * (eta + k), -2 * eta * k
     a, b = n2_re - (1 - c * c), n2_im
     modulus = dr.sqrt(dr.maximum(a * a + b * b, 1e-36))
-    p_re = sqrt_with_bounded_slope(dr.maximum(0.5 * (modulus + a), 0))
-    p_im = -sqrt_with_bounded_slope(dr.maximum(0.5 * (modulus - a), 0))
+    # The lesser part of the root from their product: the difference under its own root has no digits and no slope left
+    # where the index or the absorption is small.
+    large = sqrt_with_bounded_slope(0.5 * (modulus + dr.abs(a)))
+    small = eta * k / large
+    p_re, p_im = dr.select(a < 0, small, large), -dr.select(a < 0, large, small)
     p2 = p_re * p_re + p_im * p_im
     u_re, u_im = n2_re * c, n2_im * c
 

@@ -58,7 +58,10 @@ class DiffPlastic(mi.BSDF):
     def _diffuse(self, si: Any, cos_o: Any, f_i: Any, active: Any) -> Any:
         """Value of the diffuse lobe without the cosine and 1 / pi."""
         colour = self.diffuse_reflectance.eval(si, active)
-        internal = mi.fresnel_diffuse_reflectance(dr.rcp(self.eta))
+        inverse = dr.rcp(self.eta)
+        # Mitsuba's fit has two parts, and the slope of the other one at an index of exactly one.
+        beside = mi.fresnel_diffuse_reflectance(dr.select(inverse == 1, inverse * (1 - 6e-8), inverse))
+        internal = dr.replace_grad(mi.fresnel_diffuse_reflectance(inverse), beside)
         colour = colour / (1 - (colour * internal if self.nonlinear else internal))
         passes = fresnel(cos_o, self.eta).transmittance
         return colour * (dr.rcp(dr.square(self.eta)) * f_i.transmittance * passes)

@@ -23,6 +23,9 @@ AWAY = 0.25
 # From zero, and from larger ends relative to them: the least steps that a comparison notices.
 STEP, RELATIVE_STEP = 1e-30, 6e-8
 
+# A base colour of zero, where its root is differentiated.
+LEAST_COLOUR = 1e-4
+
 
 class Reading:
     """How the weights are read now: ``how``, and ``away``, those that sampling keeps away from their ends."""
@@ -68,7 +71,9 @@ class Weight(mi.Texture):
 
 
 class Colour(mi.Texture):
-    """The base colour. Sampling does not depend on it, and is told samples that were thrown away by their weight."""
+    """The base colour. Sampling does not depend on it: with another one, samples of weight zero are those that were
+    thrown away. Transmission has its root, which gets a finite slope.
+    """
 
     def __init__(self, texture: Any, reading: Reading) -> None:
         mi.Texture.__init__(self, mi.Properties())
@@ -77,7 +82,8 @@ class Colour(mi.Texture):
     def eval(self, si: Any, active: Any = True) -> Any:
         if self.reading.how == AWAY_FROM_ITS_END:
             return mi.UnpolarizedSpectrum(0.5)
-        return self.texture.eval(si, active)
+        colour = self.texture.eval(si, active)
+        return dr.select(colour == 0, colour + LEAST_COLOUR, colour) if self.reading.how == BESIDE_ITS_END else colour
 
     def mean(self) -> Any:
         return self.texture.mean()
@@ -168,8 +174,11 @@ class DiffPrincipled(mi.BSDF):
             self._build()
         if self.index:
             opaque(self.index_value)
+            # Mitsuba takes the same for an index of one, and loses the derivative.
+            one, instead = (0, 1e-3) if self.index == "specular" else (1, 1.001)
+            value = self.index_value
             params = mi.traverse(self.own)
-            params[self.index] = self.index_value
+            params[self.index] = dr.select(value == one, value + (instead - one), value)
             params.update()
 
     # ------------------------------------------------------------------------------------------- as it is read

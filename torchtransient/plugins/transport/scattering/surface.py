@@ -98,6 +98,8 @@ class Surface(Scattering):
             delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         )  # fmt: skip
         step.unconnected = step.delta
+        if world.wanted is not None and world.contents.glossy:
+            step.pdf = dr.select(is_black(weight) & strayed(si.wi, bs), 0, step.pdf)
         self.elsewhere(world, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
         for answer in answers:
@@ -276,6 +278,16 @@ class Surface(Scattering):
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
         )
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
+
+
+def strayed(wi, bs):
+    """Whether a sample of a lobe of reflection or transmission ended on the other side of the surface. BSDFs throw it
+    away; what they hold has a density there, and may be black.
+    """
+    reflects = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)
+    transmits = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+    crosses = wi.z * bs.wo.z < 0
+    return (reflects & ~transmits & crosses) | (transmits & ~reflects & ~crosses)
 
 
 def is_black(weight):
