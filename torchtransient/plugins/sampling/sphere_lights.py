@@ -20,6 +20,7 @@ from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 
+
 class SphereLights:
     """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
     others. ``textured``: one of them has a texture. ``marks``: one plus the place of each in the table, zero for all
