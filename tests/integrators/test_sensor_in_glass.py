@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -165,6 +166,55 @@ def test_body_of_two_faces():
         face["bsdf"] = {"type": "ref", "id": "glass"}
     check(scene(at(), depth=4, **faces), 1.0 + N * 0.5 + 1.5)
     check(scene(at(1.2), depth=4, **faces), N * 0.3 + 1.5)
+
+
+# -------------------------------------------------------------------------------------------------- what is remembered
+
+
+def test_sensor_that_moves():
+    loaded = scene(at(), depth=4, body=CUBE | {"bsdf": glass()})
+    params, inside = mi.traverse(loaded), N * 1.0 + 2.0
+    check(loaded, inside)
+    for z, length in ((-2.0, 1.0 + N * 2.0 + 2.0), (0.0, inside)):
+        params["sensor.to_world"] = mi.Transform4f(at(z)["to_world"].matrix)
+        params.update()
+        check(loaded, length)
+
+
+MOVED = {"cube": "body.vertex_positions", "ball": "body.to_world", "instance": "copy.to_world"}
+
+
+@pytest.mark.parametrize(("body", "key"), MOVED.items())
+def test_body_that_moves(body, key):
+    loaded = scene(at(), depth=4, **BODIES[body]())
+    params = mi.traverse(loaded)
+    check(loaded, N * 1.0 + 2.0)
+    if key.endswith("vertex_positions"):
+        params[key] = dr.ravel(dr.unravel(mi.Point3f, params[key]) + mi.Vector3f(0, 5, 0))
+    else:
+        params[key] = mi.Transform4f().translate([0, 5, 0]) @ params[key]
+    params.update()
+    check(loaded, 3.0)
+
+
+def kernels(loaded, seed):
+    """How many kernels a render launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(loaded.integrator().render(loaded, seed=seed, spp=4))
+        return len(dr.kernel_history([dr.KernelType.JIT]))
+
+
+def test_scene_that_stands_still_is_looked_at_once():
+    plain, glazed = scene(at()), scene(at(-2.0), depth=4, body=CUBE | {"bsdf": glass()})
+    expected = [kernels(plain, seed) for seed in range(3)][-1]
+    launched = [kernels(glazed, seed) for seed in range(3)]
+    assert launched[0] > expected and launched[1:] == [expected, expected]
+    params = mi.traverse(glazed)  # what is no glass may move
+    params["wall.to_world"] = mi.Transform4f().translate([0, 0, 0.1]) @ params["wall.to_world"]
+    params.update()
+    kernels(glazed, 3)
+    assert kernels(glazed, 4) == expected
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors

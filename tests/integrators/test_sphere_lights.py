@@ -155,6 +155,31 @@ def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     assert both.mean() > 0
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_lights_that_move(number):
+    """What is kept of the lights is looked up again: one alone and several are kept in different ways."""
+    scene = over_a_plane(*[lamp(0.01, center=[0.3 * n, 0, DISTANCE]) for n in range(number)])
+    before = steady(scene, 8, 1 << 14).mean()
+    params = mi.traverse(scene)
+    for key in [f"light_{n}.to_world" for n in range(number)]:
+        params[key] = params[key] @ mi.Transform4f().scale(2.0)
+    params.update()
+    assert steady(scene, 8, 1 << 14).mean() == pytest.approx(4 * before, rel=1e-2)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_lights_that_stand_still_are_looked_up_once(number):
+    scene = over_a_plane(*[lamp(0.01)] * number)
+
+    def launched(seed):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(scene.integrator().render(scene, seed=seed, spp=4))
+            return len(dr.kernel_history([dr.KernelType.JIT]))
+
+    assert [launched(seed) for seed in range(3)][1:] == [1, 1]
+
+
 def densities(table, scene, p, u):
     """Samples towards a light from ``p``, their weights, and the densities that are asked for."""
     ref = dr.zeros(mi.Interaction3f, dr.width(u))

@@ -20,9 +20,6 @@ from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 
-# Numbers kept of a sphere: center, radius, sign of the outward normal, probability of choosing it; then its matrix.
-_PLAIN, _WITH_MATRIX = 6, 15
-
 
 class SphereLights:
     """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
@@ -63,11 +60,16 @@ class SphereLights:
         return self._to_world[n].read(self._shapes[n]).matrix
 
     def _numbers_of(self, scene: Any, n: int) -> list[Any]:
+        """Center, radius, its square, squared distance up to which a point is inside, sign of the outward normal,
+        probability of choosing the light; where there are textures the matrix.
+        """
         matrix = self._matrix(n)
         outward = -1.0 if self._shapes[n].has_flipped_normals() else 1.0
         pmf = scene.pdf_emitter(mi.UInt32(self._numbers[n]))
-        radius = dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
-        numbers = [matrix[0, 3], matrix[1, 3], matrix[2, 3], radius, outward, pmf]
+        r = dr.norm(mi.Vector3f(matrix[0, 0], matrix[1, 0], matrix[2, 0]))
+        # Points on the surface itself see it from the side that shines.
+        edge = dr.detach(r) * (1 - outward * mi.math.RayEpsilon)
+        numbers = [matrix[0, 3], matrix[1, 3], matrix[2, 3], r, dr.square(r), dr.square(edge), outward, pmf]
         if self.textured:
             numbers += [matrix[row, column] for row in range(3) for column in range(3)]
         return [mi.Float(number) for number in numbers]
@@ -159,28 +161,26 @@ class _Sphere:
     """One light per lane, seen from ``p``: ``outside`` (where ``p`` is), ``solid_angle`` of the cone, ``pmf``."""
 
     def __init__(self, table: SphereLightTable, emitter: Any, p: Any, active: Any) -> None:
-        x, y, z, r, self.outward, self.pmf, *self.matrix = table.numbers(emitter, active)
+        x, y, z, self.radius, r2, edge2, self.outward, self.pmf, *self.matrix = table.numbers(emitter, active)
         self.center = mi.Point3f(x, y, z)
         # Idle lanes look at a unit sphere from outside: what they hold must not have an infinite derivative.
-        self.radius = dr.select(active, r, 1)
+        self.square = dr.select(active, r2, 1)
         self.to_center = dr.select(active, self.center - p, mi.Vector3f(0, 0, 2))
-        # Points on the surface itself see it from the side that shines.
-        edge = dr.detach(self.radius) * (1 - self.outward * mi.math.RayEpsilon)
         d2 = dr.squared_norm(self.to_center)
-        self.outside = dr.detach(d2) > dr.square(edge)
-        self.distance = dr.sqrt(dr.select(self.outside, d2, dr.square(2 * self.radius)))
-        self.sin_max = dr.minimum(self.radius / self.distance, 1)
-        self.cos_max = dr.sqrt(dr.maximum((1 - self.sin_max) * (1 + self.sin_max), 1e-12))
+        self.outside = dr.detach(d2) > dr.select(active, edge2, 1)
+        self.distance2 = dr.select(self.outside, d2, 4 * self.square)
+        self.sin2_max = dr.minimum(self.square / self.distance2, 1)
         # (1 - cos_max) / sin_max^2
-        self.versine_over_square = dr.rcp(1 + self.cos_max)
-        self.solid_angle = 2 * dr.pi * dr.square(self.sin_max) * self.versine_over_square
+        self.versine_over_square = dr.rcp(1 + dr.sqrt(dr.maximum(1 - self.sin2_max, 1e-12)))
+        self.versine_max = self.sin2_max * self.versine_over_square
+        self.solid_angle = 2 * dr.pi * self.versine_max
 
     def density(self, ds: Any, cos: Any) -> Any:
         """Density per solid angle of a point whose normal makes an angle of this cosine with the way back, zero where
         it shows its dark side.
         """
         lit = (cos > 0) & (ds.dist > 0)
-        from_inside = 4 * dr.pi * dr.square(self.radius) * dr.select(lit, cos, 1)
+        from_inside = 4 * dr.pi * self.square * dr.select(lit, cos, 1)
         pdf = dr.select(self.outside, 1, dr.square(ds.dist)) / dr.select(self.outside, self.solid_angle, from_inside)
         return dr.select(lit, pdf, 0)
 
@@ -191,28 +191,29 @@ class _Sphere:
         law of sines gives the distance and the angle at the center. The root of ``u`` stands alone: that of a product
         would have an infinite derivative at zero. Inside, the point is uniform on the sphere.
         """
-        versine = u.x * dr.square(self.sin_max) * self.versine_over_square
+        outside, s, distance = self.outside, dr.sqrt(self.sin2_max), dr.sqrt(self.distance2)
+        versine = u.x * self.versine_max
         share = (2 - versine) * self.versine_over_square
         root = dr.sqrt(u.x)
         a = root * dr.sqrt(share)
-        sin, cos = a * self.sin_max, 1 - versine
+        sin, cos = a * s, 1 - versine
         q = dr.sqrt(dr.maximum(1 - u.x * share, 1e-12))
-        near = cos - self.sin_max * q
-        sin_center = dr.select(self.outside, a * near, 2 * root * dr.safe_sqrt(1 - u.x))
-        cos_center = dr.select(self.outside, a * sin + cos * q, 1 - 2 * u.x)
+        near = cos - s * q
+        sin_center = dr.select(outside, a * near, 2 * root * dr.safe_sqrt(1 - u.x))
+        cos_center = dr.select(outside, dr.fma(a, sin, cos * q), 1 - 2 * u.x)
 
         sin_phi, cos_phi = dr.sincos(u.y * (2 * dr.pi))
-        frame = mi.Frame3f(dr.select(self.outside, self.to_center / self.distance, mi.Vector3f(0, 0, 1)))
-        across = frame.s * cos_phi + frame.t * sin_phi
+        frame = mi.Frame3f(dr.select(outside, self.to_center / distance, mi.Vector3f(0, 0, 1)))
+        across = dr.fma(frame.s, cos_phi, frame.t * sin_phi)
         normal = across * sin_center - frame.n * cos_center
         # From the center, since that of the sum below is lost where the sphere is far away and small.
-        away = self.radius * normal + self.to_center
-        inside_distance = dr.norm(dr.select(self.outside, mi.Vector3f(0, 0, 1), away))
+        away = dr.select(outside, mi.Vector3f(0, 0, 1), dr.fma(normal, self.radius, self.to_center))
+        inside_distance = dr.norm(away)
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p = dr.fma(normal, self.radius, self.center)
         ds.n = normal * self.outward
-        ds.dist = dr.select(self.outside, self.distance * near, inside_distance)
-        ds.d = dr.select(self.outside, across * sin + frame.n * cos, away / inside_distance)
+        ds.dist = dr.select(outside, distance * near, inside_distance)
+        ds.d = dr.select(outside, dr.fma(across, sin, frame.n * cos), away / inside_distance)
         ds.time = ref.time
         ds.pdf = self.density(ds, dr.abs_dot(ds.d, ds.n))
         if self.matrix:
