@@ -109,7 +109,9 @@ def surfaces() -> dict[str, Surface]:
             grazing=True,
         ),
         "hair": one("hair", {}, transmits=True),
-        "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
+        "hair (absorption)": one(
+            "hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True, only="sigma_a"
+        ),
         "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters),
         "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters),
         "circular": one("circular", {"transmittance": 0.8}, **filters),
