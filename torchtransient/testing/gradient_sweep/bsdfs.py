@@ -109,7 +109,9 @@ def surfaces() -> dict[str, Surface]:
             grazing=True,
         ),
         "hair": one("hair", {}, transmits=True),
-        "hair (absorption)": one("hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True),
+        "hair (absorption)": one(
+            "hair", {"sigma_a": rgb(0.2, 0.3, 0.4)}, transmits=True, bare_only=True, only="sigma_a"
+        ),
         "polarizer": one("polarizer", {"theta": 20.0, "transmittance": 0.8}, **filters),
         "retarder": one("retarder", {"theta": 20.0, "delta": 70.0, "transmittance": 0.8}, **filters),
         "circular": one("circular", {"transmittance": 0.8}, **filters),
@@ -163,7 +165,9 @@ def blend(inner: Description) -> Description:
 
 
 def bump(inner: Description) -> Description:
-    return {"type": "bumpmap", "heights": picture(1, 0.0, 1.0, seed=8), "nested": inner}
+    """Steeper for paint, which hardly notices how it leans."""
+    steepness = 4.0 if inner["type"] == "diffuse" else 1.0
+    return {"type": "bumpmap", "heights": picture(1, 0.0, 1.0, seed=8), "scale": steepness, "nested": inner}
 
 
 def normal_map(inner: Description) -> Description:
