@@ -20,7 +20,6 @@ from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 
-
 # How many numbers of a light kernels load at once.
 _PACKET = 4
 
