@@ -15,6 +15,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins.transport.scattering.surface import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
 
@@ -196,6 +197,21 @@ def test_samples_that_are_thrown_away_have_a_density(plugin):
     value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
     lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
     assert dr.count(lost)[0] > 20
+
+
+def test_samples_that_are_thrown_away_where_the_other_lobe_is_black():
+    """There neither weight nor value tell them from samples of the black lobe, whose slope is not zero."""
+    activate(RGB)
+    bsdf = mi.load_dict({"type": "roughdielectric", "alpha": 0.7, "specular_transmittance": 0.0})
+    sample, weight, si = many_samples(bsdf)
+    black = (dr.max(weight) == 0) & (sample.pdf > 0)
+    lost = black & strayed(si.wi, sample)
+    transmitted = black & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Transmission) & (si.wi.z * sample.wo.z < 0)
+    assert dr.count(lost)[0] > 20 and dr.count(transmitted)[0] > 100
+    assert dr.count(lost)[0] + dr.count(transmitted)[0] == dr.count(black)[0]
+    behind = lost & (si.wi.z * sample.wo.z < 0)
+    assert dr.count(behind)[0] > 20
+    assert dr.max(dr.select(behind, dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo)), 0))[0] == 0
 
 
 def clearcoat_slope(weight):

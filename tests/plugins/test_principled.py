@@ -248,7 +248,7 @@ def slope_at(description, key, value, step):
 
     x = mi.Float(value)
     dr.enable_grad(x)
-    dr.backward(value_at(x))
+    dr.backward(value_at(x), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     return float(dr.grad(x)[0]), float((value_at(mi.Float(value + step)) - value_at(mi.Float(value)))[0]) / step
 
 
