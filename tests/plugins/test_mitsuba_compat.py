@@ -467,23 +467,6 @@ def test_flat_shapes():
     assert not compat.is_flat(bent)
 
 
-def test_patterned_lights():
-    activate(RGB)
-    board = {"type": "checkerboard"}
-
-    def light(shape, **emitter):
-        holder = mi.load_dict({"type": shape, "emitter": emitter})
-        return compat.is_patterned(holder.emitter())  # which does not keep its shape alive
-
-    assert not light("rectangle", type="area", radiance=1.0)
-    assert not light("cylinder", type="area", radiance=1.0)
-    assert light("rectangle", type="area", radiance=board)
-    assert not light("rectangle", type="angulararea", radiance=1.0)
-    assert light("rectangle", type="angulararea", radiance=board)
-    assert light("cylinder", type="angulararea", radiance=1.0)
-    assert not compat.is_patterned(mi.load_dict({"type": "point"}))
-
-
 BATCH = """
 import torchtransient  # finds an LLVM
 import drjit as dr, mitsuba as mi

@@ -348,7 +348,7 @@ CASES = [
             {
                 "type": "roughdielectric", "alpha": 0.7, "int_ior": 1.3, "ext_ior": 1.0,
                 "specular_transmittance": {"type": "uniform", "value": 0.0},
-            }  # fmt: skip
+            }
         ),
         set_color("slab.bsdf.specular_transmittance.value"),
         0.0,
