@@ -211,6 +211,30 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     assert arrival(found.detach()) == pytest.approx(arrival(expected), rel=1e-4)
 
 
+@pytest.mark.parametrize("between", ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"])
+def test_a_lobe_of_transmission_deep_inside_two_sides(between):
+    """Mitsuba refuses transmission under ``twosided`` unless it is told that it is meant."""
+    paint = {"type": "principled", "base_color": 0.6}
+    heights, normals = (
+        {"type": "bitmap", "raw": True, "data": np.full((2, 2, len(texel)), texel, dtype=np.float32)}
+        for texel in ((0.5,), (0.5, 0.5, 1.0))
+    )
+    bumpy = {"type": "bumpmap", "heights": heights, "nested": paint}
+    nested = {
+        "normalmap": {"type": "normalmap", "normalmap": normals, "nested": paint},
+        "bumpmap": bumpy,
+        "blendbsdf": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": paint},
+        "blendbsdf of a bumpmap": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": bumpy},
+        "reference": {"type": "bumpmap", "heights": heights, "nested": {"type": "ref", "id": "paint"}},
+    }[between]
+    more = {"paint": paint} if between == "reference" else {}
+    scene = tt.load({**more, **room(bsdf={"type": "twosided", "nested": nested})}, variant="llvm_ad_mono")
+    key = next(key for key in scene.parameters() if key.endswith("spec_trans.value"))
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16)
+    renderer(seed=0).steady.sum().backward()
+    assert float(renderer.values[key].grad) < 0
+
+
 def test_a_lobe_that_is_added_to_a_scene_that_was_rendered_refracts():
     """Of a scene of Mitsuba, where a changed weight adds the lobe."""
     description = glass_slab({"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9})
