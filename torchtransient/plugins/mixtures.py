@@ -7,9 +7,9 @@ part was chosen is lost. Here the choice is made outside of the BSDFs' methods, 
 the weight is attached and the probability is not.
 
 Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
-probability of its lobes. Where the weight itself has a derivative and is exactly zero or one, the part that would never
-be chosen is, at times: the slope there is not zero. All other mixtures are left to Mitsuba, whose sum over the parts
-has less noise.
+probability of its lobes. Where the weight itself has a derivative and is zero, one or almost, the part that would never
+or hardly be chosen is, at times: the slope there is not less than elsewhere. All other mixtures are left to Mitsuba,
+whose sum over the parts has less noise.
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
 from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, weight_slot
-from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
+from torchtransient.plugins.node_walk import carries_derivatives, objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 
-# Probability of a part whose weight is exactly zero, where the derivative by the weight is asked for.
+# Probability of a part of less weight, where the derivative by the weight is asked for and the mixture is taken apart.
 LEAST_PROBABILITY = 0.25
+# Mixtures are taken apart for it where a part has less weight than this. The derivative is that of a whole part, and in
+# Mitsuba's sum its standard deviation grows by the root of one over the weight; above, the sum has less noise.
+FAINT = 0.05
 
 
 @dataclass(frozen=True)
@@ -107,17 +110,12 @@ class Mixture:
                 params.update()
 
     def taken_apart(self, derivatives: bool) -> tuple[bool, bool]:
-        """(everywhere, where a weight is 0 or 1)."""
+        """(everywhere, where a weight is about 0 or 1)."""
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
         """Whether one of its weights carries derivatives; asked with gradients enabled."""
-        return any(
-            dr.grad_enabled(shown.read(node))
-            for texture in self.textures
-            for node in (texture, *objects_below(texture, mi.Object))
-            for shown in shown_by(node)[0]
-        )
+        return any(carries_derivatives(texture) for texture in self.textures)
 
 
 def is_mixture(node: Any, kind: type) -> bool:
@@ -156,7 +154,7 @@ class Mixtures:
 class MixtureChoice:
     """Takes mixtures apart in one job. Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
 
-    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is taken apart where a weight is 0 or 1).
+    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
     """
 
     def __init__(self, mixtures: Mixtures, chosen: dict[int, tuple[bool, bool]]) -> None:
@@ -188,7 +186,7 @@ class MixtureChoice:
 
 
 def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
-    """(number of a part, its weight over its probability, whether a weight on the way or beside it is 0 or 1)."""
+    """(number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or 1)."""
     if isinstance(tree, Leaf):
         return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
     if isinstance(tree, Sides):
@@ -200,8 +198,8 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
     w = dr.select(w < 0, 0, dr.select(w > 1, 1, w))
     p, end = dr.detach(w), mi.Bool(False)
     if at_ends:
-        end = (p == 0) | (p == 1)
-        p = dr.select(end, dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY), p)
+        end = (p < FAINT) | (p > 1 - FAINT)
+        p = dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
     second = u < p
     chance = dr.select(second, p, 1 - p)
     u = dr.select(second, u, u - p) / dr.select(chance > 0, chance, 1)
