@@ -130,7 +130,7 @@ def test_two_surfaces_with_one_texture(kind, slot, value):
             "type": "rectangle", "to_world": transform().translate([1, 0, 0.05]), "bsdf": {"type": kind, slot: theirs}
         }  # fmt: skip
         scene = scene_of({"type": kind, slot: ours}, half=half)
-        keys = [key for key in mi.traverse(scene).keys() if key.endswith(f"{slot}.value")]
+        keys = [key for key in mi.traverse(scene).properties if key.endswith(f"{slot}.value")]
         assert len(keys) == (1 if shared else 2)
         rates.append(derivative(scene, keys, value))
     assert abs(rates[1]) > 1e-3 and rates[0] == pytest.approx(rates[1], rel=1e-3)

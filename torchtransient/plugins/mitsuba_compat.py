@@ -85,6 +85,13 @@ def normal_texture(bsdf: Any) -> str | None:
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
+def forgets_black_samples(bsdf: Any) -> bool:
+    """Whether a BSDF reports no density for samples of the one it holds whose weight is zero: paths end there, and the
+    derivative of what is black, by the light that comes from elsewhere, is lost. Mitsuba's bump map keeps it.
+    """
+    return bool(bsdf.class_name() == "NormalMap")
+
+
 def is_bump_map(bsdf: Any) -> bool:
     """Whether a BSDF takes its normals from the slope of a texture, which Mitsuba keeps between the texels of a bitmap:
     it jumps at each of them.
