@@ -1,7 +1,7 @@
 """Textures that are exactly zero inside a normal map.
 
-Mitsuba's normal map forgets the density of samples whose weight is zero (:func:`.mitsuba_compat.forgets_black_samples`):
-paths end there, and the derivative by what is black, as far as it is due to the light beyond, is lost. A number that
+Mitsuba's normal map forgets the density of samples whose weight is zero: paths end there
+(:func:`.mitsuba_compat.forgets_black_samples`), and the derivative by what is black, as far as it is due to the light beyond, is lost. A number that
 leaves no weight to speak of, but is not zero, keeps both.
 """
 
@@ -41,8 +41,8 @@ def check_black(attached: Sequence[tuple[Any, str, Any, Sequence[tuple[Any, str]
     for node, key, value, owners in attached:
         if loses_black(node, owners) and _has_zeros(value):
             raise GradientError(
-                f"{f'{node.id()}.{key}'.lstrip('.')!r} is zero inside a normalmap, which forgets samples of weight zero "
-                f"and with them the derivative. Set it to {ALMOST_BLACK:g}; tt.TransientRenderer does so by itself."
+                f"{f'{node.id()}.{key}'.lstrip('.')!r} is zero inside a normalmap, which forgets samples of weight "
+                f"zero and with them the derivative. Set it to {ALMOST_BLACK:g}, as tt.TransientRenderer does."
             )
 
 
