@@ -16,11 +16,13 @@ from support.gradient_cases.cases_mixtures import (
     METAL,
     MIRROR,
     PLASTIC,
+    ROUGH_GLASS,
     blend,
     bump,
     mask,
     mirror_room,
     normal_map,
+    seen_through,
     two_sided,
 )
 
@@ -63,9 +65,21 @@ MIXTURES = {
 }
 
 
-def rows(bsdf):
+THROUGH = {
+    "paint and rough glass": lambda: around_a_blend(bare, DIFFUSE, ROUGH_GLASS),
+    "rough glass and metal": lambda: around_a_blend(bare, ROUGH_GLASS, METAL),
+    "two kinds of rough glass": lambda: around_a_blend(bare, ROUGH_GLASS, {**ROUGH_GLASS, "int_ior": 1.2}),
+    "under normals, seen through": lambda: around_a_blend(normal_map, DIFFUSE, ROUGH_GLASS),
+    "mask of rough glass and paint": lambda: masked(blend(DIFFUSE, ROUGH_GLASS)),
+    "thin sheet and paint": lambda: around_a_blend(
+        bare, {"type": "principledthin", "roughness": 0.4, "spec_trans": 0.5, "diff_trans": 0.8}, DIFFUSE
+    ),
+}
+
+
+def rows(bsdf, room=mirror_room):
     """Sums over the film of each time bin, by seed."""
-    scene = mirror_room(bsdf)
+    scene = room(bsdf)
     scene["integrator"]["max_depth"] = 3
     scene = mi.load_dict(scene, optimize=False)
     renders = [scene.integrator().render(scene, seed=seed, spp=512)[1] for seed in range(SEEDS)]
@@ -74,10 +88,18 @@ def rows(bsdf):
 
 @pytest.mark.parametrize("name", MIXTURES)
 def test_mixture_is_the_weighed_sum_of_its_parts(name):
-    mixture, parts = MIXTURES[name]()
-    found = rows(mixture).sum(1)
+    check_sum(*MIXTURES[name]())
+
+
+@pytest.mark.parametrize("name", THROUGH)
+def test_mixture_that_is_seen_through_is_the_weighed_sum_of_its_parts(name):
+    check_sum(*THROUGH[name](), seen_through)
+
+
+def check_sum(mixture, parts, room=mirror_room):
+    found = rows(mixture, room).sum(1)
     # The parts use other seeds than the mixture only in that they draw other numbers; their errors count as well.
-    weighed = [weight * rows(bsdf).sum(1) for weight, bsdf in parts if weight > 0]
+    weighed = [weight * rows(bsdf, room).sum(1) for weight, bsdf in parts if weight > 0]
     expected = sum(part.mean() for part in weighed)
     error = np.sqrt(sum(part.var(ddof=1) for part in [found, *weighed]) / SEEDS)
     assert abs(found.mean() - expected) < 3 * error + 1e-6 * expected

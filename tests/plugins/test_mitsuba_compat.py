@@ -15,6 +15,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins.node_walk import objects_below
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
 
@@ -105,8 +106,29 @@ def test_blends_of_delta_lobes_have_wrong_values():
     reflected = dr.mean(dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), weight.x, 0))
     # Half of the mirror: 0.45. What comes is divided by 1 / 2 and half of the density of the paint.
     assert abs(float(reflected[0]) - 0.45) > 0.02
-    assert compat.mixes_delta(bsdf) and compat.weight_slot(bsdf) == "weight"
-    assert not compat.mixes_delta(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
+    assert adds_up_wrongly(bsdf) and compat.weight_slot(bsdf) == "weight"
+    assert not adds_up_wrongly(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
+
+
+def adds_up_wrongly(bsdf):
+    return compat.adds_up_wrongly(bsdf, objects_below(bsdf, mi.BSDF))
+
+
+def test_blends_count_samples_that_a_part_threw_away():
+    """Rough glass and paint from behind: what a blend samples is more than what it scatters."""
+    activate(RGB)
+    paint, glass = {"type": "diffuse", "reflectance": 0.5}, {"type": "roughdielectric", "alpha": 0.3}
+    bsdf = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": glass, "b": paint})
+    n = 1_000_000
+    rng = mi.PCG32(size=n)
+    u = [rng.next_float32() for _ in range(5)]
+    si = interaction(unit(0.3, 0.0, -0.9))
+    _, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    wo = mi.warp.square_to_uniform_sphere(mi.Point2f(u[3], u[4]))
+    scattered = np.array(bsdf.eval(mi.BSDFContext(), si, wo).x) * 4 * np.pi
+    error = scattered.std() / np.sqrt(n)
+    assert float(dr.mean(weight.x)[0]) - scattered.mean() > 10 * error
+    assert adds_up_wrongly(bsdf)
 
 
 # -------------------------------------------------------------------------------------------------------- polarization

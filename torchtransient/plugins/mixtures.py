@@ -1,12 +1,12 @@
 """Mixtures (``mask``, ``blendbsdf``, ``blendphase``): a path chooses one part of them and sees that part alone.
 
-Mitsuba samples such a mixture as a whole. Where a part has a delta lobe that goes wrong: a blend divides by the sum of
-a probability and a density (:func:`.mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
-part was chosen is lost. Here the choice is made outside of the BSDFs' methods, as between delayed and prompt light
-(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which
-the weight is attached and the probability is not.
+Mitsuba samples such a mixture as a whole. Where a part has a delta lobe or lets light through that goes wrong: a blend
+divides by a sum of densities that is not that of its samples (:func:`.mitsuba_compat.adds_up_wrongly`), and the
+derivative of the probability with which a part was chosen is lost. Here the choice is made outside of the BSDFs'
+methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and
+the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
-Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
+Which mixtures are taken apart: blends of delta lobes and of what lets light through always; for derivatives also those around a BSDF that hides the
 probability of its lobes. Where the weight itself has a derivative and is exactly zero or one, the part that would never
 be chosen is, at times: the slope there is not zero. All other mixtures are left to Mitsuba, whose sum over the parts
 has less noise.
@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, weight_slot
+from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, hides_lobe_probability, weight_slot
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 
@@ -67,7 +67,7 @@ class Mixture:
         self.wrapped: list[tuple[Any, Any]] = []
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        self.always = any(mixes_delta(part) for part in [node, *objects_below(node, kind)])
+        self.always = any(adds_up_wrongly(part, objects_below(part, kind)) for part in [node, *objects_below(node, kind)])
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
