@@ -15,6 +15,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
@@ -77,12 +78,12 @@ def test_delta_weights_lack_the_derivative_of_their_probability(plugin, attach):
     weight, density = slopes_of_lobe(bsdf, 0.01, attach)
     # What is chosen in proportion to Fresnel's term has a weight without it: its derivative is all that is missing.
     assert abs(density) > 0.1 and abs(weight) < 0.3 * abs(density)
-    assert compat.hides_lobe_probability(bsdf)
-    assert compat.hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
+    assert hides_lobe_probability(bsdf)
+    assert hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
     bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 1)))}}
-    assert compat.hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
+    assert hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
     # Mixtures are asked part by part.
-    assert not compat.hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
+    assert not hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
 
 
 @pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
@@ -91,7 +92,7 @@ def test_delta_weights_of_others_have_it(plugin):
     bsdf = mi.load_dict({"type": plugin})
     weight, density = slopes_of_lobe(bsdf, 0.01, by_direction)
     assert density == 0 and abs(weight) > 0.1
-    assert not compat.hides_lobe_probability(bsdf)
+    assert not hides_lobe_probability(bsdf)
 
 
 def test_blends_of_delta_lobes_have_wrong_values():
@@ -144,8 +145,8 @@ def test_two_sided_matrices_from_behind_are_those_of_the_front():
     behind = matrix(both.eval(mi.BSDFContext(), interaction(mirrored[0]), mirrored[1]))
     np.testing.assert_allclose(behind, front, rtol=1e-5)
     assert abs(front[3, 1]) > 0.1 * front[0, 0], "this pair of directions would not tell the hands apart"
-    assert compat.is_two_sided(both) and not compat.is_two_sided(one)
-    assert compat.is_two_sided(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
+    assert mirrors_matrices(both) and not mirrors_matrices(one)
+    assert mirrors_matrices(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
 
 
 def slope_at_the_normal(bsdf):

@@ -23,21 +23,14 @@ WRITTEN_AGAINST = "3.9.1"
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
 # Those of the others (Mitsuba's dielectric, ours) divide by the detached probability.
-_CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
-# A scene's BSDFs show themselves by their description, nested ones included.
-_TWO_SIDED_DESCRIPTION = "TwoSided["
+_CANCELLING = ("ThinDielectric", "SmoothPlastic")
 # Mixtures, and the slot of the texture or volume that says how much of the (second) nested one there is.
 _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFunction": "weight"}
-_MIXTURES = ("Mask[", "BlendBSDF[")
 
 
-def hides_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
-
-    Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
-    """
-    shown = str(bsdf)
-    return any(name in shown for name in _CANCELLING) and not any(name in shown for name in _MIXTURES)
+def cancels_lobe_probability(bsdf: Any) -> bool:
+    """Whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    return bsdf.class_name() in _CANCELLING
 
 
 def weight_slot(bsdf: Any) -> str | None:
@@ -62,18 +55,8 @@ def adds_up_wrongly(bsdf: Any, nested: list[Any]) -> bool:
     )
 
 
-def is_two_sided(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
-
-    From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
-    Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
-    exchanged.
-    """
-    return _TWO_SIDED_DESCRIPTION in str(bsdf)
-
-
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided``."""
+    """Whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
@@ -84,6 +67,9 @@ def has_equal_sides(bsdf: Any) -> bool:
 
 # Slots of BSDFs that hold a texture of normals or heights, which turns the frame that the nested BSDF works in.
 _NORMAL_TEXTURES = {"NormalMap": "normalmap", "BumpMap": "nested_texture"}
+
+# Flags of these that a built one does not show.
+HIDDEN_FLAGS = ("flip_invalid_normals", "use_shadowing_function")
 
 
 def normal_texture(bsdf: Any) -> str | None:

@@ -20,8 +20,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
 from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
-from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, hides_lobe_probability, weight_slot
+from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 

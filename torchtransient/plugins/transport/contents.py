@@ -9,15 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import (
-    has_vertices,
-    hides_lobe_probability,
-    is_flat,
-    is_patterned,
-    is_two_sided,
-    lacks_directions,
-)
+from torchtransient.plugins.mitsuba_compat import has_vertices, is_flat, is_patterned, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
 from torchtransient.plugins.pointer_table import PointerTable
@@ -97,7 +91,7 @@ def _is_patterned(bsdf: Any) -> bool:
 
 
 def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
-    found = [bsdf for bsdf in bsdfs if is_two_sided(bsdf)]
+    found = [bsdf for bsdf in bsdfs if mirrors_matrices(bsdf)]
     # A path may be handed a part of a BSDF by the part's own pointer.
-    found += [part for bsdf in found for part in bsdfs_below(bsdf) if is_two_sided(part)]
+    found += [part for bsdf in found for part in bsdfs_below(bsdf) if mirrors_matrices(part)]
     return PointerTable.marking(found)
