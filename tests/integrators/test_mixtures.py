@@ -6,6 +6,7 @@ sum of those of its parts. The bound is derived: three standard errors of indepe
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from support.gradient_cases.cases_mixtures import (
     seen_through,
     two_sided,
 )
+from torchtransient.plugins.bsdfs.wrapper_copy import flags_of
 
 VARIANT = "llvm_ad_mono"
 SEEDS = 6
@@ -104,3 +106,57 @@ def check_sum(mixture, parts, room=mirror_room):
     error = np.sqrt(sum(part.var(ddof=1) for part in [found, *weighed]) / SEEDS)
     assert abs(found.mean() - expected) < 3 * error + 1e-6 * expected
     assert error < 0.02 * expected
+
+
+TILTED, FLAT = (0.85, 0.5, 0.85), (0.5, 0.5, 1.0)
+FLAGS = [{"flip_invalid_normals": flips, "use_shadowing_function": shadows} for flips in (0, 1) for shadows in (0, 1)]
+FLAGS = [{name: bool(value) for name, value in flags.items()} for flags in FLAGS]
+
+
+def around_metal(normals, paint, flags):
+    """A normal map, constant by four texels, around a blend with a delta lobe."""
+    bitmap = {"type": "bitmap", "data": mi.TensorXf(np.tile(np.float32(normals), (4, 4, 1))), "raw": True}
+    parts = {**DIFFUSE, "reflectance": paint}, {"type": "conductor", "specular_reflectance": paint}
+    return {"type": "normalmap", "normalmap": bitmap, "nested": blend(*parts, 0.5), **flags}
+
+
+@pytest.mark.parametrize("flags", FLAGS, ids=str)
+@pytest.mark.parametrize("first", [(FLAT, 0.8), (TILTED, 0.0)], ids=["flat", "black"])
+def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags):
+    """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""
+    images = []
+    for normals, paint in (first, (TILTED, 0.8)):
+        scene = mi.load_dict(mirror_room(around_metal(normals, paint, flags)), optimize=False)
+        scene.integrator().render(scene, seed=0, spp=4)
+        params = mi.traverse(scene)
+        params["wall.bsdf.normalmap.data"] = mi.TensorXf(np.tile(np.float32(TILTED), (4, 4, 1)))
+        for key in ("bsdf_0.reflectance.value", "bsdf_1.specular_reflectance.value"):
+            params[f"wall.bsdf.nested_bsdf.{key}"] = 0.8
+        params.update()
+        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("flags", FLAGS, ids=str)
+def test_hidden_flags_are_found(flags):
+    mi.set_variant(VARIANT)
+    for make in (lambda: around_metal(FLAT, 0.0, flags), lambda: bump(blend(DIFFUSE, MIRROR), 0.5, 0.5) | flags):
+        assert flags_of(mi.load_dict(make())) == flags
+
+
+def test_looking_for_flags_leaves_values_and_their_derivatives():
+    mi.set_variant(VARIANT)
+    bsdf = mi.load_dict(around_metal(FLAT, 0.3, FLAGS[0]))
+    params = mi.traverse(bsdf)
+    before = {key: np.array(params[key]) for key in params.keys()}
+    x = mi.TensorXf(params["normalmap.data"])
+    dr.enable_grad(x)
+    params["normalmap.data"] = x
+    params.update()
+    with dr.suspend_grad():
+        flags_of(bsdf)
+    after = mi.traverse(bsdf)
+    for key, value in before.items():
+        np.testing.assert_array_equal(np.array(dr.detach(after[key])), value)
+    dr.backward(dr.sum(after["normalmap.data"] * 2))
+    np.testing.assert_array_equal(np.array(dr.grad(x)), np.full((4, 4, 3), 2.0))
