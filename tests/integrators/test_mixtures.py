@@ -148,7 +148,7 @@ def test_looking_for_flags_leaves_values_and_their_derivatives():
     mi.set_variant(VARIANT)
     bsdf = mi.load_dict(around_metal(FLAT, 0.3, FLAGS[0]))
     params = mi.traverse(bsdf)
-    before = {key: np.array(params[key]) for key in params.keys()}
+    before = {key: np.array(value) for key, value in params.items()}
     x = mi.TensorXf(params["normalmap.data"])
     dr.enable_grad(x)
     params["normalmap.data"] = x

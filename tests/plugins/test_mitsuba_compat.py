@@ -17,6 +17,7 @@ from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below
+from torchtransient.plugins.transport.scattering.surface import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
 
@@ -219,6 +220,21 @@ def test_samples_that_are_thrown_away_have_a_density(plugin):
     value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
     lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
     assert dr.count(lost)[0] > 20
+
+
+def test_samples_that_are_thrown_away_where_the_other_lobe_is_black():
+    """There neither weight nor value tell them from samples of the black lobe, whose slope is not zero."""
+    activate(RGB)
+    bsdf = mi.load_dict({"type": "roughdielectric", "alpha": 0.7, "specular_transmittance": 0.0})
+    sample, weight, si = many_samples(bsdf)
+    black = (dr.max(weight) == 0) & (sample.pdf > 0)
+    lost = black & strayed(si.wi, sample)
+    transmitted = black & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Transmission) & (si.wi.z * sample.wo.z < 0)
+    assert dr.count(lost)[0] > 20 and dr.count(transmitted)[0] > 100
+    assert dr.count(lost)[0] + dr.count(transmitted)[0] == dr.count(black)[0]
+    behind = lost & (si.wi.z * sample.wo.z < 0)
+    assert dr.count(behind)[0] > 20
+    assert dr.max(dr.select(behind, dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo)), 0))[0] == 0
 
 
 def clearcoat_slope(weight):
@@ -488,23 +504,6 @@ def test_flat_shapes():
     params["vertex_normals"] = dr.ravel(dr.normalize(dr.unravel(mi.Point3f, params["vertex_positions"])))
     params.update()
     assert not compat.is_flat(bent)
-
-
-def test_patterned_lights():
-    activate(RGB)
-    board = {"type": "checkerboard"}
-
-    def light(shape, **emitter):
-        holder = mi.load_dict({"type": shape, "emitter": emitter})
-        return compat.is_patterned(holder.emitter())  # which does not keep its shape alive
-
-    assert not light("rectangle", type="area", radiance=1.0)
-    assert not light("cylinder", type="area", radiance=1.0)
-    assert light("rectangle", type="area", radiance=board)
-    assert not light("rectangle", type="angulararea", radiance=1.0)
-    assert light("rectangle", type="angulararea", radiance=board)
-    assert light("cylinder", type="angulararea", radiance=1.0)
-    assert not compat.is_patterned(mi.load_dict({"type": "point"}))
 
 
 BATCH = """

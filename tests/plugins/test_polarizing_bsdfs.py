@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import torchtransient as tt
+from support.gradient_cases.scenes import mirror_room
 from torchtransient import plugins
 
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
@@ -194,3 +196,33 @@ def test_derivatives(plugin, wi):
         d1, d2 = ((evaluate(s, key, tangent, False) - evaluate(-s, key, tangent, False)) / (2 * s) for s in (h, 2 * h))
         expected = (4 * d1 - d2) / 3
         assert evaluate(0.0, key, tangent, True) == pytest.approx(expected, rel=2e-3, abs=3e-4)
+
+
+def test_a_metal_of_index_zero_has_a_slope():
+    """Reflectance at normal incidence is 1 - 4 eta / ((1 + eta)^2 + k^2). Mitsuba's own loses the slope at zero."""
+    activate("llvm_ad_mono")
+    slopes = {}
+    for plugin in ("conductor", "diff_conductor"):
+        bsdf = mi.load_dict({"type": plugin, "eta": {"type": "uniform", "value": 0.0}, "k": 2.0})
+        params, eta = mi.traverse(bsdf), mi.Float(0)
+        dr.enable_grad(eta)
+        params["eta.value"] = eta
+        params.update()
+        _, weight = bsdf.sample(mi.BSDFContext(), interaction(mi.Vector3f(0, 0, 1)), 0.5, mi.Point2f(0.5))
+        dr.backward(weight[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+        slopes[plugin] = float(dr.grad(eta)[0])
+    assert slopes["conductor"] == 0
+    assert slopes["diff_conductor"] == pytest.approx(-4 / 5, rel=1e-5)
+
+
+def test_a_described_metal_of_index_zero_is_built_anew():
+    metal = {"type": "conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}
+    scene = tt.load(mirror_room(metal), variant="llvm_ad_mono")
+    info = scene.parameters()["wall.bsdf.eta.value"]
+    assert info.differentiable and not info.biased and "diff_conductor" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=["wall.bsdf.eta.value"], spp=64)
+    image = renderer(seed=0).steady.sum()
+    image.backward()
+    # Mirrored light falls by 4 / (1 + k^2) for each unit, near normal incidence.
+    slope = renderer.values["wall.bsdf.eta.value"].grad / image.detach()
+    assert float(slope) == pytest.approx(-4 / 5, rel=0.1)

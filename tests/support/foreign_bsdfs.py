@@ -8,13 +8,18 @@ import mitsuba as mi
 
 def register():
     """Their plugins, for the active variant: ``tint``, ``mended_tint`` and ``nameless``."""
+    tint = _tint()
+    for name, kind in (("tint", tint), ("mended_tint", _mended(tint)), ("nameless", _nameless())):
+        mi.register_bsdf(name, kind)
 
+
+def _tint():
     class Tint(mi.BSDF):
         """Half of what another BSDF scatters, whose name it does not tell."""
 
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
-            self.inner = next(props[key] for key in props.keys() if isinstance(props[key], mi.BSDF))
+            self.inner = next(held for _, held in props.objects() if isinstance(held, mi.BSDF))
             self.m_components = [self.inner.flags(i) for i in range(self.inner.component_count())]
             self.m_flags = self.inner.flags()
             self.tint = mi.Float(0.5)
@@ -40,7 +45,11 @@ def register():
         def to_string(self):
             return "Tint[]"
 
-    class MendedTint(Tint):
+    return Tint
+
+
+def _mended(tint):
+    class MendedTint(tint):
         """Weights divide by the detached probability, and it shows what it holds."""
 
         hides_lobe_probability = False
@@ -53,6 +62,10 @@ def register():
         def to_string(self):
             return f"MendedTint[{self.inner}]"
 
+    return MendedTint
+
+
+def _nameless():
     class Nameless(mi.BSDF):
         """Paint without ``to_string``."""
 
@@ -77,5 +90,4 @@ def register():
         def eval_pdf(self, ctx, si, wo, active=True):
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
-    for name, kind in (("tint", Tint), ("mended_tint", MendedTint), ("nameless", Nameless)):
-        mi.register_bsdf(name, kind)
+    return Nameless

@@ -11,8 +11,23 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
-from torchtransient.plugins.transport.scattering.geometry_terms import direction_to, distance, solid_angle_over_area
+from torchtransient.plugins.transport.scattering.geometry_terms import distance
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Guide, Local, Proposal
+
+
+def direction_to(p, q, active, otherwise):
+    """Value of ``otherwise`` with the derivative of the direction from ``p`` to ``q`` where active. Of a point light:
+    points on surfaces that are near move by ``damped_motion``, and a strategy that shares their light has to follow.
+    """
+    v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
+    return dr.replace_grad(otherwise, dr.select(active, dr.normalize(v), otherwise))
+
+
+def solid_angle_over_area(p, q, n, active):
+    """``|cos| / distance^2``, the solid angle at ``p`` of an area at ``q`` with normal ``n``; 1 where inactive."""
+    v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
+    d2 = dr.squared_norm(v)
+    return dr.select(active, dr.abs_dot(n, v) * dr.rsqrt(d2) / d2, 1)
 
 
 class SecondEmitterSample(EmitterSampled):

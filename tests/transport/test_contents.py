@@ -7,9 +7,11 @@ import weakref
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
-from support.gradient_cases.scenes import room
+from support.gradient_cases.scenes import instances, room
+from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.transport.contents import SceneContents
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 
@@ -138,3 +140,35 @@ def test_wanted_follows_what_parameters_move(scene):
     assert camera.sensor and camera.ray and not camera.plain and set(camera.carried) == {"β", "slope", "w", "o", "d"}
     light = wanted("light.position")
     assert light.light and light.geometry and not light.emitter_shape
+
+
+def around(bsdf, wrapper):
+    wrapped = {
+        "group": bsdf,
+        "mask in a group": {"type": "mask", "opacity": 0.5, "nested": bsdf},
+        "mask": {"type": "mask", "opacity": 0.5, "nested": bsdf},
+        "twosided": {"type": "twosided", "nested": bsdf},
+        "bump map": {"type": "bumpmap", "heights": {"type": "checkerboard"}, "nested": bsdf},
+    }[wrapper]
+    description = instances(wrapped) if "group" in wrapper else room(bsdf=wrapped, depth=3)
+    return mi.load_dict(description, optimize=False)
+
+
+@pytest.mark.parametrize("wrapper", ["group", "mask in a group", "mask", "twosided", "bump map"])
+def test_a_lobe_that_joins_is_seen_wherever_it_is(wrapper):
+    scene = around({"type": "principled", "eta": 1.4}, wrapper)
+    assert contents_of(scene).refraction is None
+    params = mi.traverse(scene)
+    key = next(key for key in params.keys() if key.endswith("spec_trans.value"))
+    params[key] = mi.Float(0.9)
+    params.update()
+    table = contents_of(scene).refraction.read().table
+    assert {round(float(index), 5) for index in np.unique(np.array(table))} >= {1.4}
+
+
+def test_another_bsdf_in_a_group_is_seen():
+    scene = around({"type": "diffuse"}, "group")
+    assert contents_of(scene).delta is False and len(contents_of(scene).bsdfs) == 2
+    plate = next(shape for shape in shapes_of_scene(scene) if shape.id() == "plate")
+    plate.set_bsdf(mi.load_dict({"type": "conductor"}))
+    assert contents_of(scene).delta is True

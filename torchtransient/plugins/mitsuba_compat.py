@@ -196,12 +196,17 @@ _FLAT = ("Rectangle", "Disk")
 _LARGE_MESH = 10_000
 
 
+def is_flat_shape(shape: Any) -> bool:
+    """Whether a shape is a rectangle or a disk."""
+    return bool(shape.class_name() in _FLAT)
+
+
 def is_flat(shape: Any) -> bool:
     """Whether the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that it
     merges them into have normals at their vertices: across the faces.
     """
     if not isinstance(shape, mi.Mesh):
-        return bool(shape.class_name() in _FLAT)
+        return is_flat_shape(shape)
     if not shape.has_vertex_normals():
         return True
     if shape.face_count() > _LARGE_MESH:
@@ -211,15 +216,17 @@ def is_flat(shape: Any) -> bool:
     return bool(np.ptp(normals, axis=1).max(initial=0) < 1e-5)
 
 
-def is_patterned(emitter: Any) -> bool:
-    """Whether the light that leaves a surface in a given direction differs from place to place: a texture, or what
-    counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
-    """
-    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
-        return False
-    if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
-        return True
-    return emitter.class_name() != "AreaLight" and emitter.get_shape().class_name() not in _FLAT
+# What scatters or emits alike all over a flat surface unless one of its textures varies. What classes of others ask the
+# place for is not known.
+SCATTER_ALIKE = frozenset(
+    (
+        "SmoothDiffuse", "SmoothDielectric", "RoughDielectric", "ThinDielectric", "SmoothConductor", "RoughConductor",
+        "SmoothPlastic", "RoughPlastic", "PolarizedPlastic", "Principled", "PrincipledThin", "Hair", "Null",
+        "LinearPolarizer", "LinearRetarder", "CircularPolarizer", "BlendBSDF", "MaskBSDF", "TwoSidedBRDF",
+        "BumpMap", "NormalMap",
+    )
+)  # fmt: skip
+EMIT_ALIKE = frozenset(("AreaLight", "DirectionalArea"))
 
 
 def bounds_of(shape: Any) -> Any:

@@ -7,10 +7,10 @@ methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the pa
 the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
 Which mixtures are taken apart: blends of delta lobes and of what lets light through always; for derivatives also those
-around a BSDF that hides the probability of its lobes. Where the weight itself has a derivative and is exactly zero or
-one, the part that would never be chosen is, at times: the slope there is not zero. All other mixtures are left to
-Mitsuba, whose sum over the parts has less noise; so are those inside a plugin that cannot be rebuilt around a part (one
-of others), unless they would have to be taken apart, which is an error.
+around a BSDF that hides the probability of its lobes. Where the weight itself has a derivative and is zero, one or
+almost, the part that would never or hardly be chosen is, at times: the slope there is not less than elsewhere. All
+other mixtures are left to Mitsuba, whose sum over the parts has less noise; so are those inside a plugin that cannot be
+rebuilt around a part (one of others), unless they would have to be taken apart, which is an error.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from torchtransient.errors import GradientError, SceneError
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
 from torchtransient.plugins.bsdfs.wrapper_copy import can_be_rebuilt, flags_of, rebuild_wrapper
 from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
-from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects_of, shown_by
+from torchtransient.plugins.node_walk import bsdfs_below, carries_derivatives, objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 
-# Probability of a part whose weight is exactly zero, where the derivative by the weight is asked for.
+# Probability of a part of less weight, where the derivative by the weight is asked for and the mixture is taken apart.
 LEAST_PROBABILITY = 0.25
+# Mixtures are taken apart for it where a part has less weight than this. The derivative is that of a whole part, and in
+# Mitsuba's sum its standard deviation grows by the root of one over the weight; above, the sum has less noise.
+FAINT = 0.05
 
 
 @dataclass(frozen=True)
@@ -115,19 +118,12 @@ class Mixture:
                 params.update()
 
     def taken_apart(self, derivatives: bool) -> tuple[bool, bool]:
-        """(everywhere, where a weight is 0 or 1)."""
+        """(everywhere, where a weight is about 0 or 1)."""
         return self.for_derivatives if derivatives else self.always, derivatives and self._has_derivative()
 
     def _has_derivative(self) -> bool:
         """Whether one of its weights carries derivatives; asked with gradients enabled."""
-        return any(attached_below(texture) for texture in self.textures)
-
-
-def attached_below(plugin: Any) -> list[Any]:
-    """The values of a plugin and of what it holds that carry derivatives; asked with gradients enabled."""
-    nodes = (plugin, *objects_below(plugin, mi.Object))
-    values = (shown.read(node) for node in nodes for shown in shown_by(node)[0])
-    return [value for value in values if dr.grad_enabled(value)]
+        return any(carries_derivatives(texture) for texture in self.textures)
 
 
 class Seal:
@@ -159,14 +155,16 @@ class Seal:
 
     def check(self, wanted: Any) -> None:
         """Raise GradientError where derivatives need the mixture taken apart; asked with gradients enabled."""
-        if self._hides and (wanted.geometry or any(attached_below(part) for part in self._mixtures)):
+        if self._hides and (wanted.geometry or any(carries_derivatives(part) for part in self._mixtures)):
             raise GradientError(
                 f"{self._names(self._mixtures[0])}, and a delta lobe in it hides the derivative of its probability. "
                 f"{self._REMEDY}"
             )
         for mixture in self._mixtures:
             texture = dict(objects_of(mixture))[weight_slot(mixture)]
-            weights = (np.array(dr.detach(value)) for value in attached_below(texture))
+            held = (texture, *objects_below(texture, mi.Object))
+            values = (shown.read(part) for part in held for shown in shown_by(part)[0])
+            weights = (np.array(dr.detach(value)) for value in values if dr.grad_enabled(value))
             if any(((weight <= 0) | (weight >= 1)).any() for weight in weights):
                 raise GradientError(
                     f"{self._names(mixture)}, whose weight is exactly 0 or 1, where the derivative by it is lost. "
@@ -224,7 +222,7 @@ class Mixtures:
 class MixtureChoice:
     """Takes mixtures apart in one job. Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
 
-    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is taken apart where a weight is 0 or 1).
+    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
     """
 
     def __init__(self, mixtures: Mixtures, chosen: dict[int, tuple[bool, bool]]) -> None:
@@ -256,7 +254,7 @@ class MixtureChoice:
 
 
 def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) -> tuple[Any, Any, Any]:
-    """(number of a part, its weight over its probability, whether a weight on the way or beside it is 0 or 1)."""
+    """(number of a part, its weight over its probability, whether a weight on the way or beside it is about 0 or 1)."""
     if isinstance(tree, Leaf):
         return mi.UInt32(tree.index), mi.Float(1), mi.Bool(False)
     if isinstance(tree, Sides):
@@ -268,8 +266,8 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
     w = dr.select(w < 0, 0, dr.select(w > 1, 1, w))
     p, end = dr.detach(w), mi.Bool(False)
     if at_ends:
-        end = (p == 0) | (p == 1)
-        p = dr.select(end, dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY), p)
+        end = (p < FAINT) | (p > 1 - FAINT)
+        p = dr.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
     second = u < p
     chance = dr.select(second, p, 1 - p)
     u = dr.select(second, u, u - p) / dr.select(chance > 0, chance, 1)

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import has_surface, is_instance
@@ -81,6 +82,17 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
 
     enter(node)
     return list(found.values())
+
+
+def carries_derivatives(node: Any) -> bool:
+    """Whether a number of a plugin, or of what it holds, is attached; to be asked with gradients enabled."""
+    below = (node, *objects_below(node, mi.Object))
+    return any(dr.grad_enabled(shown.read(part)) for part in below for shown in shown_by(part)[0])
+
+
+def attached_as(*values: Any) -> tuple[int, ...]:
+    """Which nodes of the graph of derivatives arrays are, 0 for none; to be asked with gradients enabled."""
+    return tuple(value.index_ad if dr.grad_enabled(value) else 0 for value in values)
 
 
 def bsdfs_below(node: Any) -> list[Any]:

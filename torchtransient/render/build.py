@@ -30,7 +30,7 @@ from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
-from torchtransient.render.nodes import check_finite, children, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.nodes import check_finite, children, descendants, find_child, is_film, is_integrator, media_in_use
 from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 
@@ -334,8 +334,8 @@ def _substitute_plugins(state: Any, options: BuildOptions) -> None:
             node.props["format"] = "variant"
         elif plugin == "twosided":
             # A lobe that is built although its weight is zero may be one of transmission.
-            held = [state.nodes[index] for _, index in children(state, node)]
-            if any(child.props.id() in asked and child.props.plugin_name() in BUILDS_LOBES for child in held):
+            held = descendants(state, node)
+            if any(inner.props.id() in asked and inner.props.plugin_name() in BUILDS_LOBES for inner in held):
                 node.props["allow_transmission"] = True
 
 

@@ -30,6 +30,18 @@ def children(state: Any, node: Any) -> list[tuple[str, int]]:
     return result
 
 
+def descendants(state: Any, node: Any) -> list[Any]:
+    """The nodes below a node, each once."""
+    found: dict[int, Any] = {}
+    waiting = [node]
+    while waiting:
+        for _, index in children(state, waiting.pop()):
+            if index not in found:
+                found[index] = state.nodes[index]
+                waiting.append(found[index])
+    return list(found.values())
+
+
 def check_finite(state: Any) -> None:
     """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
     bad: dict[str, str] = {}

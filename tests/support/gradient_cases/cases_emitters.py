@@ -22,6 +22,19 @@ def projector():
     return {"type": "projector", "irradiance": 2.0, "fov": 40.0, "to_world": pose, "scale": 1.0}
 
 
+def lamp_under_a_sky(integrator="transient_path"):
+    """An area light and light from everywhere."""
+    scene = room(light=area_light(), sky=picture_sky(), sensor=camera(start=2.0), side_reflectance=0.2)
+    scene["integrator"]["type"] = integrator
+    return scene
+
+
+def color_beside_a_pose(params, x):
+    """The pose is asked for beside the colour, and stays."""
+    set_color("wall.bsdf.reflectance.value")(params, x)
+    move("light.to_world", (1, 0, 0))(params, 0 * x)
+
+
 def angular_light():
     """An area light that emits into a cone with a soft rim."""
     lamp = area_light()
@@ -138,6 +151,15 @@ CASES = [
         5e-3,
         spp=4096,
         fd_spp=8192,
+    ),
+    Case("color_beside_a_lamp_and_a_sky", "area light shape", lamp_under_a_sky, color_beside_a_pose, 0.5, 0.05),
+    Case(
+        "color_beside_a_lamp_and_a_sky_volpath",
+        "area light shape",
+        lambda: lamp_under_a_sky("transient_prbvolpath"),
+        color_beside_a_pose,
+        0.5,
+        0.05,
     ),
     Case(
         "angular_light_radiance",

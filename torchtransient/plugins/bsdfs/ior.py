@@ -9,7 +9,8 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 
-# Each of two lobes is drawn at least this often where one of them is black: its slope is not zero.
+# Each of two lobes is drawn at least this often where one of them is black, and in derivatives by their reflectances:
+# the slope of a faint lobe is that of a bright one.
 LEAST_SHARE = 0.25
 
 
@@ -35,14 +36,16 @@ def optional_texture(props: Any, name: str) -> Any | None:
     return props.get_texture(name) if name in props else None
 
 
-def specular_share(specular: Any | None, diffuse: Any) -> Any:
-    """Detached share of the specular lobe among the samples, by the mean reflectances of both lobes' textures."""
+def specular_share(specular: Any | None, diffuse: Any, followed: bool) -> Any:
+    """Detached share of the specular lobe among the samples, by the mean reflectances of both lobes' textures;
+    ``followed``: for derivatives by one of them.
+    """
     with dr.suspend_grad():
         d = mi.Float(diffuse.mean())
         s = mi.Float(1) if specular is None else mi.Float(specular.mean())
         share = s / dr.select(d + s > 0, d + s, 1)
-        one_is_black = (d <= 0) | (s <= 0)
-        return opaque(dr.select(one_is_black, dr.clip(share, LEAST_SHARE, 1 - LEAST_SHARE), share))
+        both = dr.clip(share, LEAST_SHARE, 1 - LEAST_SHARE)
+        return opaque(both if followed else dr.select((d <= 0) | (s <= 0), both, share))
 
 
 def opaque(value: Any) -> Any:

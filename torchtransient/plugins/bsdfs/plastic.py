@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 
 from .fresnel import fresnel
@@ -45,7 +46,16 @@ class DiffPlastic(mi.BSDF):
 
     def parameters_changed(self, keys: Any = ()) -> None:
         opaque(self.eta)
-        self._specular_weight = specular_share(self.specular_reflectance, self.diffuse_reflectance)
+        self._followed = None
+        self.follow_derivatives(True)
+
+    def follow_derivatives(self, asked: bool) -> None:
+        """As :meth:`.principled.DiffPrincipled.follow_derivatives`."""
+        lobes = [lobe for lobe in (self.specular_reflectance, self.diffuse_reflectance) if lobe is not None]
+        followed = asked and any(carries_derivatives(lobe) for lobe in lobes)
+        if followed != self._followed:
+            self._followed = followed
+            self._specular_weight = specular_share(self.specular_reflectance, self.diffuse_reflectance, followed)
 
     # ------------------------------------------------------------------------------------------------------- lobes
 

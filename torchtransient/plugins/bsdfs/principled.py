@@ -12,13 +12,15 @@ import mitsuba as mi
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.mitsuba_compat import LOST_AT
 from torchtransient.plugins.mitsuba_parameters import PRINCIPLED_INDEX
+from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import declare_effects
 
 from .ior import opaque
 
 # How a weight is read by the BSDF of Mitsuba that is asked.
 AS_IT_IS, BESIDE_ITS_END, AWAY_FROM_ITS_END = "as it is", "beside its end", "away from its end"
-# Share of the range of a weight by which sampling keeps away from an end.
+# Share of the range of a weight by which sampling keeps away from an end: the derivative by a weight is that of a whole
+# lobe, however little there is of it, and samples that are as rare as the lobe is faint would be as noisy.
 AWAY = 0.25
 # From zero, and from larger ends relative to them: the least steps that a comparison notices.
 STEP, RELATIVE_STEP = 1e-30, 6e-8
@@ -28,7 +30,9 @@ LEAST_COLOUR = 1e-4
 
 
 class Reading:
-    """How the weights are read now: ``how``, and ``away``, those that sampling keeps away from their ends."""
+    """How the weights are read now: ``how``, and ``away``, those that sampling keeps away from their ends because
+    derivatives by them are computed.
+    """
 
     def __init__(self) -> None:
         self.how = AS_IT_IS
@@ -54,7 +58,8 @@ class Weight(mi.Texture):
             if self.slot in self.reading.away:
                 span = max(1.0, *self.ends)
                 for end in self.ends:
-                    value = dr.select(value == end, abs(end - AWAY * span), value)
+                    inside = abs(end - AWAY * span)
+                    value = dr.maximum(value, inside) if end == 0 else dr.minimum(value, inside)
         return value
 
     def eval(self, si: Any, active: Any = True) -> Any:
@@ -107,8 +112,8 @@ class DiffPrincipled(mi.BSDF):
 
     Mitsuba skips a lobe of weight zero, its value and its samples. Here it is asked three times: for values with the
     weights as they are, for derivatives with weights that are beside such an end by less than rounding, and for
-    samples with weights that keep away from it. The last holds for weights that were changed since the plugin was
-    built: those that a derivative is asked by. Without any, samples are those of Mitsuba.
+    samples with weights that keep away from it. The last holds for weights that carry derivatives in a job that asks
+    for them (:meth:`follow_derivatives`); all other samples are those of Mitsuba.
 
     ``lobes``: names of weights, separated by commas, whose lobes are built although they are zero or not given.
     ``sample`` draws a detached direction, its weight is value over density. Sampling rates are fixed when built.
@@ -125,7 +130,7 @@ class DiffPrincipled(mi.BSDF):
 
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
-        self.index, self.index_value = "", None
+        self.index, self.index_value, self._handed_on = "", None, (0,)
         self._read_index(props)
         # Mitsuba leaves out what is not given, or given as the number zero, until it is changed.
         self.built = {name for name in self.slots if name in self.always or _is_given(props, name)}
@@ -167,19 +172,41 @@ class DiffPrincipled(mi.BSDF):
             cb.put(self.index, self.index_value, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
     def parameters_changed(self, keys: Any = ()) -> None:
-        changed = set(keys) & set(self.slots)
-        self.reading.away |= changed & set(LOST_AT[self.kind])
-        if not changed <= self.built:
-            self.built |= changed
-            self._build()
-        if self.index:
-            opaque(self.index_value)
-            # Mitsuba takes the same for an index of one, and loses the derivative.
-            one, instead = (0, 1e-3) if self.index == "specular" else (1, 1.001)
-            value = self.index_value
-            params = mi.traverse(self.own)
-            params[self.index] = dr.select(value == one, value + (instead - one), value)
-            params.update()
+        self._have_built(set(keys) & set(self.slots))
+        self._hand_index_on()
+        self.follow_derivatives(True)
+
+    def follow_derivatives(self, asked: bool) -> None:
+        """Look which parameters carry derivatives now; to be asked with gradients enabled and before a job. ``asked``:
+        it is one of derivatives.
+
+        Mitsuba tells only one of the plugins that share a texture of its changes, and none when derivatives are
+        switched on in place.
+        """
+        attached = {name for name, texture in self.textures.items() if asked and carries_derivatives(texture)}
+        self.reading.away = attached & set(LOST_AT[self.kind])
+        rebuilt = self._have_built(attached)
+        if self.index and (rebuilt or self._handed_on != attached_as(self.index_value)):
+            self._hand_index_on()
+
+    def _have_built(self, names: set[str]) -> bool:
+        """Build the BSDF of Mitsuba anew if it lacks the lobes of these weights; whether it did."""
+        if names <= self.built:
+            return False
+        self.built |= names
+        self._build()
+        return True
+
+    def _hand_index_on(self) -> None:
+        if not self.index:
+            return
+        value = opaque(self.index_value)
+        self._handed_on = attached_as(value)
+        # Mitsuba takes the same for an index of one, and loses the derivative.
+        one, instead = (0, 1e-3) if self.index == "specular" else (1, 1.001)
+        params = mi.traverse(self.own)
+        params[self.index] = dr.select(value == one, value + (instead - one), value)
+        params.update()
 
     # ------------------------------------------------------------------------------------------- as it is read
 

@@ -88,16 +88,15 @@ def _refractive_leaves(bsdf: Any, lobes: tuple[Any, ...]) -> list[Any]:
     """The BSDFs inside ``bsdf``, or itself, that hold an index of refraction; none if it does not refract through one
     of the kinds of ``lobes``.
     """
-    if not _has_refraction_lobe(bsdf, lobes):
-        return []
     leaves: list[Any] = []
     pending = [bsdf]
     while pending:
         node = pending.pop()
         nested = bsdfs_below(node)
         if nested:
-            pending.extend(child for child in nested if _has_refraction_lobe(child, lobes))
-        elif not has_equal_sides(node):
+            # What holds others does not notice when they get another lobe.
+            pending.extend(nested)
+        elif _has_refraction_lobe(node, lobes) and not has_equal_sides(node):
             leaves.append(node)
     return leaves
 

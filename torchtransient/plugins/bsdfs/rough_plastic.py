@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.node_walk import attached_as, carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 
 from .fresnel import fresnel
@@ -66,10 +67,23 @@ class DiffRoughPlastic(mi.BSDF):
             cb.put("specular_reflectance", self.specular_reflectance, +mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any = ()) -> None:
-        self.specular_share = specular_share(self.specular_reflectance, self.diffuse_reflectance)
         opaque(self.eta)
         opaque(self.alpha)
         if not keys or "alpha" in keys or "eta" in keys:
+            self._tables_of = None
+        self._followed = None
+        self.follow_derivatives(True)
+
+    def follow_derivatives(self, asked: bool) -> None:
+        """As :meth:`.principled.DiffPrincipled.follow_derivatives`."""
+        lobes = [lobe for lobe in (self.specular_reflectance, self.diffuse_reflectance) if lobe is not None]
+        followed = asked and any(carries_derivatives(lobe) for lobe in lobes)
+        if followed != self._followed:
+            self._followed = followed
+            self.specular_share = specular_share(self.specular_reflectance, self.diffuse_reflectance, followed)
+        attached = attached_as(self.alpha, self.eta)
+        if attached != self._tables_of:
+            self._tables_of = attached
             alpha = self._alpha()
             self.transmittance = external_transmittance(alpha, self.eta, self.ggx)
             self.thrown_back = internal_reflectance(alpha, self.eta, self.ggx)

@@ -212,6 +212,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
+            self._seen_scene(scene).follow_derivatives(scene, False)
             if develop:
                 film.check_one_band()
             world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
@@ -265,6 +266,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _wanted(self, scene, sensor, film):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
+        self._seen_scene(scene).follow_derivatives(scene, True)
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
             effects = self.parameters(scene).attached()

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from torchtransient.plugins.described_scene import check_scene, described
+from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.parameters import ParameterTracker
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.transport.contents import SceneContents
@@ -12,7 +16,7 @@ from torchtransient.plugins.transport.contents import SceneContents
 
 class SeenScene:
     """Look-ups that need to be made once a scene: the ``reference`` sphere of distant light, the contents by sensor,
-    the parameters.
+    the parameters, the BSDFs with all that they hold.
 
     The reference is that of the scene as described, see :mod:`..described_scene`: neither moving a shape nor what was
     rendered before may shift the clock. The scene itself is not kept, since it owns the integrator and would never be
@@ -25,13 +29,28 @@ class SeenScene:
         self.reference: DistantReference = self._described.reference
         # So that no later scene can be taken for this one because it got the same addresses.
         self._kept = scene.shapes()[:1]
-        self._plugins: tuple[int, ...] = ()
+        own = {shape.ptr for shape in scene.shapes()}
+        self._in_groups = [shape for shape in shapes_of_scene(scene) if shape.ptr not in own]
+        self._pointers: tuple[int, ...] = ()
+        self._lobes: list[int] = []
+        self._bsdfs: list[Any] = []
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
         return self._described.is_of(scene)
+
+    def follow_derivatives(self, scene: Any, asked: bool) -> None:
+        """Let the BSDFs that sample otherwise for derivatives look which parameters carry some now. ``asked``: for a
+        job of derivatives. What they build for it belongs to the scene's contents.
+        """
+        self._forget_replaced(scene)
+        with dr.resume_grad():
+            for bsdf in self._bsdfs:
+                follow = getattr(bsdf, "follow_derivatives", None)
+                if follow is not None:
+                    follow(asked)
 
     def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
         """What the scene contains for a sensor, which may stand in a medium."""
@@ -48,19 +67,17 @@ class SeenScene:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
-
     def _forget_replaced(self, scene: Any) -> None:
         """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""
-        plugins = _plugins_of(scene)
-        if plugins != self._plugins:
-            self._plugins, self._tracker = plugins, None
+        bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in [*scene.shapes(), *self._in_groups]) if bsdf is not None]
+        # By address: those in use are kept by the scene.
+        pointers = (*(bsdf.ptr for bsdf in bsdfs), *(emitter.ptr for emitter in scene.emitters()))
+        if pointers != self._pointers:
+            outermost = {bsdf.ptr: bsdf for bsdf in bsdfs}.values()
+            nested = [part for bsdf in outermost for part in objects_below(bsdf, mi.BSDF)]
+            self._bsdfs = list({bsdf.ptr: bsdf for bsdf in [*outermost, *nested]}.values())
+        # Changed parameters may add a lobe, which those around a BSDF do not tell of.
+        lobes = [bsdf.flags() for bsdf in self._bsdfs]
+        if pointers != self._pointers or lobes != self._lobes:
+            self._pointers, self._lobes, self._tracker = pointers, lobes, None
             self._contents.clear()
-
-
-def _plugins_of(scene: Any) -> tuple[int, ...]:
-    """What surfaces and lights are made of, by address: those in use are kept by the scene. With the kinds of lobes,
-    since changed parameters may add one.
-    """
-    bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in scene.shapes()) if bsdf is not None]
-    lights = (emitter.ptr for emitter in scene.emitters())
-    return (*(bsdf.ptr for bsdf in bsdfs), *(bsdf.flags() for bsdf in bsdfs), *lights)

@@ -20,6 +20,9 @@ from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
 from torchtransient.plugins.node_walk import objects_below, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 
+# How many numbers of a light kernels load at once.
+_PACKET = 4
+
 
 class SphereLights:
     """The spherical lights among ``lights``, the emitters of one scene; ``numbers``: which ones. ``all``: there are no
@@ -72,6 +75,7 @@ class SphereLights:
         numbers = [matrix[0, 3], matrix[1, 3], matrix[2, 3], r, dr.square(r), dr.square(edge), outward, pmf]
         if self.textured:
             numbers += [matrix[row, column] for row in range(3) for column in range(3)]
+            numbers += [0.0] * (-len(numbers) % _PACKET)
         return [mi.Float(number) for number in numbers]
 
 
@@ -88,8 +92,8 @@ class SphereLightTable:
     def __init__(self, lights: SphereLights, rows: list[list[Any]]) -> None:
         self._marks, self.all = lights.marks, lights.all
         self._rows, self._width = rows, len(rows[0])
-        # A light that is the only one is not looked up: kernels read its numbers as they are.
-        self._only = rows[0] if lights.all and len(rows) == 1 else None
+        # Where there is only one, kernels read its numbers as they are instead of looking them up.
+        self._only = rows[0] if len(rows) == 1 else None
         self._values = None if self._only else self._laid_out(rows)
 
     def _laid_out(self, rows: list[list[Any]]) -> Any:
@@ -153,8 +157,9 @@ class SphereLightTable:
             return self._only
         slot = self._marks.look_up(emitter, active)
         known = slot > 0
-        first = dr.select(known, slot - 1, 0) * self._width
-        return [dr.gather(mi.Float, self._values, first + k, known) for k in range(self._width)]
+        packets = self._width // _PACKET
+        first = dr.select(known, slot - 1, 0) * packets
+        return [x for k in range(packets) for x in dr.gather(mi.Vector4f, self._values, first + k, known)]
 
 
 class _Sphere:

@@ -11,9 +11,9 @@ import mitsuba as mi
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import has_vertices, is_flat, is_patterned, lacks_directions
+from torchtransient.plugins.mitsuba_compat import has_vertices, is_flat, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
-from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
@@ -21,6 +21,7 @@ from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
 from torchtransient.plugins.transport.instances import Instances
 from torchtransient.plugins.transport.media_contents import media_of
+from torchtransient.plugins.transport.patterns import emits_by_place, scatters_by_place
 
 # Derivatives let points slide along with the vertex that sees them where they are nearer than this share of the scene's
 # radius and of the path's first segment. Creases and edges so near are not followed: it is as small as the variance in
@@ -66,9 +67,9 @@ class SceneContents:
         self.sphere_lights = SphereLights.of(scene)
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
-        self.patterned_lights = any(is_patterned(e) for e in scene.emitters())
+        self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
-        self.patterned |= any(_is_patterned(bsdf) for bsdf in outermost)
+        self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
         self._built = True
 
@@ -80,14 +81,6 @@ class SceneContents:
         if getattr(self, "_built", False):
             raise AttributeError(f"SceneContents does not change once built; tried to set {name!r}.")
         super().__setattr__(name, value)
-
-
-def _is_patterned(bsdf: Any) -> bool:
-    """Whether a BSDF may scatter otherwise at another place of a flat surface. What one of another library written in
-    Python asks for is not known.
-    """
-    own = type(bsdf).__module__.split(".")[0] in ("mitsuba", "torchtransient")
-    return not own or any(texture.is_spatially_varying() for texture in objects_below(bsdf, mi.Texture))
 
 
 def _two_sided(bsdfs: list[Any]) -> PointerTable | None:

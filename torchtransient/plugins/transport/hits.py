@@ -22,17 +22,23 @@ _ELLIPSOID, _POINT = 10, 4
 
 
 class DetachedHits:
-    """The shapes of a scene that leave their hit points detached. Does not change once built."""
+    """The shapes of a scene that leave their hit points detached; how many ellipsoids each has may change."""
 
     def __init__(self, shapes: Sequence[Any]) -> None:
         shown = [(shape, {value.key: value for value in shown_by(shape)[0]}) for shape in shapes]
         self._ellipsoids = [(shape, values) for shape, values in shown if "data" in values]
         self._curves = [(shape, values) for shape, values in shown if "control_points" in values]
-        # Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none.
+        self._starts: list[list[int]] = []
+        self._find_starts()
+
+    def _find_starts(self) -> None:
+        """Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none."""
         ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
         segments = _starts([values["segment_indices"].read(shape) for shape, values in self._curves], 1)
-        self._first_ellipsoid = PointerTable([shape for shape, _ in self._ellipsoids], [1 + n for n in ellipsoids])
-        self._first_segment = PointerTable([shape for shape, _ in self._curves], [1 + n for n in segments])
+        if [ellipsoids, segments] != self._starts:
+            self._first_ellipsoid = PointerTable([shape for shape, _ in self._ellipsoids], [1 + n for n in ellipsoids])
+            self._first_segment = PointerTable([shape for shape, _ in self._curves], [1 + n for n in segments])
+            self._starts = [ellipsoids, segments]
 
     @staticmethod
     def of(scene: Any) -> DetachedHits | None:
@@ -43,6 +49,7 @@ class DetachedHits:
     def read(self) -> HitTable:
         """Their parameters as they are now, attached where they are; to be called outside of loops, once a job."""
         with dr.resume_grad():
+            self._find_starts()
             kinds: list[Any] = []
             if self._ellipsoids:
                 kinds.append(EllipsoidTable(self._ellipsoids, self._first_ellipsoid))

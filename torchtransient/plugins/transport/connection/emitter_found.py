@@ -3,7 +3,8 @@
 The point of a found light belongs to the vertex that scattered towards it. Where the light's shape moves it is attached
 there (``_ahead``) as a material point, as it is for connections: both strategies must move their samples alike, or the
 weights between them would no longer sum to one under the motion. Where the sensor or a delta lobe led to it, no other
-strategy could have: the ray decides, and it is attached at the light's own vertex (``_here``).
+strategy could have: the ray decides, and it is attached at the light's own vertex (``_here``). So is light without a
+shape, from infinitely far away.
 """
 
 from __future__ import annotations
@@ -72,10 +73,12 @@ class EmitterFound(Connection):
         mis = v.of(self.name)["mis"]
         hit = v.active & (mis > 0)
         emitter = vertex.sid.emitter(world.scene)
-        if wanted.emitter_shape:
-            hit &= v.before(world.scattering.name, "delta", at_sensor=True)
-        elif (claimed := self._claimed(world, emitter, v.ray.d, wanted)) is not None:
-            hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~claimed
+        elsewhere = self._claimed(world, emitter, v.ray.d, wanted)
+        if wanted.emitter_shape:  # the vertex before counts what has a shape, whether it claims it or not
+            shaped = vertex.sid.is_valid()
+            elsewhere = shaped if elsewhere is None else elsewhere | shaped
+        if elsewhere is not None:
+            hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~elsewhere
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
         return EventTerm(value=first_column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
 
