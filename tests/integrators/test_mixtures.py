@@ -108,6 +108,20 @@ def check_sum(mixture, parts, room=mirror_room):
     assert error < 0.02 * expected
 
 
+def test_kinds_of_glass_that_become_different():
+    """Paths behind either kind count its own index, whatever was rendered first."""
+    images = []
+    for first in (1.5, 1.2):
+        mixture = blend(ROUGH_GLASS, {**ROUGH_GLASS, "int_ior": first}, 0.5)
+        scene = mi.load_dict(seen_through(mixture), optimize=False)
+        scene.integrator().render(scene, seed=0, spp=4)
+        params = mi.traverse(scene)
+        params["wall.bsdf.bsdf_1.eta"] = mi.Float(1.2)
+        params.update()
+        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
+
+
 TILTED, FLAT = (0.85, 0.5, 0.85), (0.5, 0.5, 1.0)
 FLAGS = [{"flip_invalid_normals": flips, "use_shadowing_function": shadows} for flips in (0, 1) for shadows in (0, 1)]
 FLAGS = [{name: bool(value) for name, value in flags.items()} for flags in FLAGS]
