@@ -1,8 +1,8 @@
 """Textures that are exactly zero inside a normal map.
 
 Mitsuba's normal map forgets the density of samples whose weight is zero: paths end there
-(:func:`.mitsuba_compat.forgets_black_samples`), and the derivative by what is black, as far as it is due to the light beyond, is lost. A number that
-leaves no weight to speak of, but is not zero, keeps both.
+(:func:`.mitsuba_compat.forgets_black_samples`), and the derivative by what is black, as far as it is due to the light
+beyond, is lost. A number that leaves no weight to speak of, but is not zero, keeps both.
 """
 
 from __future__ import annotations

@@ -192,6 +192,13 @@ def leaves_hits_detached(shape: Any) -> bool:
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
+def misplaces_hits(shape: Any) -> bool:
+    """Whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it: Mitsuba
+    projects onto one of two directions of its surface as if they were perpendicular.
+    """
+    return bool(shape.class_name() == "BSplineCurve")
+
+
 def has_vertices(shape: Any) -> bool:
     """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
