@@ -23,21 +23,14 @@ WRITTEN_AGAINST = "3.9.1"
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
 # Those of the others (Mitsuba's dielectric, ours) divide by the detached probability.
-_CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
-# A scene's BSDFs show themselves by their description, nested ones included.
-_TWO_SIDED_DESCRIPTION = "TwoSided["
+_CANCELLING = ("ThinDielectric", "SmoothPlastic")
 # Mixtures, and the slot of the texture or volume that says how much of the (second) nested one there is.
 _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFunction": "weight"}
-_MIXTURES = ("Mask[", "BlendBSDF[")
 
 
-def hides_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
-
-    Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
-    """
-    shown = str(bsdf)
-    return any(name in shown for name in _CANCELLING) and not any(name in shown for name in _MIXTURES)
+def cancels_lobe_probability(bsdf: Any) -> bool:
+    """Whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    return bsdf.class_name() in _CANCELLING
 
 
 def weight_slot(bsdf: Any) -> str | None:
@@ -47,27 +40,23 @@ def weight_slot(bsdf: Any) -> str | None:
     return _WEIGHT_SLOTS.get(bsdf.class_name())
 
 
-def mixes_delta(bsdf: Any) -> bool:
-    """Whether a BSDF is a blend of which a part has a delta lobe.
+def adds_up_wrongly(bsdf: Any, nested: list[Any]) -> bool:
+    """Whether a BSDF is a blend of which a part has a delta lobe or lets light through; ``nested``: all BSDFs that it
+    holds, asked themselves since a blend does not notice lobes that they get later.
 
-    Mitsuba divides the sum of both parts' values by the sum of their densities, of which that of a delta lobe is a
-    probability instead: the values of such blends are wrong, and the derivatives of their weights.
+    Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is a
+    probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
+    one that is seen from behind, a rough one whose facet mirrors or refracts there. What lets light through has a value
+    there, which counts once too often (rough glass and paint, from behind: 10 %).
     """
-    return bool(bsdf.class_name() == "BlendBSDF" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
-
-
-def is_two_sided(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
-
-    From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
-    Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
-    exchanged.
-    """
-    return _TWO_SIDED_DESCRIPTION in str(bsdf)
+    lobes = (mi.BSDFFlags.Delta, mi.BSDFFlags.Transmission)
+    return bool(
+        bsdf.class_name() == "BlendBSDF" and any(mi.has_flag(part.flags(), lobe) for part in nested for lobe in lobes)
+    )
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided``."""
+    """Whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
@@ -79,10 +68,20 @@ def has_equal_sides(bsdf: Any) -> bool:
 # Slots of BSDFs that hold a texture of normals or heights, which turns the frame that the nested BSDF works in.
 _NORMAL_TEXTURES = {"NormalMap": "normalmap", "BumpMap": "nested_texture"}
 
+# Flags of these that a built one does not show.
+HIDDEN_FLAGS = ("flip_invalid_normals", "use_shadowing_function")
+
 
 def normal_texture(bsdf: Any) -> str | None:
     """Name of the texture by which a BSDF turns the shading frame, None for BSDFs that leave it."""
     return _NORMAL_TEXTURES.get(bsdf.class_name())
+
+
+def forgets_black_samples(bsdf: Any) -> bool:
+    """Whether a BSDF reports no density for samples of the one it holds whose weight is zero: paths end there, and the
+    derivative of what is black, by the light that comes from elsewhere, is lost. Mitsuba's bump map keeps it.
+    """
+    return bool(bsdf.class_name() == "NormalMap")
 
 
 def is_bump_map(bsdf: Any) -> bool:
@@ -185,6 +184,13 @@ def leaves_hits_detached(shape: Any) -> bool:
     ray that moves.
     """
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
+
+
+def misplaces_hits(shape: Any) -> bool:
+    """Whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it: Mitsuba
+    projects onto one of two directions of its surface as if they were perpendicular.
+    """
+    return bool(shape.class_name() == "BSplineCurve")
 
 
 def has_vertices(shape: Any) -> bool:

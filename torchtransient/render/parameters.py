@@ -257,6 +257,13 @@ class Slot:
             raise SceneError(f"parameter {key!r} is not numeric.")
         self.shape: tuple[int, ...] = shape
 
+    def loses_black(self) -> bool:
+        """Whether derivatives are lost where the value is exactly zero."""
+        if self.kind == "mesh_transform":
+            return False
+        scene = self._built.scene
+        return bool(scene.integrator().parameters(scene).loses_black(self._built.params.properties[self.key][2]))
+
     @property
     def size(self) -> int:
         """Number of entries."""

@@ -9,14 +9,9 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.delay_table import delays_of
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import (
-    has_vertices,
-    hides_lobe_probability,
-    is_flat,
-    is_two_sided,
-    lacks_directions,
-)
+from torchtransient.plugins.mitsuba_compat import has_vertices, is_flat, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
@@ -89,7 +84,7 @@ class SceneContents:
 
 
 def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
-    found = [bsdf for bsdf in bsdfs if is_two_sided(bsdf)]
+    found = [bsdf for bsdf in bsdfs if mirrors_matrices(bsdf)]
     # A path may be handed a part of a BSDF by the part's own pointer.
-    found += [part for bsdf in found for part in bsdfs_below(bsdf) if is_two_sided(part)]
+    found += [part for bsdf in found for part in bsdfs_below(bsdf) if mirrors_matrices(part)]
     return PointerTable.marking(found)
