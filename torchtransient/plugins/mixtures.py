@@ -6,7 +6,8 @@ part was chosen is lost. Here the choice is made outside of the BSDFs' methods, 
 (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which
 the weight is attached and the probability is not.
 
-Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
+Which mixtures are taken apart: blends of delta lobes always, and blends whose parts do not all work on the same sides
+of a surface (:func:`.mitsuba_compat.mixes_sides`); for derivatives also those around a BSDF that hides the
 probability of its lobes. Where the weight itself has a derivative and is exactly zero or one, the part that would never
 be chosen is, at times: the slope there is not zero. All other mixtures are left to Mitsuba, whose sum over the parts
 has less noise.
@@ -21,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, weight_slot
+from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, mixes_sides, weight_slot
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 
@@ -67,7 +68,7 @@ class Mixture:
         self.wrapped: list[tuple[Any, Any]] = []
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        self.always = any(mixes_delta(part) for part in [node, *objects_below(node, kind)])
+        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
@@ -118,6 +119,12 @@ class Mixture:
             for node in (texture, *objects_below(texture, mi.Object))
             for shown in shown_by(node)[0]
         )
+
+
+def needs_choice(node: Any) -> bool:
+    """Whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
+    return mixes_delta(node) or mixes_sides(node, held)
 
 
 def is_mixture(node: Any, kind: type) -> bool:
