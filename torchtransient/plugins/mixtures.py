@@ -6,7 +6,12 @@ derivative of the probability with which a part was chosen is lost. Here the cho
 methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and
 the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
-        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
+Which mixtures are taken apart: blends of delta lobes, of what lets light through, and of what works on different sides
+of a surface always; for derivatives also those around a BSDF that hides the probability of its lobes. Where the weight
+itself has a derivative and is zero, one or almost, the part that would never or hardly be chosen is, at times: the slope
+there is not less than elsewhere. All other mixtures are left to Mitsuba, whose sum over the parts has less noise; so are
+those inside a plugin that cannot be rebuilt around a part (one of others), unless they would have to be taken apart,
+which is an error.
 """
 
 from __future__ import annotations
@@ -71,8 +76,7 @@ class Mixture:
         self._flags: dict[int, dict[str, bool]] = {}
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        held = [node, *objects_below(node, kind)]
-        self.always = any(adds_up_wrongly(part, objects_below(part, kind)) for part in held)
+        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
