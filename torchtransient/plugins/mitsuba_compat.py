@@ -100,20 +100,24 @@ DIFFERENTIABLE_PLUGINS = {
     "roughdielectric": "diff_rough_dielectric",
     "plastic": "diff_plastic",
     "roughplastic": "diff_rough_plastic",
+    "pplastic": "diff_pplastic",
     "conductor": "diff_conductor",
+    "roughconductor": "diff_rough_conductor",
     "principled": "diff_principled",
     "principledthin": "diff_principled_thin",
 }
 # Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
 # and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
 # texture; plastics go by its mean. Where a principled surface transmits and its base is black, the derivative by the
-# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal has no slope in single precision
-# where the index is zero.
-PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic"}
-LOSING = PLASTICS | {"SmoothConductor": "conductor", "Principled": "principled", "PrincipledThin": "principledthin"}
+# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal is a small difference under a root
+# where the index or the absorption is small: its slope loses its digits below 0.01, and is zero below 1e-3.
+PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic", "PolarizedPlastic": "pplastic"}
+METALS = {"SmoothConductor": "conductor", "RoughConductor": "roughconductor"}
+LOSING = PLASTICS | METALS | {"Principled": "principled", "PrincipledThin": "principledthin"}
+LEAST_INDEX = 0.01
 LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
     **{name: {"diffuse_reflectance": (0,), "specular_reflectance": (0,)} for name in PLASTICS},
-    "SmoothConductor": {"eta": (0,)},
+    **{name: {"eta": (0,), "k": (0,)} for name in METALS},
     "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
@@ -128,16 +132,6 @@ def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
     if slot == "base_color" and name in LOST_AT and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
         return (0,)
     return LOST_AT.get(name, {}).get(slot, ())
-
-
-def is_polarized_plastic(bsdf: Any) -> bool:
-    """Whether a BSDF is ``pplastic``, which loses black lobes as other plastics do."""
-    return bool(bsdf.class_name() == "PolarizedPlastic")
-
-
-def is_rough_conductor(bsdf: Any) -> bool:
-    """Whether a BSDF is ``roughconductor``, of which the slope by an index of zero is lost."""
-    return bool(bsdf.class_name() == "RoughConductor")
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
