@@ -8,10 +8,10 @@ the factor ``weight / probability``, of which the weight is attached and the pro
 
 Which mixtures are taken apart: blends of delta lobes, of what lets light through, and of what works on different sides
 of a surface always; for derivatives also those around a BSDF that hides the probability of its lobes. Where the weight
-itself has a derivative and is zero, one or almost, the part that would never or hardly be chosen is, at times: the slope
-there is not less than elsewhere. All other mixtures are left to Mitsuba, whose sum over the parts has less noise; so are
-those inside a plugin that cannot be rebuilt around a part (one of others), unless they would have to be taken apart,
-which is an error.
+itself has a derivative and is zero, one or almost, the part that would never or hardly be chosen is, at times: the
+slope there is not less than elsewhere. All other mixtures are left to Mitsuba, whose sum over the parts has less noise;
+so are those inside a plugin that cannot be rebuilt around a part (one of others), unless they would have to be taken
+apart, which is an error.
 """
 
 from __future__ import annotations
