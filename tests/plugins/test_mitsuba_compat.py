@@ -16,7 +16,7 @@ import pytest
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
-from torchtransient.plugins.node_walk import objects_below
+from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.transport.scattering.surface import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
@@ -113,7 +113,8 @@ def test_blends_of_delta_lobes_have_wrong_values():
 
 
 def adds_up_wrongly(bsdf):
-    return compat.adds_up_wrongly(bsdf, objects_below(bsdf, mi.BSDF))
+    held = [part for _, part in objects_of(bsdf) if isinstance(part, mi.BSDF)]
+    return compat.adds_up_wrongly(bsdf, held, objects_below(bsdf, mi.BSDF))
 
 
 def test_blends_count_samples_that_a_part_threw_away():

@@ -40,19 +40,21 @@ def weight_slot(bsdf: Any) -> str | None:
     return _WEIGHT_SLOTS.get(bsdf.class_name())
 
 
-def adds_up_wrongly(bsdf: Any, nested: list[Any]) -> bool:
-    """Whether a BSDF is a blend of which a part has a delta lobe or lets light through; ``nested``: all BSDFs that it
-    holds, asked themselves since a blend does not notice lobes that they get later.
+def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
+    """Whether a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of the
+    surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a blend
+    does not notice lobes that they get later.
 
     Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is a
     probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
     one that is seen from behind, a rough one whose facet mirrors or refracts there. What lets light through has a value
     there, which counts once too often (rough glass and paint, from behind: 10 %).
     """
+    if bsdf.class_name() != "BlendBSDF":
+        return False
     lobes = (mi.BSDFFlags.Delta, mi.BSDFFlags.Transmission)
-    return bool(
-        bsdf.class_name() == "BlendBSDF" and any(mi.has_flag(part.flags(), lobe) for part in nested for lobe in lobes)
-    )
+    behind = {bool(mi.has_flag(part.flags(), mi.BSDFFlags.BackSide)) for part in held}
+    return len(behind) > 1 or any(mi.has_flag(part.flags(), lobe) for part in nested for lobe in lobes)
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:

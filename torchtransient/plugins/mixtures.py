@@ -6,11 +6,12 @@ derivative of the probability with which a part was chosen is lost. Here the cho
 methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and
 the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
-Which mixtures are taken apart: blends of delta lobes and of what lets light through always; for derivatives also those
-around a BSDF that hides the probability of its lobes. Where the weight itself has a derivative and is zero, one or
-almost, the part that would never or hardly be chosen is, at times: the slope there is not less than elsewhere. All
-other mixtures are left to Mitsuba, whose sum over the parts has less noise; so are those inside a plugin that cannot be
-rebuilt around a part (one of others), unless they would have to be taken apart, which is an error.
+Which mixtures are taken apart: blends of delta lobes, of what lets light through, and of what works on different sides
+of a surface always; for derivatives also those around a BSDF that hides the probability of its lobes. Where the weight
+itself has a derivative and is zero, one or almost, the part that would never or hardly be chosen is, at times: the
+slope there is not less than elsewhere. All other mixtures are left to Mitsuba, whose sum over the parts has less noise;
+so are those inside a plugin that cannot be rebuilt around a part (one of others), unless they would have to be taken
+apart, which is an error.
 """
 
 from __future__ import annotations
@@ -75,8 +76,7 @@ class Mixture:
         self._flags: dict[int, dict[str, bool]] = {}
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        held = [node, *objects_below(node, kind)]
-        self.always = any(adds_up_wrongly(part, objects_below(part, kind)) for part in held)
+        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
@@ -136,10 +136,10 @@ class Seal:
         self.node, held = node, objects_below(node, kind)
         self._mixtures = [part for part in held if weight_slot(part) is not None]
         for part in self._mixtures:
-            if adds_up_wrongly(part, objects_below(part, kind)):
+            if needs_choice(part):
                 raise SceneError(
                     f"{self._names(part)}. Mitsuba samples a blend wrongly of which a part has a delta lobe or lets "
-                    f"light through. {self._REMEDY}"
+                    f"light through, or works on other sides than another. {self._REMEDY}"
                 )
         # One that says what its weights hide is taken at its word.
         silent = getattr(node, "hides_lobe_probability", None) is None
@@ -170,6 +170,12 @@ class Seal:
                     f"{self._names(mixture)}, whose weight is exactly 0 or 1, where the derivative by it is lost. "
                     f"Start beside that value. {self._REMEDY}"
                 )
+
+
+def needs_choice(node: Any) -> bool:
+    """Whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
+    return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
 
 
 def is_mixture(node: Any) -> bool:
