@@ -202,6 +202,12 @@ def test_directions():
     assert len(tangents_of("lamp.position", "vector", torch.zeros(3))) == 2
 
 
+def test_some_parameters_are_differentiated_in_forward_mode_too():
+    names = [f"{name}: plate.to_world" for name in SETTINGS]
+    assert 0.2 * len(names) < sum(QUICK.in_both_modes(name) for name in names) < 0.5 * len(names)
+    assert all(compare.Effort().in_both_modes(name) for name in names)
+
+
 @pytest.mark.parametrize(("value", "sign"), [(0.0, 1), (1.0, -1)])
 def test_directions_lead_inwards(value, sign):
     (tangent,) = tangents_of("plate.bsdf.opacity.value", "number", torch.tensor(value))
@@ -284,15 +290,16 @@ def sample():
     """Every bare plugin, and some of what is inside others."""
     bare = [setting for setting in SETTINGS.values() if setting.is_bare]
     nested = [setting for setting in SETTINGS.values() if not setting.is_bare]
-    return [*bare, *random.Random(3).sample(nested, 8)]
+    return [*bare, *random.Random(3).sample(nested, 6)]
 
 
 @pytest.mark.slow
 def test_against_finite_differences(tmp_path):
-    """One round of few samples: what it cannot decide, the whole sweep does."""
+    """Few samples: what they cannot decide, the whole sweep does."""
     file = ResultFile(tmp_path / "results.jsonl")
     runner.sweep(sample(), file, quick=True)
     results = file.results()
     assert {line["setting"] for line in results} >= {setting.name for setting in sample() if setting.kind == "bsdf"}
     assert [line for line in results if line["verdict"] in WRONG and not line["biased"]] == []
-    assert sum(line["verdict"] == "agree" for line in results) > 0.7 * len(results)
+    compared = [line["verdict"] for line in results if line["verdict"] != "refused"]
+    assert compared.count("agree") > 0.8 * len(compared)
