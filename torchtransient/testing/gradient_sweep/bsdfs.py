@@ -86,7 +86,9 @@ def surfaces() -> dict[str, Surface]:
         "roughdielectric": one("roughdielectric", ROUGH_GLASS, **thin),
         "conductor": one("conductor", METAL, polarizes=True),
         "roughconductor": one("roughconductor", {**METAL, "alpha": 0.3}, polarizes=True),
-        "roughconductor (anisotropic)": one("roughconductor", {**METAL, "alpha_u": 0.2, "alpha_v": 0.4}),
+        "roughconductor (anisotropic)": one(
+            "roughconductor", {**METAL, "alpha_u": 0.2, "alpha_v": 0.4}, bare_only=True, only="alpha"
+        ),
         "plastic": one("plastic", PLASTIC, polarizes=True),
         "plastic (nonlinear)": one("plastic", {**PLASTIC, "nonlinear": True}),
         "roughplastic": one("roughplastic", {**PLASTIC, "alpha": 0.3}, polarizes=True),

@@ -28,14 +28,13 @@ FILM = 16
 SHORTER_STEPS = 4
 # How many times as long a step may become where it lessens the noise.
 LONGER_STEPS = 4.0
-CONFIRMING_SEEDS = 12
 
 
 @dataclass(frozen=True)
 class Effort:
     """How much is done for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
-    begin with, at most so many directions, at most so many paths a seed. Of so many parameters, one is differentiated
-    in forward mode too.
+    begin with, at most so many directions, at most so many paths a seed, seeds to confirm a contradiction with. Of so
+    many parameters, one is differentiated in forward mode too.
     """
 
     seconds: float = 45.0
@@ -43,6 +42,7 @@ class Effort:
     spp: int = 2048
     directions: int = 2
     paths: int = 2**21
+    confirming: int = 12
     forward_of: int = 1
 
     def in_both_modes(self, name: str) -> bool:
@@ -50,9 +50,9 @@ class Effort:
         return zlib.crc32(name.encode()) % self.forward_of == 0
 
 
-# Of the bare parameters, two thirds are decided by 256 samples per pixel and nine tenths by 8192; what is left is the
+# Of the bare parameters, two thirds are decided by 256 samples per pixel and nine tenths by 4096; what is left is the
 # matter of the whole sweep. Most of the time goes into building kernels, those of forward mode cost the most.
-QUICK = Effort(60.0, 4, 256, 1, 2**17, 3)
+QUICK = Effort(seconds=60.0, seeds=4, spp=256, directions=1, paths=2**16, confirming=6, forward_of=3)
 
 
 @dataclass
@@ -166,11 +166,11 @@ def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[R
         tangent = replace(tangent, step=2 * tangent.step) if noisy else tangent
 
 
-def confirmed_runs(subject: Subject, tangent: Tangent, spp: int) -> tuple[Runs, str]:
-    """Once more with fresh seeds, and with what the length of the step does taken away: shorter steps, until they
-    change nothing, and what is left extrapolated to a step of zero.
+def confirmed_runs(subject: Subject, tangent: Tangent, spp: int, count: int) -> tuple[Runs, str]:
+    """Once more with ``count`` fresh seeds, and with what the length of the step does taken away: shorter steps, until
+    they change nothing, and what is left extrapolated to a step of zero.
     """
-    seeds, step = range(100, 100 + CONFIRMING_SEEDS), tangent.step
+    seeds, step = range(100, 100 + count), tangent.step
     whole = run(subject, tangent, seeds, spp, step)
     for _ in range(SHORTER_STEPS):
         if not whole.contradicts:
@@ -192,7 +192,7 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort, both_modes: bool =
     runs, spp, tangent = resolved_runs(subject, tangent, effort)
     note = ""
     if runs.contradicts and not subject.info.biased:
-        runs, note = confirmed_runs(subject, tangent, spp)
+        runs, note = confirmed_runs(subject, tangent, spp, effort.confirming)
     reverse = float(runs.reverse[0])
     forward = subject.forward(tangent.direction, runs.first_seed, spp) if both_modes else reverse
     return Result(

@@ -28,6 +28,8 @@ PLATE, LAMP, SENSOR, MEDIUM = ("plate.",), ("lamp.",), ("sensor.",), ("slab.inte
 PAINT_OF_LAMPS = ("lamp.bsdf.",)
 # What a plugin is inside of that cannot stand alone.
 BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinction", "constvolume as albedo")
+# Their parameters are those of the same plugin without the words, at other values.
+AGAIN = ("plastic (nonlinear)", "principled (without lobes)")
 # Plugins with parameters that matter to polarized light alone.
 FILTERS = ("polarizer", "retarder", "diff_polarizer", "diff_retarder")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
@@ -62,7 +64,9 @@ class Setting:
     @property
     def is_bare(self) -> bool:
         """Whether it stands for its plugin alone, in the simplest place that it can be in."""
-        return self.inside in BARE and (self.variant == RGB or self.kind == "spectrum" or self.plugin in FILTERS)
+        if self.inside not in BARE or self.plugin in AGAIN:
+            return False
+        return bool(self.variant == RGB or self.kind == "spectrum" or self.plugin in FILTERS)
 
     def takes(self, key: str) -> bool:
         """Whether a parameter is to be looked at."""
