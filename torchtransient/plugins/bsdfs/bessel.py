@@ -3,7 +3,7 @@
     I0(x) exp(-x),   of slope   (I1(x) - I0(x)) exp(-x)
 
 Both orders are nearly equal for large arguments, so that the difference is not taken of values but of the
-coefficients of their asymptotic series. That one is used beyond x = 8, where its tenth term is below rounding, and
+coefficients of their asymptotic series. That one is used beyond x = 10, where its last term is below rounding, and
 the power series before it.
 
 References: Abramowitz and Stegun, Handbook of Mathematical Functions, 9.6.10 and 9.7.1.
@@ -17,8 +17,8 @@ from typing import Any
 import drjit as dr
 
 # Where one series takes over from the other.
-BORDER = 8.0
-_POWERS, _INVERSE_POWERS = 17, 10
+BORDER = 10.0
+_POWERS, _INVERSE_POWERS = 21, 12
 
 
 def _power_coefficients(order: int) -> list[float]:
