@@ -64,7 +64,7 @@ def is_two_sided_itself(bsdf: Any) -> bool:
 
 def has_equal_sides(bsdf: Any) -> bool:
     """Whether the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
-    return bool(bsdf.class_name() == "Hair")
+    return bool(bsdf.class_name() == "Hair" or getattr(bsdf, "has_equal_sides", False))
 
 
 # Slots of BSDFs that hold a texture of normals or heights, which turns the frame that the nested BSDF works in.
@@ -95,6 +95,8 @@ def is_bump_map(bsdf: Any) -> bool:
 # Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
 # plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
 # computes tables from roughness and index outside of the graph. Plastics and principled surfaces lose lobes, see below.
+# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that is
+# up to 12 % off where derivatives take it from one; what crosses the fibre three times and more is sent into one plane.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
@@ -105,6 +107,7 @@ DIFFERENTIABLE_PLUGINS = {
     "roughconductor": "diff_rough_conductor",
     "principled": "diff_principled",
     "principledthin": "diff_principled_thin",
+    "hair": "diff_hair",
 }
 # Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
 # and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
@@ -132,6 +135,16 @@ def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
     if slot == "base_color" and name in LOST_AT and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
         return (0,)
     return LOST_AT.get(name, {}).get(slot, ())
+
+
+def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
+    """Whether what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
+    return bool(bsdf.class_name() == "Hair" and slot == "sigma_a")
+
+
+def is_replaced_for(bsdf: Any, slot: str) -> bool:
+    """Whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked for."""
+    return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of

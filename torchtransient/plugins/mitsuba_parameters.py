@@ -17,6 +17,7 @@ from torchtransient.plugins.mitsuba_compat import (
     LOST_AT,
     METALS,
     PLASTICS,
+    is_absorption_of_hair,
     is_bump_map,
     is_dark,
     lost_at,
@@ -79,6 +80,10 @@ VARNISH = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
+)
+FIBRE = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['hair']} when asked for, whose lobes are those of its samples",
+    stand_in=DIFFERENTIABLE_PLUGINS["hair"],
 )
 DARK = ParameterEffect(
     supported=False,
@@ -213,6 +218,10 @@ def _rows_of_weights() -> Iterator[Row]:
             yield Row(effect, partial(condition, cls), words)
 
 
+def _is_in_hair(site: Site) -> bool:
+    return any(is_absorption_of_hair(holder, name) for holder, name in site.owners)
+
+
 def _is_of_a_dark_light(site: Site) -> bool:
     """Whether a texture is that of lights that stay dark, and of nothing else."""
     kinds = (mi.BSDF, mi.Emitter, mi.Medium)
@@ -220,6 +229,7 @@ def _is_of_a_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
+IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
@@ -275,7 +285,8 @@ _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_o
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
-declare_effects("Hair", {"eta": VALUE})
+_OF_HAIR = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
+declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
@@ -283,7 +294,7 @@ declare_effects(
     "Texture",
     {
         ANY_KEY: (
-            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), OF_A_DARK_LIGHT,
+            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT,
         )
     },
 )  # fmt: skip
