@@ -251,7 +251,7 @@ def test_derivatives_are_those_of_the_model(fibre, key):
 def test_values_and_derivatives_are_finite_at_the_ends(settings):
     bsdf = mi.load_dict({"type": "diff_hair", "sigma_a": 0.3, **INDEX, **settings})
     params = mi.traverse(bsdf)
-    unknowns = {key: mi.Float(params[key]) for key in params.keys() if key not in ("eumelanin", "pheomelanin")}
+    unknowns = {key: mi.Float(params[key]) for key in params.properties if key not in ("eumelanin", "pheomelanin")}
     for key, x in unknowns.items():
         dr.enable_grad(x)
         params[key] = x

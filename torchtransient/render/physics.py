@@ -73,11 +73,10 @@ class PhysicsWatch:
                 self._tell(key, outside_message(key, low, high))
             elif low < -_SLACK:
                 self._tell(f"{key} below zero", outside_message(key, low, high))
-        elif self.mode == "error" or key not in self._told:
-            if key in self.transforms:
-                matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
-                if any(is_singular(matrix) for matrix in matrices):
-                    self._tell(key, singular_message(key))
+        elif key in self.transforms and (self.mode == "error" or key not in self._told):
+            matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
+            if any(is_singular(matrix) for matrix in matrices):
+                self._tell(key, singular_message(key))
 
     def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
         """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""
