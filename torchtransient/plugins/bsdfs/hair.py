@@ -67,7 +67,8 @@ class DiffHair(mi.BSDF):
 
     ``longitudinal_roughness``, ``azimuthal_roughness`` (0.3; in [0, 1], below 1e-3 as 1e-3), ``scale_tilt`` (2
     degrees), ``int_ior`` ("amber"), ``ext_ior`` ("air") (number or material name), ``eumelanin`` (1.3) and
-    ``pheomelanin`` (0.2) or, in their place, ``sigma_a`` (texture; per radius of the fibre) and ``scale`` (1), its factor. All but ``scale``
+    ``pheomelanin`` (0.2) or, in their place, ``sigma_a`` (texture; per radius of the fibre) and ``scale`` (1), its
+    factor. All but ``scale``
     are differentiable. Pigments need a variant with colours.
 
     Values are Mitsuba's up to its Bessel function, which is up to 0.6 % too small. ``sample`` draws a detached
