@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.transport.scattering.surface import strayed
