@@ -195,9 +195,7 @@ def test_nothing_is_lost_where_nothing_is_absorbed(fibre, light):
     roughness, tilt, eta, _ = fibre
     bsdf = mi.load_dict(described(roughness, tilt, eta, 0.0))
     wo, solid_angle = grid()
-    value = bsdf.eval(
-        mi.BSDFContext(), interaction(np.repeat(towards(*light), wo.shape[1], axis=1)), mi.Vector3f(wo)
-    )
+    value = bsdf.eval(mi.BSDFContext(), interaction(np.repeat(towards(*light), wo.shape[1], axis=1)), mi.Vector3f(wo))
     assert np.array(value).astype(float).sum() * solid_angle == pytest.approx(1, abs=2e-3)
     _, weight = sampled(bsdf, interaction(np.repeat(towards(*light), 1000, axis=1)))
     np.testing.assert_allclose(np.array(weight), 1, rtol=1e-4)
@@ -251,7 +249,7 @@ def test_derivatives_are_those_of_the_model(fibre, key):
 def test_values_and_derivatives_are_finite_at_the_ends(settings):
     bsdf = mi.load_dict({"type": "diff_hair", "sigma_a": 0.3, **INDEX, **settings})
     params = mi.traverse(bsdf)
-    unknowns = {key: mi.Float(params[key]) for key in params.properties if key not in ("eumelanin", "pheomelanin")}
+    unknowns = {key: mi.Float(params[key]) for key in UNKNOWNS}
     for key, x in unknowns.items():
         dr.enable_grad(x)
         params[key] = x

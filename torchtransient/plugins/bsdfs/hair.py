@@ -68,8 +68,8 @@ class DiffHair(mi.BSDF):
     ``longitudinal_roughness``, ``azimuthal_roughness`` (0.3; in [0, 1], below 1e-3 as 1e-3), ``scale_tilt`` (2
     degrees), ``int_ior`` ("amber"), ``ext_ior`` ("air") (number or material name), ``eumelanin`` (1.3) and
     ``pheomelanin`` (0.2) or, in their place, ``sigma_a`` (texture; per radius of the fibre) and ``scale`` (1), its
-    factor. All but ``scale``
-    are differentiable. Pigments need a variant with colours.
+    factor. Differentiable: all of them but ``scale``, and ``eta`` (inside over outside index) for the two indices.
+    Pigments need a variant with colours.
 
     Values are Mitsuba's up to its Bessel function, which is up to 0.6 % too small. ``sample`` draws a detached
     direction, its weight is value over density. Samples are Mitsuba's, but for those of three and more crossings,
@@ -166,8 +166,8 @@ class DiffHair(mi.BSDF):
     def _densities(self, fibre: Fibre, wi: Any, wo: Any) -> list[Any]:
         """``M_p N_p`` per solid angle."""
         sin_o, cos_o = wo.y, sqrt_with_bounded_slope(wo.x * wo.x + wo.z * wo.z)
-        rotated = _angle(wo.z * wi.x - wo.x * wi.z, wo.x * wi.x + wo.z * wi.z)
-        around = [_azimuthal(rotated - turn, fibre.scale) for turn in fibre.turns] + [mi.Float(0.5 / pi)]
+        around_fibre = _angle(wo.z * wi.x - wo.x * wi.z, wo.x * wi.x + wo.z * wi.z)
+        around = [_azimuthal(around_fibre - turn, fibre.scale) for turn in fibre.turns] + [mi.Float(0.5 / pi)]
         return [
             _longitudinal(sin_i, cos_i, sin_o, cos_o, concentration) * azimuthal
             for sin_i, cos_i, concentration, azimuthal in zip(
