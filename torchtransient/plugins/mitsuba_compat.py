@@ -95,9 +95,9 @@ def is_bump_map(bsdf: Any) -> bool:
 # Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
 # plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
 # computes tables from roughness and index outside of the graph. Plastics and principled surfaces lose lobes, see below.
-# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that is
-# wrong by as much; less one, as derivatives have it, 12 %. What crosses a fibre three times or more is sent into one
-# plane.
+# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that
+# is wrong by as much; less one, as derivatives have it, 12 %. What crosses a fibre three times or more is sent into
+# one plane.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
