@@ -100,19 +100,20 @@ DIFFERENTIABLE_PLUGINS = {
     "plastic": "diff_plastic",
     "roughplastic": "diff_rough_plastic",
     "conductor": "diff_conductor",
+    "roughconductor": "diff_rough_conductor",
     "principled": "diff_principled",
     "principledthin": "diff_principled_thin",
 }
 # Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
 # and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
 # texture; plastics go by its mean. Where a principled surface transmits and its base is black, the derivative by the
-# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal has no slope in single precision
-# where the index is zero.
+# colour is NaN, or counts samples that were thrown away. Metals go by `loses_slope_of_metal`, near these values too.
 PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic"}
-LOSING = PLASTICS | {"SmoothConductor": "conductor", "Principled": "principled", "PrincipledThin": "principledthin"}
+METALS = {"SmoothConductor": "conductor", "RoughConductor": "roughconductor"}
+LOSING = PLASTICS | METALS | {"Principled": "principled", "PrincipledThin": "principledthin"}
 LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
     **{name: {"diffuse_reflectance": (0,), "specular_reflectance": (0,)} for name in PLASTICS},
-    "SmoothConductor": {"eta": (0,)},
+    **{name: {"eta": (0,), "k": (0,)} for name in METALS},
     "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
@@ -134,9 +135,24 @@ def is_polarized_plastic(bsdf: Any) -> bool:
     return bool(bsdf.class_name() == "PolarizedPlastic")
 
 
-def is_rough_conductor(bsdf: Any) -> bool:
-    """Whether a BSDF is ``roughconductor``, of which the slope by an index of zero is lost."""
-    return bool(bsdf.class_name() == "RoughConductor")
+# Below this share of `1 + k^2` in `eta k`, Mitsuba's Fresnel term of a metal loses more than 0.1 % of its slopes.
+_LEAST_PRODUCT = 0.008
+
+
+def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, float]) -> bool:
+    """Whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges ``eta, k``.
+
+    It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
+    in single precision where ``eta k`` is small: below total reflection without absorption (``eta < 1``), and in metals
+    without losses. Its Mueller matrix takes a complex root instead, and loses that of no absorption alone.
+    """
+    least, (low, high) = eta[0], k
+    if mi.is_polarized:
+        return slot == "k" and low == 0 and 0 < least < 1
+    # The slope by one of them is proportional to the other, and truly zero without it.
+    if (high if slot == "eta" else eta[1]) <= 0:
+        return False
+    return any(least * x < _LEAST_PRODUCT * (1 + x * x) and (least < 1 or x > least) for x in (low, high))
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of

@@ -14,11 +14,13 @@ from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
     LOSING,
     LOST_AT,
+    METALS,
     PLASTICS,
     is_bump_map,
     is_dark,
     is_polarized_plastic,
-    is_rough_conductor,
+    keeps_coefficients,
+    loses_slope_of_metal,
     lost_at,
     normal_texture,
 )
@@ -33,6 +35,7 @@ from torchtransient.plugins.parameter_effect import (
     Site,
     declare_effects,
 )
+from torchtransient.plugins.shares import NUMBERS
 
 VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.
@@ -193,12 +196,35 @@ def _is_lost_in(cls: str, site: Site) -> bool:
         if cls in PLASTICS:
             textures = [dict(objects_of(holder))[name] for holder, name in held]
             return any(dr.all(mi.Float(texture.mean()) <= 0) for texture in textures)
+        if cls in METALS:
+            return any(_loses_slope_of_metal(holder, name) for holder, name in held)
         shown = mi.traverse(site.node)[site.key] if held else None
         if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
             return False
         entries = shown.array if dr.is_tensor_v(shown) else shown
         ends = {end for holder, name in held for end in lost_at(holder, name)}
         return any(bool(dr.any(entries == end, axis=None)) for end in ends)
+
+
+def _loses_slope_of_metal(metal: Any, slot: str) -> bool:
+    textures = dict(objects_of(metal))
+    eta, k = (_range_of(textures[name]) for name in ("eta", "k"))
+    return eta is not None and k is not None and loses_slope_of_metal(slot, eta, k)
+
+
+def _range_of(texture: Any) -> tuple[float, float] | None:
+    """Smallest and largest number of a texture, None if it shows none."""
+    found: list[float] = []
+    for node in (texture, *objects_below(texture, mi.Texture)):
+        if keeps_coefficients(node):
+            found += [float(dr.slice(mi.Float(node.mean()), 0))]
+            continue
+        numbers = [shown.read(node) for shown in shown_by(node)[0] if shown.key in NUMBERS]
+        for value in numbers:
+            value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
+            value = value.array if dr.is_tensor_v(value) else dr.ravel(value)
+            found += [float(dr.slice(pick(value), 0)) for pick in (dr.min, dr.max)]
+    return (min(found), max(found)) if found else None
 
 
 def _rows_of_weights() -> Iterator[Row]:
@@ -208,7 +234,8 @@ def _rows_of_weights() -> Iterator[Row]:
             twin = DIFFERENTIABLE_PLUGINS[plugin]
             reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives at zero"
             effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=now)
-            words = f"in {plugin}, {', '.join(LOST_AT[cls])}" + (" where a lobe is lost" if now else "")
+            lost = f" where {'a slope' if cls in METALS else 'a lobe'} is lost" if now else ""
+            words = f"in {plugin}, {', '.join(LOST_AT[cls])}{lost}"
             yield Row(effect, partial(condition, cls), words)
 
 
@@ -229,15 +256,6 @@ def _is_black_in_pplastic(site: Site) -> bool:
     return any(site.node is t or any(site.node is n for n in objects_below(t, mi.Texture)) for t in black)
 
 
-def _is_index_of_rough_metal_at_zero(site: Site) -> bool:
-    if not any(is_rough_conductor(holder) and name == "eta" for holder, name in site.owners):
-        return False
-    shown = dr.detach(mi.traverse(site.node)[site.key])
-    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
-        return False
-    return bool(dr.any((shown.array if dr.is_tensor_v(shown) else shown) == 0, axis=None))
-
-
 BLACK_PPLASTIC = Row(
     ParameterEffect(
         biased=True,
@@ -245,14 +263,6 @@ BLACK_PPLASTIC = Row(
     ),
     _is_black_in_pplastic,
     "the reflectance of a black lobe of pplastic",
-)
-METAL_AT_ZERO = Row(
-    ParameterEffect(
-        biased=True,
-        reason="biased: Mitsuba's Fresnel term of a metal has no slope by an index of zero; start from 0.01",
-    ),
-    _is_index_of_rough_metal_at_zero,
-    "the index of roughconductor, where it is zero",
 )
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
@@ -317,7 +327,7 @@ declare_effects(
     "Texture",
     {
         ANY_KEY: (
-            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), BLACK_PPLASTIC, METAL_AT_ZERO, OF_A_DARK_LIGHT,
+            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), BLACK_PPLASTIC, OF_A_DARK_LIGHT,
         )
     },
 )  # fmt: skip

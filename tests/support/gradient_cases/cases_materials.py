@@ -331,16 +331,6 @@ CASES = [
         fd_spp=65536,
     ),
     Case(
-        "metal_of_index_zero",
-        "complex index of a conductor",
-        lambda: mirror_room({"type": "diff_conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}),
-        set_color("wall.bsdf.eta.value"),
-        0.0,
-        0.01,
-        side=1,
-        spp=2048,
-    ),
-    Case(
         "black_transmission_of_rough_glass",
         "specular transmittance (rough glass)",
         lambda: sheet(
