@@ -66,9 +66,7 @@ ROUGH_METALS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, "llvm_ad_spectral_polarized"]
-)
+@pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, "llvm_ad_spectral_polarized"])
 def test_rough_metal_equals_mitsubas(variant):
     activate(variant)
     si, wo = interaction(directions(1)), directions(2)
@@ -224,7 +222,10 @@ def test_ranges_of_textures():
     for data, needed in ((grid, False), (dark, True)):
         k = {"type": "bitmap", "data": data, "raw": True}
         scene = mi.load_dict(
-            {"type": "scene", "wall": {"type": "sphere", "bsdf": {"type": "roughconductor", "eta": number(0.5), "k": k}}}
+            {
+                "type": "scene",
+                "wall": {"type": "sphere", "bsdf": {"type": "roughconductor", "eta": number(0.5), "k": k}},
+            }
         )
         tracker = ParameterTracker(scene)
         _, _, node, flags = next(v for key, v in mi.traverse(scene).properties.items() if key.endswith("k.data"))

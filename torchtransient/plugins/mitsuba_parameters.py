@@ -223,7 +223,7 @@ def _range_of(texture: Any) -> tuple[float, float] | None:
         for value in numbers:
             value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
             value = value.array if dr.is_tensor_v(value) else dr.ravel(value)
-            found += [float(dr.slice(pick(value), 0)) for pick in (dr.min, dr.max)]
+            found += [float(dr.slice(least_or_most(value), 0)) for least_or_most in (dr.min, dr.max)]
     return (min(found), max(found)) if found else None
 
 

@@ -60,5 +60,7 @@ CASES = [
     ),
     # In degrees. Differences of 2 degrees are 0.3 % off, of one 0.07 %, of a half 0.02 %: the step, not the derivative.
     Case("brushed_metal_turns", "shape to_world", brushed, rotate("wall.to_world", (0, 0, 1)), 0.0, 0.25),
-    Case("brushed_metal_alpha", "roughness (rough conductor)", brushed, set_color("wall.bsdf.alpha_u.value"), 0.1, 1e-3),
+    Case(
+        "brushed_metal_alpha", "roughness (rough conductor)", brushed, set_color("wall.bsdf.alpha_u.value"), 0.1, 1e-3
+    ),
 ]

@@ -128,7 +128,9 @@ class DiffRoughConductor(mi.BSDF):
     def to_string(self) -> str:
         held = "".join(f",\n  {name} = {texture}" for name, texture in self.textures.items())
         distribution = "ggx" if self.ggx else "beckmann"
-        return f"DiffRoughConductor[\n  distribution = {distribution},\n  sample_visible = {self.sample_visible}{held}\n]"
+        return (
+            f"DiffRoughConductor[\n  distribution = {distribution},\n  sample_visible = {self.sample_visible}{held}\n]"
+        )
 
 
 register("bsdf", "diff_rough_conductor", DiffRoughConductor)
