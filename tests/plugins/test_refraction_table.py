@@ -34,6 +34,7 @@ def test_none_where_nothing_refracts_through_a_lobe():
         {"type": "thindielectric"},
         {"type": "diff_dielectric"},
         {"type": "hair"},
+        {"type": "diff_hair", "sigma_a": 0.5},
     ):
         assert RefractiveBSDFs.of(scene_of(bsdf)) is None
     assert RefractiveBSDFs.of(scene_of({"type": "principled", "roughness": 0.5})) is None
@@ -92,6 +93,17 @@ def test_parts_with_different_indices_are_refused():
     blend = {"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": {**GLASS, "int_ior": 1.3}}
     with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
         RefractiveBSDFs.of(scene_of(blend))
+
+
+def test_parts_that_become_different_are_refused():
+    scene = scene_of({"type": "blendbsdf", "weight": 0.5, "a": OURS, "b": {**OURS, "alpha": 0.2}})
+    found = RefractiveBSDFs.of(scene)
+    found.read()
+    params = mi.traverse(scene)
+    params["s0.bsdf.bsdf_1.eta"] = mi.Float(1.3)
+    params.update()
+    with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
+        found.read()
 
 
 def test_reading_again_finds_new_values():

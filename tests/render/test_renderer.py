@@ -263,7 +263,7 @@ def test_gradients_reach_numbers_inside_lists(room_scene):
 
 @pytest.mark.parametrize(
     "value",
-    [torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool(), [True, False, True], [[1, 2], [3]], "red", object()],
+    [torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool(), [True, False], [[1, 2], [3]], "red", object(), None],
 )
 def test_values_that_are_no_real_numbers(room_scene, value):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)

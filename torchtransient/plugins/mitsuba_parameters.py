@@ -16,9 +16,9 @@ from torchtransient.plugins.mitsuba_compat import (
     LOST_AT,
     METALS,
     PLASTICS,
+    is_absorption_of_hair,
     is_bump_map,
     is_dark,
-    is_polarized_plastic,
     keeps_coefficients,
     loses_slope_of_metal,
     lost_at,
@@ -82,6 +82,10 @@ VARNISH = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
+)
+FIBRE = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['hair']} when asked for, whose lobes are those of its samples",
+    stand_in=DIFFERENTIABLE_PLUGINS["hair"],
 )
 DARK = ParameterEffect(
     supported=False,
@@ -239,6 +243,10 @@ def _rows_of_weights() -> Iterator[Row]:
             yield Row(effect, partial(condition, cls), words)
 
 
+def _is_in_hair(site: Site) -> bool:
+    return any(is_absorption_of_hair(holder, name) for holder, name in site.owners)
+
+
 def _is_of_a_dark_light(site: Site) -> bool:
     """Whether a texture is that of lights that stay dark, and of nothing else."""
     kinds = (mi.BSDF, mi.Emitter, mi.Medium)
@@ -246,24 +254,7 @@ def _is_of_a_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
-def _is_black_in_pplastic(site: Site) -> bool:
-    """Whether a texture is a black lobe of ``pplastic``."""
-    lobes = [holder for holder, _ in site.owners if is_polarized_plastic(holder)]
-    names = ("diffuse_reflectance", "specular_reflectance")
-    held = [texture for lobe in lobes for name, texture in objects_of(lobe) if name in names]
-    with dr.suspend_grad():
-        black = [texture for texture in held if dr.all(mi.Float(texture.mean()) <= 0)]
-    return any(site.node is t or any(site.node is n for n in objects_below(t, mi.Texture)) for t in black)
-
-
-BLACK_PPLASTIC = Row(
-    ParameterEffect(
-        biased=True,
-        reason="biased: Mitsuba never samples a lobe of pplastic that is black; only samples of the other lobe find it",
-    ),
-    _is_black_in_pplastic,
-    "the reflectance of a black lobe of pplastic",
-)
+IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
@@ -300,9 +291,7 @@ for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
 CLAMPED = replace(
     SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
 )
-declare_effects(
-    "Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))}
-)
+declare_effects("Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))})
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 
@@ -319,7 +308,8 @@ _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_o
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
-declare_effects("Hair", {"eta": VALUE})
+_OF_HAIR = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
+declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
@@ -327,7 +317,7 @@ declare_effects(
     "Texture",
     {
         ANY_KEY: (
-            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), BLACK_PPLASTIC, OF_A_DARK_LIGHT,
+            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT,
         )
     },
 )  # fmt: skip

@@ -29,9 +29,8 @@ _PIXELS_WORTH_READING = 1 << 18
 _TRANSPARENT = frozenset((
     "scene", "area", "angulararea", "directionalarea", "point", "spot", "directional", "constant", "projector",
     "diffuse", "dielectric", "thindielectric", "roughdielectric", "diff_dielectric", "diff_rough_dielectric",
-    "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_rough_conductor", "diff_polarizer", "diff_retarder",
-    "diff_circular",
-    "conductor", "roughconductor", "plastic", "roughplastic",
+    "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular",
+    "conductor", "roughconductor", "plastic", "roughplastic", "diff_rough_conductor", "diff_pplastic",
     "pplastic", "principled", "principledthin", "diff_principled", "diff_principled_thin",
     "blendbsdf", "mask", "twosided", "bumpmap",
     "normalmap", "null", "polarizer", "retarder", "circular", "delayed", "homogeneous", "heterogeneous",
@@ -53,7 +52,7 @@ _MEASURED_PLUGINS = {
 _COLOURED_PLUGINS = {
     "sunsky": "coloured sky",
     "timed_sunsky": "coloured sky",
-    "hair": "coloured absorption of hair",
+    **dict.fromkeys(("hair", "diff_hair"), "coloured absorption of hair"),
     "mesh_attribute": "attribute of a mesh, which may be coloured",
 }
 

@@ -41,10 +41,10 @@ def case(name, scene, slot, step=0.01, **more):
 
 
 CASES = [
-    case("metal_of_index_zero", lambda: mirror_room(metal("diff_conductor", eta=0.0, k=2.0)), "eta", spp=2048),
+    case("metal_without_index", lambda: mirror_room(metal("diff_conductor", eta=0.0, k=2.0)), "eta", spp=2048),
     case("mirror_without_absorption", lambda: slanted(metal("diff_conductor", eta=0.4, k=0.0)), "k", 2e-3),
-    case("rough_metal_of_index_zero", lambda: room(metal(eta=0.0, k=2.0), light=area_light()), "eta"),
-    case("rough_metal_without_absorption", lambda: slanted(metal(eta=0.4, k=0.0)), "k", 2e-3),
+    case("rough_metal_without_index", lambda: room(metal(eta=0.0, k=2.0), light=area_light()), "eta"),
+    case("slanted_metal_without_absorption", lambda: slanted(metal(eta=0.4, k=0.0)), "k", 2e-3),
     case(
         "rough_metal_of_index_zero_polarized",
         partial(slanted, metal(eta=0.0, k=2.0)),
