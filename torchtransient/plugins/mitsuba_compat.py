@@ -145,8 +145,8 @@ def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, fl
     """Whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges ``eta, k``.
 
     It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
-    in single precision where ``eta k`` is small: in total reflection with little absorption (``eta < 1``), and in metals
-    without losses. Its Mueller matrix takes a complex root instead, and loses that of no absorption alone.
+    in single precision where ``eta k`` is small: in total reflection (``eta < 1``), and in metals without losses. Its
+    Mueller matrix takes a complex root instead, and loses that of no absorption alone.
     """
     least, (low, high) = eta[0], k
     if mi.is_polarized:
