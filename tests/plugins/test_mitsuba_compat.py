@@ -265,6 +265,30 @@ def test_a_lobe_of_weight_zero_is_skipped():
     assert 0 in compat.LOST_AT["Principled"]["clearcoat"]
 
 
+@pytest.mark.parametrize("plugin", compat.METALS.values())
+@pytest.mark.parametrize(("slot", "index"), [("eta", (0.0, 2.0)), ("k", (0.4, 0.0))])
+def test_metals_lose_their_slopes_without_index_or_absorption(plugin, slot, index):
+    activate("llvm_ad_mono")
+
+    def reflected(x):
+        numbers = {"eta": index[0], "k": index[1]}
+        textures = {name: {"type": "uniform", "value": value} for name, value in numbers.items()}
+        params = mi.traverse(bsdf := mi.load_dict({"type": plugin, **textures}))
+        params[f"{slot}.value"] = x
+        params.update()
+        # Every facet that light reaches here is beyond the angle of total reflection.
+        ctx, si = mi.BSDFContext(), interaction(unit(0.6, 0.0, 0.8))
+        smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        return bsdf.sample(ctx, si, 0.5, mi.Point2f(0.5))[1] if smooth else bsdf.eval(ctx, si, unit(-0.6, 0.0, 0.8))
+
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    dr.backward(reflected(x)[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    change = float((reflected(mi.Float(0.01))[0] - reflected(mi.Float(0))[0])[0]) / 0.01
+    assert dr.grad(x)[0] == 0 and abs(change) > 0.3
+    assert compat.loses_slope_of_metal(slot, (index[0],) * 2, (index[1],) * 2)
+
+
 @pytest.mark.parametrize("cls", compat.PLASTICS)
 @pytest.mark.parametrize("black", [0, 1])
 def test_black_lobes_of_plastics_are_never_sampled(cls, black):

@@ -12,7 +12,6 @@ import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
-    LEAST_INDEX,
     LOSING,
     LOST_AT,
     METALS,
@@ -20,6 +19,8 @@ from torchtransient.plugins.mitsuba_compat import (
     is_absorption_of_hair,
     is_bump_map,
     is_dark,
+    keeps_coefficients,
+    loses_slope_of_metal,
     lost_at,
     normal_texture,
 )
@@ -34,6 +35,7 @@ from torchtransient.plugins.parameter_effect import (
     Site,
     declare_effects,
 )
+from torchtransient.plugins.shares import NUMBERS
 
 VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.
@@ -198,13 +200,35 @@ def _is_lost_in(cls: str, site: Site) -> bool:
         if cls in PLASTICS:
             textures = [dict(objects_of(holder))[name] for holder, name in held]
             return any(dr.all(mi.Float(texture.mean()) <= 0) for texture in textures)
+        if cls in METALS:
+            return any(_loses_slope_of_metal(holder, name) for holder, name in held)
         shown = mi.traverse(site.node)[site.key] if held else None
         if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
             return False
         entries = shown.array if dr.is_tensor_v(shown) else shown
         ends = {end for holder, name in held for end in lost_at(holder, name)}
-        within = LEAST_INDEX if cls in METALS else 0
-        return any(bool(dr.any(dr.abs(entries - end) <= within, axis=None)) for end in ends)
+        return any(bool(dr.any(entries == end, axis=None)) for end in ends)
+
+
+def _loses_slope_of_metal(metal: Any, slot: str) -> bool:
+    textures = dict(objects_of(metal))
+    eta, k = (_range_of(textures[name]) for name in ("eta", "k"))
+    return eta is not None and k is not None and loses_slope_of_metal(slot, eta, k)
+
+
+def _range_of(texture: Any) -> tuple[float, float] | None:
+    """Smallest and largest number of a texture, None if it shows none."""
+    found: list[float] = []
+    for node in (texture, *objects_below(texture, mi.Texture)):
+        if keeps_coefficients(node):
+            found += [float(dr.slice(mi.Float(node.mean()), 0))]
+            continue
+        numbers = [shown.read(node) for shown in shown_by(node)[0] if shown.key in NUMBERS]
+        for value in numbers:
+            value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
+            value = value.array if dr.is_tensor_v(value) else dr.ravel(value)
+            found += [float(dr.slice(least_or_most(value), 0)) for least_or_most in (dr.min, dr.max)]
+    return (min(found), max(found)) if found else None
 
 
 def _rows_of_weights() -> Iterator[Row]:
@@ -214,7 +238,8 @@ def _rows_of_weights() -> Iterator[Row]:
             twin = DIFFERENTIABLE_PLUGINS[plugin]
             reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives at zero"
             effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=now)
-            words = f"in {plugin}, {', '.join(LOST_AT[cls])}" + (" where a lobe is lost" if now else "")
+            lost = f" where {'a slope' if cls in METALS else 'a lobe'} is lost" if now else ""
+            words = f"in {plugin}, {', '.join(LOST_AT[cls])}{lost}"
             yield Row(effect, partial(condition, cls), words)
 
 
@@ -266,9 +291,7 @@ for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
 CLAMPED = replace(
     SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
 )
-declare_effects(
-    "Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))}
-)
+declare_effects("Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))})
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 
