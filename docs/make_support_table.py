@@ -21,6 +21,10 @@ NOT_SUPPORTED = (
         "taken over by `diff_plastic`, `diff_rough_plastic` when the key is asked for",
     ),
     (
+        "reflectances of Mitsuba's own `pplastic`, `eta` and `k` of `conductor`, `roughconductor`",
+        "taken over by `diff_pplastic`, `diff_conductor`, `diff_rough_conductor` when the key is asked for",
+    ),
+    (
         "weights of lobes of Mitsuba's own `principled`, `principledthin`",
         "taken over by `diff_principled`, `diff_principled_thin` when the key is asked for",
     ),

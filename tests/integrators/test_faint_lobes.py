@@ -79,6 +79,8 @@ def derivative_in_place(scene, key, spp=1024):
         ({"type": "diff_plastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
         ({"type": "diff_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
         ({"type": "diff_rough_plastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
+        ({"type": "diff_pplastic", "diffuse_reflectance": number(0.0)}, "diffuse_reflectance.value", 0.0),
+        ({"type": "diff_pplastic", "specular_reflectance": number(0.0)}, "specular_reflectance.value", 0.0),
         ({"type": "blendbsdf", "weight": number(0.0), "a": DIFFUSE, "b": METAL}, "weight.value", 0.0),
         ({"type": "blendbsdf", "weight": number(0.0), "a": DIFFUSE, "b": MIRROR}, "weight.value", 1.0),
         ({"type": "mask", "opacity": number(0.0), "nested": DIFFUSE}, "opacity.value", 0.0),
@@ -118,6 +120,7 @@ def test_derivatives_that_are_switched_on_in_place(bsdf, key):
         ("diff_principled", "spec_trans", 0.0),
         ("diff_plastic", "specular_reflectance", 1e-3),
         ("diff_rough_plastic", "diffuse_reflectance", 1e-3),
+        ("diff_pplastic", "diffuse_reflectance", 1e-3),
     ],
 )
 def test_two_surfaces_with_one_texture(kind, slot, value):
@@ -130,7 +133,7 @@ def test_two_surfaces_with_one_texture(kind, slot, value):
             "type": "rectangle", "to_world": transform().translate([1, 0, 0.05]), "bsdf": {"type": kind, slot: theirs}
         }  # fmt: skip
         scene = scene_of({"type": kind, slot: ours}, half=half)
-        keys = [key for key in mi.traverse(scene).keys() if key.endswith(f"{slot}.value")]
+        keys = [key for key in mi.traverse(scene).properties if key.endswith(f"{slot}.value")]
         assert len(keys) == (1 if shared else 2)
         rates.append(derivative(scene, keys, value))
     assert abs(rates[1]) > 1e-3 and rates[0] == pytest.approx(rates[1], rel=1e-3)

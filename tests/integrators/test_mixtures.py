@@ -6,6 +6,7 @@ sum of those of its parts. The bound is derived: three standard errors of indepe
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,13 +17,16 @@ from support.gradient_cases.cases_mixtures import (
     METAL,
     MIRROR,
     PLASTIC,
+    ROUGH_GLASS,
     blend,
     bump,
     mask,
     mirror_room,
     normal_map,
+    seen_through,
     two_sided,
 )
+from torchtransient.plugins.bsdfs.wrapper_copy import flags_of
 
 VARIANT = "llvm_ad_mono"
 SEEDS = 6
@@ -63,9 +67,21 @@ MIXTURES = {
 }
 
 
-def rows(bsdf):
+THROUGH = {
+    "paint and rough glass": lambda: around_a_blend(bare, DIFFUSE, ROUGH_GLASS),
+    "rough glass and metal": lambda: around_a_blend(bare, ROUGH_GLASS, METAL),
+    "two kinds of rough glass": lambda: around_a_blend(bare, ROUGH_GLASS, {**ROUGH_GLASS, "int_ior": 1.2}),
+    "under normals, seen through": lambda: around_a_blend(normal_map, DIFFUSE, ROUGH_GLASS),
+    "mask of rough glass and paint": lambda: masked(blend(DIFFUSE, ROUGH_GLASS)),
+    "thin sheet and paint": lambda: around_a_blend(
+        bare, {"type": "principledthin", "roughness": 0.4, "spec_trans": 0.5, "diff_trans": 0.8}, DIFFUSE
+    ),
+}
+
+
+def rows(bsdf, room=mirror_room):
     """Sums over the film of each time bin, by seed."""
-    scene = mirror_room(bsdf)
+    scene = room(bsdf)
     scene["integrator"]["max_depth"] = 3
     scene = mi.load_dict(scene, optimize=False)
     renders = [scene.integrator().render(scene, seed=seed, spp=512)[1] for seed in range(SEEDS)]
@@ -74,11 +90,87 @@ def rows(bsdf):
 
 @pytest.mark.parametrize("name", MIXTURES)
 def test_mixture_is_the_weighed_sum_of_its_parts(name):
-    mixture, parts = MIXTURES[name]()
-    found = rows(mixture).sum(1)
+    check_sum(*MIXTURES[name]())
+
+
+@pytest.mark.parametrize("name", THROUGH)
+def test_mixture_that_is_seen_through_is_the_weighed_sum_of_its_parts(name):
+    check_sum(*THROUGH[name](), seen_through)
+
+
+def check_sum(mixture, parts, room=mirror_room):
+    found = rows(mixture, room).sum(1)
     # The parts use other seeds than the mixture only in that they draw other numbers; their errors count as well.
-    weighed = [weight * rows(bsdf).sum(1) for weight, bsdf in parts if weight > 0]
+    weighed = [weight * rows(bsdf, room).sum(1) for weight, bsdf in parts if weight > 0]
     expected = sum(part.mean() for part in weighed)
     error = np.sqrt(sum(part.var(ddof=1) for part in [found, *weighed]) / SEEDS)
     assert abs(found.mean() - expected) < 3 * error + 1e-6 * expected
     assert error < 0.02 * expected
+
+
+def test_kinds_of_glass_that_become_different():
+    """Paths behind either kind count its own index, whatever was rendered first."""
+    images = []
+    for first in (1.5, 1.2):
+        mixture = blend(ROUGH_GLASS, {**ROUGH_GLASS, "int_ior": first}, 0.5)
+        scene = mi.load_dict(seen_through(mixture), optimize=False)
+        scene.integrator().render(scene, seed=0, spp=4)
+        params = mi.traverse(scene)
+        params["wall.bsdf.bsdf_1.eta"] = mi.Float(1.2)
+        params.update()
+        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
+    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
+
+
+TILTED, FLAT = (0.85, 0.5, 0.85), (0.5, 0.5, 1.0)
+FLAGS = [{"flip_invalid_normals": flips, "use_shadowing_function": shadows} for flips in (0, 1) for shadows in (0, 1)]
+FLAGS = [{name: bool(value) for name, value in flags.items()} for flags in FLAGS]
+
+
+def around_metal(normals, paint, flags):
+    """A normal map, constant by four texels, around a blend with a delta lobe."""
+    bitmap = {"type": "bitmap", "data": mi.TensorXf(np.tile(np.float32(normals), (4, 4, 1))), "raw": True}
+    parts = {**DIFFUSE, "reflectance": paint}, {"type": "conductor", "specular_reflectance": paint}
+    return {"type": "normalmap", "normalmap": bitmap, "nested": blend(*parts, 0.5), **flags}
+
+
+@pytest.mark.parametrize("flags", FLAGS, ids=str)
+@pytest.mark.parametrize("first", [(FLAT, 0.8), (TILTED, 0.0)], ids=["flat", "black"])
+def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags):
+    """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""
+    images = []
+    for normals, paint in (first, (TILTED, 0.8)):
+        scene = mi.load_dict(mirror_room(around_metal(normals, paint, flags)), optimize=False)
+        scene.integrator().render(scene, seed=0, spp=4)
+        params = mi.traverse(scene)
+        params["wall.bsdf.normalmap.data"] = mi.TensorXf(np.tile(np.float32(TILTED), (4, 4, 1)))
+        for key in ("bsdf_0.reflectance.value", "bsdf_1.specular_reflectance.value"):
+            params[f"wall.bsdf.nested_bsdf.{key}"] = 0.8
+        params.update()
+        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("flags", FLAGS, ids=str)
+def test_hidden_flags_are_found(flags):
+    mi.set_variant(VARIANT)
+    for make in (lambda: around_metal(FLAT, 0.0, flags), lambda: bump(blend(DIFFUSE, MIRROR), 0.5, 0.5) | flags):
+        assert flags_of(mi.load_dict(make())) == flags
+
+
+def test_looking_for_flags_leaves_values_and_their_derivatives():
+    mi.set_variant(VARIANT)
+    bsdf = mi.load_dict(around_metal(FLAT, 0.3, FLAGS[0]))
+    params = mi.traverse(bsdf)
+    before = {key: np.array(value) for key, value in params.items()}
+    x = mi.TensorXf(params["normalmap.data"])
+    dr.enable_grad(x)
+    params["normalmap.data"] = x
+    params.update()
+    with dr.suspend_grad():
+        flags_of(bsdf)
+    after = mi.traverse(bsdf)
+    for key, value in before.items():
+        np.testing.assert_array_equal(np.array(dr.detach(after[key])), value)
+    dr.backward(dr.sum(after["normalmap.data"] * 2))
+    np.testing.assert_array_equal(np.array(dr.grad(x)), np.full((4, 4, 3), 2.0))

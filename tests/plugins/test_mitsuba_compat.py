@@ -16,6 +16,8 @@ import pytest
 from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
+from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.transport.scattering.surface import strayed
 
 RGB, POLARIZED, SPECTRAL = "llvm_ad_rgb", "llvm_ad_mono_polarized", "llvm_ad_spectral"
@@ -78,12 +80,12 @@ def test_delta_weights_lack_the_derivative_of_their_probability(plugin, attach):
     weight, density = slopes_of_lobe(bsdf, 0.01, attach)
     # What is chosen in proportion to Fresnel's term has a weight without it: its derivative is all that is missing.
     assert abs(density) > 0.1 and abs(weight) < 0.3 * abs(density)
-    assert compat.hides_lobe_probability(bsdf)
-    assert compat.hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
+    assert hides_lobe_probability(bsdf)
+    assert hides_lobe_probability(mi.load_dict({"type": "twosided", "bsdf": {"type": "plastic"}}))
     bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 1)))}}
-    assert compat.hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
+    assert hides_lobe_probability(mi.load_dict({**bumpy, "bsdf": {"type": plugin}}))
     # Mixtures are asked part by part.
-    assert not compat.hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
+    assert not hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
 
 
 @pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
@@ -92,7 +94,7 @@ def test_delta_weights_of_others_have_it(plugin):
     bsdf = mi.load_dict({"type": plugin})
     weight, density = slopes_of_lobe(bsdf, 0.01, by_direction)
     assert density == 0 and abs(weight) > 0.1
-    assert not compat.hides_lobe_probability(bsdf)
+    assert not hides_lobe_probability(bsdf)
 
 
 def test_blends_of_delta_lobes_have_wrong_values():
@@ -107,8 +109,30 @@ def test_blends_of_delta_lobes_have_wrong_values():
     reflected = dr.mean(dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), weight.x, 0))
     # Half of the mirror: 0.45. What comes is divided by 1 / 2 and half of the density of the paint.
     assert abs(float(reflected[0]) - 0.45) > 0.02
-    assert compat.mixes_delta(bsdf) and compat.weight_slot(bsdf) == "weight"
-    assert not compat.mixes_delta(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
+    assert adds_up_wrongly(bsdf) and compat.weight_slot(bsdf) == "weight"
+    assert not adds_up_wrongly(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": paint, "b": paint}))
+
+
+def adds_up_wrongly(bsdf):
+    held = [part for _, part in objects_of(bsdf) if isinstance(part, mi.BSDF)]
+    return compat.adds_up_wrongly(bsdf, held, objects_below(bsdf, mi.BSDF))
+
+
+def test_blends_count_samples_that_a_part_threw_away():
+    """Rough glass and paint from behind: what a blend samples is more than what it scatters."""
+    activate(RGB)
+    paint, glass = {"type": "diffuse", "reflectance": 0.5}, {"type": "roughdielectric", "alpha": 0.3}
+    bsdf = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": glass, "b": paint})
+    n = 1_000_000
+    rng = mi.PCG32(size=n)
+    u = [rng.next_float32() for _ in range(5)]
+    si = interaction(unit(0.3, 0.0, -0.9))
+    _, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    wo = mi.warp.square_to_uniform_sphere(mi.Point2f(u[3], u[4]))
+    light = np.array(bsdf.eval(mi.BSDFContext(), si, wo).x) * 4 * np.pi
+    error = light.std() / np.sqrt(n)
+    assert float(dr.mean(weight.x)[0]) - light.mean() > 10 * error
+    assert adds_up_wrongly(bsdf)
 
 
 # -------------------------------------------------------------------------------------------------------- polarization
@@ -124,8 +148,8 @@ def test_two_sided_matrices_from_behind_are_those_of_the_front():
     behind = matrix(both.eval(mi.BSDFContext(), interaction(mirrored[0]), mirrored[1]))
     np.testing.assert_allclose(behind, front, rtol=1e-5)
     assert abs(front[3, 1]) > 0.1 * front[0, 0], "this pair of directions would not tell the hands apart"
-    assert compat.is_two_sided(both) and not compat.is_two_sided(one)
-    assert compat.is_two_sided(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
+    assert mirrors_matrices(both) and not mirrors_matrices(one)
+    assert mirrors_matrices(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
 
 
 def slope_at_the_normal(bsdf):

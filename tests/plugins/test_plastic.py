@@ -77,8 +77,26 @@ def black(name):
     return {name: {"type": "uniform", "value": 0.0}}
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "settings", [{"alpha": 0.3}, {"alpha_u": 0.1, "alpha_v": 0.4, "specular_reflectance": 0.3}], ids=str
+)
+def test_polarized_plastic_is_that_of_mitsuba(settings, variant):
+    activate(variant)
+    settings = {"diffuse_reflectance": 0.6, "int_ior": 1.4, "distribution": "ggx", **settings}
+    theirs, ours = (mi.load_dict({"type": name, **settings}) for name in ("pplastic", "diff_pplastic"))
+    one, other = mi.traverse(theirs), mi.traverse(ours)
+    assert set(one.properties) == set(other.properties)
+    assert all(one.flags(key) == other.flags(key) for key in one.properties)
+    si, u, v = directions(20000)
+    (a, weight_a), (b, weight_b) = (bsdf.sample(mi.BSDFContext(), si, u, v) for bsdf in (theirs, ours))
+    (value_a, pdf_a), (value_b, pdf_b) = (bsdf.eval_pdf(mi.BSDFContext(), si, a.wo) for bsdf in (theirs, ours))
+    for one, other in [(weight_a, weight_b), (value_a, value_b), (pdf_a, pdf_b), (a.pdf, b.pdf), (a.wo, b.wo)]:
+        np.testing.assert_allclose(np.array(other), np.array(one), rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic"])
 def test_a_black_lobe_has_its_slope(kind, lobe):
     scene = scene_with(kind, **black(lobe))
     key = f"wall.bsdf.{lobe}.value"
@@ -137,7 +155,7 @@ def attached(scene, key):
 
 
 @pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic"])
 def test_black_lobes_of_mitsubas_own_are_refused(kind, lobe):
     scene = scene_with(kind, bare=True, **black(lobe))
     params, _ = attached(scene, f"wall.bsdf.{lobe}.value")
@@ -146,7 +164,7 @@ def test_black_lobes_of_mitsubas_own_are_refused(kind, lobe):
         scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)
 
 
-@pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
+@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic"])
 def test_lobes_of_mitsubas_own_that_are_not_black(kind):
     """Their derivatives are right as they are, and so are those of the other lobe."""
     scene = scene_with(kind, bare=True, **black("specular_reflectance"))

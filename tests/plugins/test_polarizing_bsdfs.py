@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import drjit as dr
@@ -12,6 +13,8 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.scenes import mirror_room
 from torchtransient import plugins
+from torchtransient.errors import GradientError
+from torchtransient.plugins import mitsuba_compat as compat
 
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
 LANES = 500
@@ -47,6 +50,7 @@ def interaction(wi):
 
 def entries(value):
     """The numbers of a BSDF value as an array with the lane last."""
+    dr.eval(value)  # in one kernel
     values = [value[i, j] for i in range(4) for j in range(4)] if mi.is_polarized else [value]
     return np.stack([np.broadcast_to(np.array(x), (len(x), LANES)) for x in values]).astype(float)
 
@@ -54,6 +58,7 @@ def entries(value):
 def sampled(bsdf, wi, mode=None):
     ctx = mi.BSDFContext() if mode is None else mi.BSDFContext(mode)
     bs, weight = bsdf.sample(ctx, interaction(wi), mi.Float(0.3), mi.Point2f(0.2, 0.4), True)
+    dr.eval(bs, weight)
     return np.array(bs.wo), entries(weight)
 
 
@@ -198,21 +203,79 @@ def test_derivatives(plugin, wi):
         assert evaluate(0.0, key, tangent, True) == pytest.approx(expected, rel=2e-3, abs=3e-4)
 
 
-def test_a_metal_of_index_zero_has_a_slope():
-    """Reflectance at normal incidence is 1 - 4 eta / ((1 + eta)^2 + k^2). Mitsuba's own loses the slope at zero."""
+# (which number, its value, the other one, cosine, slope of the reflectance): at normal incidence the reflectance is
+# 1 - 4 eta / ((1 + eta)^2 + k^2); at 1.2 rad light is reflected totally where nothing absorbs it (Born and Wolf, 14.2,
+# in double precision).
+SMALL = [
+    ("eta", 0.0, 2.0, 1.0, -0.8),
+    ("eta", 1e-4, 2.0, 1.0, -0.79987),
+    ("k", 0.0, 0.5, math.cos(1.2), -1.7072),
+    ("k", 1e-4, 0.5, math.cos(1.2), -1.7069),
+]
+
+
+@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
+@pytest.mark.parametrize(("slot", "value", "other", "cosine", "expected"), SMALL)
+def test_a_metal_of_small_index_or_absorption_has_a_slope(plugin, slot, value, other, cosine, expected):
+    """Mitsuba's own loses it."""
     activate("llvm_ad_mono")
+    rates = {slot: {"type": "uniform", "value": value}, "k" if slot == "eta" else "eta": other}
+    wi = mi.Vector3f(math.sqrt(1 - cosine * cosine), 0, cosine)
     slopes = {}
-    for plugin in ("conductor", "diff_conductor"):
-        bsdf = mi.load_dict({"type": plugin, "eta": {"type": "uniform", "value": 0.0}, "k": 2.0})
-        params, eta = mi.traverse(bsdf), mi.Float(0)
-        dr.enable_grad(eta)
-        params["eta.value"] = eta
+    for name in (plugin, compat.DIFFERENTIABLE_PLUGINS[plugin]):
+        bsdf = mi.load_dict({"type": name, **rates})
+        params, x = mi.traverse(bsdf), mi.Float(value)
+        dr.enable_grad(x)
+        params[f"{slot}.value"] = x
         params.update()
-        _, weight = bsdf.sample(mi.BSDFContext(), interaction(mi.Vector3f(0, 0, 1)), 0.5, mi.Point2f(0.5))
+        if plugin == "conductor":
+            _, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), 0.5, mi.Point2f(0.5))
+        else:
+            weight = bsdf.eval(mi.BSDFContext(), interaction(wi), mi.Vector3f(-wi.x, 0, wi.z))
+        share = float(dr.detach(weight)[0][0]) / reflectance(slot, value, other, cosine)
         dr.backward(weight[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-        slopes[plugin] = float(dr.grad(eta)[0])
-    assert slopes["conductor"] == 0
-    assert slopes["diff_conductor"] == pytest.approx(-4 / 5, rel=1e-5)
+        slopes[name] = float(dr.grad(x)[0]) / share
+    assert abs(slopes[plugin]) < 1e-6
+    assert slopes[compat.DIFFERENTIABLE_PLUGINS[plugin]] == pytest.approx(expected, rel=1e-3)
+
+
+def reflectance(slot, value, other, cosine):
+    """Of a smooth metal, by complex arithmetic in double precision."""
+    eta, k = (value, other) if slot == "eta" else (other, value)
+    n = complex(eta, -k)
+    p = np.conj(np.sqrt(np.conj(n * n) - (1 - cosine**2)))
+    s, r = (cosine - p) / (cosine + p), (n * n * cosine - p) / (n * n * cosine + p)
+    return float(abs(s) ** 2 + abs(r) ** 2) / 2
+
+
+ROUGH = [
+    {"eta": 0.2, "k": 3.0, "alpha": 0.3},
+    {"eta": 1.2, "k": 0.5, "alpha_u": 0.1, "alpha_v": 0.5, "distribution": "ggx", "sample_visible": False},
+    {"eta": 0.0, "k": 1.0, "alpha": 0.2, "specular_reflectance": 0.7},
+]
+
+
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL, "llvm_ad_mono", "llvm_ad_rgb"])
+def test_rough_metal_equals_mitsubas(variant):
+    activate(variant)
+    metals = [{"material": "Au", "alpha": 0.3, "distribution": "ggx"}, *([] if mi.is_spectral else ROUGH)]
+    wi, wo = directions(3), directions(4, 0.0)
+    for metal in metals:
+        theirs, ours = (mi.load_dict({"type": name, **metal}) for name in ("roughconductor", "diff_rough_conductor"))
+        one, other = mi.traverse(theirs), mi.traverse(ours)
+        assert set(one.properties) == set(other.properties)
+        assert all(one.flags(key) == other.flags(key) for key in one.properties)
+        for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+            ctx = mi.BSDFContext(mode)
+            (expected, p), (got, q) = (b.eval_pdf(ctx, interaction(wi), wo) for b in (theirs, ours))
+            dr.eval(expected, p, got, q)
+            expected, got = entries(expected), entries(got)
+            assert np.abs(expected).max() > 0.04
+            np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
+            np.testing.assert_array_equal(np.array(q), np.array(p))
+            (expected_out, expected), (out, got) = (sampled(bsdf, wi, mode) for bsdf in (theirs, ours))
+            np.testing.assert_array_equal(out, expected_out)
+            np.testing.assert_allclose(got, expected, atol=3e-5 * np.abs(expected).max())
 
 
 def test_a_described_metal_of_index_zero_is_built_anew():
@@ -226,3 +289,20 @@ def test_a_described_metal_of_index_zero_is_built_anew():
     # Mirrored light falls by 4 / (1 + k^2) for each unit, near normal incidence.
     slope = renderer.values["wall.bsdf.eta.value"].grad / image.detach()
     assert float(slope) == pytest.approx(-4 / 5, rel=0.1)
+
+
+@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
+@pytest.mark.parametrize("slot", ["eta", "k"])
+def test_rates_of_a_metal_that_mitsuba_loses_are_refused(plugin, slot):
+    """Not only at zero: single precision has no slope left beside it either."""
+    activate("llvm_ad_mono")
+    metal = {"type": plugin, "eta": {"type": "uniform", "value": 0.5}, "k": {"type": "uniform", "value": 0.5}}
+    for value, refused in ((0.0, True), (1e-4, True), (0.1, False)):
+        scene = mi.load_dict(mirror_room({**metal, slot: {"type": "uniform", "value": value}}), optimize=False)
+        params, x = mi.traverse(scene), mi.Float(value)
+        dr.enable_grad(x)
+        params[f"wall.bsdf.{slot}.value"] = x
+        params.update()
+        adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
+        with pytest.raises(GradientError, match="diff_") if refused else contextlib.nullcontext():
+            scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)

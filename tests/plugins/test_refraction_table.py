@@ -95,6 +95,17 @@ def test_parts_with_different_indices_are_refused():
         RefractiveBSDFs.of(scene_of(blend))
 
 
+def test_parts_that_become_different_are_refused():
+    scene = scene_of({"type": "blendbsdf", "weight": 0.5, "a": OURS, "b": {**OURS, "alpha": 0.2}})
+    found = RefractiveBSDFs.of(scene)
+    found.read()
+    params = mi.traverse(scene)
+    params["s0.bsdf.bsdf_1.eta"] = mi.Float(1.3)
+    params.update()
+    with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
+        found.read()
+
+
 def test_reading_again_finds_new_values():
     scene = scene_of(OURS)
     found = RefractiveBSDFs.of(scene)

@@ -159,7 +159,7 @@ def test_a_lobe_that_joins_is_seen_wherever_it_is(wrapper):
     scene = around({"type": "principled", "eta": 1.4}, wrapper)
     assert contents_of(scene).refraction is None
     params = mi.traverse(scene)
-    key = next(key for key in params.keys() if key.endswith("spec_trans.value"))
+    key = next(key for key in params.properties if key.endswith("spec_trans.value"))
     params[key] = mi.Float(0.9)
     params.update()
     table = contents_of(scene).refraction.read().table

@@ -85,8 +85,10 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule(
         "torchtransient.plugins.bsdfs.principled", (("bsdf", "diff_principled"), ("bsdf", "diff_principled_thin"))
     ),
+    PluginModule("torchtransient.plugins.bsdfs.polarized_plastic", (("bsdf", "diff_pplastic"),)),
     PluginModule("torchtransient.plugins.bsdfs.hair", (("bsdf", "diff_hair"),)),
     PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
+    PluginModule("torchtransient.plugins.bsdfs.rough_conductor", (("bsdf", "diff_rough_conductor"),)),
     PluginModule(
         "torchtransient.plugins.bsdfs.thin_elements",
         (("bsdf", "diff_polarizer"), ("bsdf", "diff_retarder"), ("bsdf", "diff_circular")),

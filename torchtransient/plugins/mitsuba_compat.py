@@ -23,21 +23,14 @@ WRITTEN_AGAINST = "3.9.1"
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
 # Those of the others (Mitsuba's dielectric, ours) divide by the detached probability.
-_CANCELLING = ("ThinDielectric[", "SmoothPlastic[")
-# A scene's BSDFs show themselves by their description, nested ones included.
-_TWO_SIDED_DESCRIPTION = "TwoSided["
+_CANCELLING = ("ThinDielectric", "SmoothPlastic")
 # Mixtures, and the slot of the texture or volume that says how much of the (second) nested one there is.
 _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFunction": "weight"}
-_MIXTURES = ("Mask[", "BlendBSDF[")
 
 
-def hides_lobe_probability(bsdf: Any) -> bool:
-    """Whether the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put back.
-
-    Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
-    """
-    shown = str(bsdf)
-    return any(name in shown for name in _CANCELLING) and not any(name in shown for name in _MIXTURES)
+def cancels_lobe_probability(bsdf: Any) -> bool:
+    """Whether the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    return bsdf.class_name() in _CANCELLING
 
 
 def weight_slot(bsdf: Any) -> str | None:
@@ -47,27 +40,25 @@ def weight_slot(bsdf: Any) -> str | None:
     return _WEIGHT_SLOTS.get(bsdf.class_name())
 
 
-def mixes_delta(bsdf: Any) -> bool:
-    """Whether a BSDF is a blend of which a part has a delta lobe.
+def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
+    """Whether a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of the
+    surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a blend
+    does not notice lobes that they get later.
 
-    Mitsuba divides the sum of both parts' values by the sum of their densities, of which that of a delta lobe is a
-    probability instead: the values of such blends are wrong, and the derivatives of their weights.
+    Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is a
+    probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
+    one that is seen from behind, a rough one whose facet mirrors or refracts there. What lets light through has a value
+    there, which counts once too often (rough glass and paint, from behind: 10 %).
     """
-    return bool(bsdf.class_name() == "BlendBSDF" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
-
-
-def is_two_sided(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided`` or holds one (in a mask, in a blend).
-
-    From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
-    Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
-    exchanged.
-    """
-    return _TWO_SIDED_DESCRIPTION in str(bsdf)
+    if bsdf.class_name() != "BlendBSDF":
+        return False
+    lobes = (mi.BSDFFlags.Delta, mi.BSDFFlags.Transmission)
+    behind = {bool(mi.has_flag(part.flags(), mi.BSDFFlags.BackSide)) for part in held}
+    return len(behind) > 1 or any(mi.has_flag(part.flags(), lobe) for part in nested for lobe in lobes)
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Whether a BSDF is ``twosided``."""
+    """Whether a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
@@ -79,10 +70,20 @@ def has_equal_sides(bsdf: Any) -> bool:
 # Slots of BSDFs that hold a texture of normals or heights, which turns the frame that the nested BSDF works in.
 _NORMAL_TEXTURES = {"NormalMap": "normalmap", "BumpMap": "nested_texture"}
 
+# Flags of these that a built one does not show.
+HIDDEN_FLAGS = ("flip_invalid_normals", "use_shadowing_function")
+
 
 def normal_texture(bsdf: Any) -> str | None:
     """Name of the texture by which a BSDF turns the shading frame, None for BSDFs that leave it."""
     return _NORMAL_TEXTURES.get(bsdf.class_name())
+
+
+def forgets_black_samples(bsdf: Any) -> bool:
+    """Whether a BSDF reports no density for samples of the one it holds whose weight is zero: paths end there, and the
+    derivative of what is black, by the light that comes from elsewhere, is lost. Mitsuba's bump map keeps it.
+    """
+    return bool(bsdf.class_name() == "NormalMap")
 
 
 def is_bump_map(bsdf: Any) -> bool:
@@ -94,15 +95,17 @@ def is_bump_map(bsdf: Any) -> bool:
 # Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
 # plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
 # computes tables from roughness and index outside of the graph. Plastics and principled surfaces lose lobes, see below.
-# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that is
-# wrong by as much; less one, as derivatives have it, 12 %. What crosses a fibre three times or more is sent into one
-# plane.
+# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that
+# is wrong by as much; less one, as derivatives have it, 12 %. What crosses a fibre three times or more is sent into
+# one plane.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
     "plastic": "diff_plastic",
     "roughplastic": "diff_rough_plastic",
+    "pplastic": "diff_pplastic",
     "conductor": "diff_conductor",
+    "roughconductor": "diff_rough_conductor",
     "principled": "diff_principled",
     "principledthin": "diff_principled_thin",
     "hair": "diff_hair",
@@ -110,13 +113,15 @@ DIFFERENTIABLE_PLUGINS = {
 # Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
 # and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
 # texture; plastics go by its mean. Where a principled surface transmits and its base is black, the derivative by the
-# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal has no slope in single precision
-# where the index is zero.
-PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic"}
-LOSING = PLASTICS | {"SmoothConductor": "conductor", "Principled": "principled", "PrincipledThin": "principledthin"}
+# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal is a small difference under a root
+# where the index or the absorption is small: its slope loses its digits below 0.01, and is zero below 1e-3.
+PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic", "PolarizedPlastic": "pplastic"}
+METALS = {"SmoothConductor": "conductor", "RoughConductor": "roughconductor"}
+LOSING = PLASTICS | METALS | {"Principled": "principled", "PrincipledThin": "principledthin"}
+LEAST_INDEX = 0.01
 LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
     **{name: {"diffuse_reflectance": (0,), "specular_reflectance": (0,)} for name in PLASTICS},
-    "SmoothConductor": {"eta": (0,)},
+    **{name: {"eta": (0,), "k": (0,)} for name in METALS},
     "Principled": {"clearcoat": (0,), "sheen": (0,), "spec_trans": (0, 1), "metallic": (1,)},
     "PrincipledThin": {"spec_trans": (0, 1), "diff_trans": (0, 2)},
 }
@@ -141,16 +146,6 @@ def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
 def is_replaced_for(bsdf: Any, slot: str) -> bool:
     """Whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked for."""
     return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
-
-
-def is_polarized_plastic(bsdf: Any) -> bool:
-    """Whether a BSDF is ``pplastic``, which loses black lobes as other plastics do."""
-    return bool(bsdf.class_name() == "PolarizedPlastic")
-
-
-def is_rough_conductor(bsdf: Any) -> bool:
-    """Whether a BSDF is ``roughconductor``, of which the slope by an index of zero is lost."""
-    return bool(bsdf.class_name() == "RoughConductor")
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
@@ -207,9 +202,24 @@ def leaves_hits_detached(shape: Any) -> bool:
     return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
 
 
+def misplaces_hits(shape: Any) -> bool:
+    """Whether the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it: Mitsuba
+    projects onto one of two directions of its surface as if they were perpendicular.
+    """
+    return bool(shape.class_name() == "BSplineCurve")
+
+
 def has_vertices(shape: Any) -> bool:
     """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
+
+
+def has_smooth_shape(emitter: Any) -> bool:
+    """Whether a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point on it
+    is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and more.
+    """
+    shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
+    return shape is not None and has_vertices(shape) and bool(shape.has_vertex_normals())
 
 
 # Their normal is the same everywhere.

@@ -12,14 +12,14 @@ import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
+    LEAST_INDEX,
     LOSING,
     LOST_AT,
+    METALS,
     PLASTICS,
     is_absorption_of_hair,
     is_bump_map,
     is_dark,
-    is_polarized_plastic,
-    is_rough_conductor,
     lost_at,
     normal_texture,
 )
@@ -203,7 +203,8 @@ def _is_lost_in(cls: str, site: Site) -> bool:
             return False
         entries = shown.array if dr.is_tensor_v(shown) else shown
         ends = {end for holder, name in held for end in lost_at(holder, name)}
-        return any(bool(dr.any(entries == end, axis=None)) for end in ends)
+        within = LEAST_INDEX if cls in METALS else 0
+        return any(bool(dr.any(dr.abs(entries - end) <= within, axis=None)) for end in ends)
 
 
 def _rows_of_weights() -> Iterator[Row]:
@@ -228,41 +229,6 @@ def _is_of_a_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
-def _is_black_in_pplastic(site: Site) -> bool:
-    """Whether a texture is a black lobe of ``pplastic``."""
-    lobes = [holder for holder, _ in site.owners if is_polarized_plastic(holder)]
-    names = ("diffuse_reflectance", "specular_reflectance")
-    held = [texture for lobe in lobes for name, texture in objects_of(lobe) if name in names]
-    with dr.suspend_grad():
-        black = [texture for texture in held if dr.all(mi.Float(texture.mean()) <= 0)]
-    return any(site.node is t or any(site.node is n for n in objects_below(t, mi.Texture)) for t in black)
-
-
-def _is_index_of_rough_metal_at_zero(site: Site) -> bool:
-    if not any(is_rough_conductor(holder) and name == "eta" for holder, name in site.owners):
-        return False
-    shown = dr.detach(mi.traverse(site.node)[site.key])
-    if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
-        return False
-    return bool(dr.any((shown.array if dr.is_tensor_v(shown) else shown) == 0, axis=None))
-
-
-BLACK_PPLASTIC = Row(
-    ParameterEffect(
-        biased=True,
-        reason="biased: Mitsuba never samples a lobe of pplastic that is black; only samples of the other lobe find it",
-    ),
-    _is_black_in_pplastic,
-    "the reflectance of a black lobe of pplastic",
-)
-METAL_AT_ZERO = Row(
-    ParameterEffect(
-        biased=True,
-        reason="biased: Mitsuba's Fresnel term of a metal has no slope by an index of zero; start from 0.01",
-    ),
-    _is_index_of_rough_metal_at_zero,
-    "the index of roughconductor, where it is zero",
-)
 IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
@@ -328,7 +294,7 @@ declare_effects(
     "Texture",
     {
         ANY_KEY: (
-            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, BLACK_PPLASTIC, METAL_AT_ZERO, OF_A_DARK_LIGHT,
+            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT,
         )
     },
 )  # fmt: skip

@@ -1,15 +1,17 @@
 """Mixtures (``mask``, ``blendbsdf``, ``blendphase``): a path chooses one part of them and sees that part alone.
 
-Mitsuba samples such a mixture as a whole. Where a part has a delta lobe that goes wrong: a blend divides by the sum of
-a probability and a density (:func:`.mitsuba_compat.mixes_delta`), and the derivative of the probability with which a
-part was chosen is lost. Here the choice is made outside of the BSDFs' methods, as between delayed and prompt light
-(:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and the factor ``weight / probability``, of which
-the weight is attached and the probability is not.
+Mitsuba samples such a mixture as a whole. Where a part has a delta lobe or lets light through that goes wrong: a blend
+divides by a sum of densities that is not that of its samples (:func:`.mitsuba_compat.adds_up_wrongly`), and the
+derivative of the probability with which a part was chosen is lost. Here the choice is made outside of the BSDFs'
+methods, as between delayed and prompt light (:mod:`.bsdfs.delay_table`): the path is handed the pointer of a part and
+the factor ``weight / probability``, of which the weight is attached and the probability is not.
 
-Which mixtures are taken apart: blends of delta lobes always; for derivatives also those around a BSDF that hides the
-probability of its lobes. Where the weight itself has a derivative and is zero, one or almost, the part that would never
-or hardly be chosen is, at times: the slope there is not less than elsewhere. All other mixtures are left to Mitsuba,
-whose sum over the parts has less noise.
+Which mixtures are taken apart: blends of delta lobes, of what lets light through, and of what works on different sides
+of a surface always; for derivatives also those around a BSDF that hides the probability of its lobes. Where the weight
+itself has a derivative and is zero, one or almost, the part that would never or hardly be chosen is, at times: the
+slope there is not less than elsewhere. All other mixtures are left to Mitsuba, whose sum over the parts has less noise;
+so are those inside a plugin that cannot be rebuilt around a part (one of others), unless they would have to be taken
+apart, which is an error.
 """
 
 from __future__ import annotations
@@ -19,10 +21,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from torchtransient.plugins.bsdfs.wrapper_copy import rebuild_wrapper
-from torchtransient.plugins.mitsuba_compat import hides_lobe_probability, mixes_delta, weight_slot
-from torchtransient.plugins.node_walk import carries_derivatives, objects_below, objects_of, shown_by
+from torchtransient.errors import GradientError, SceneError
+from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
+from torchtransient.plugins.bsdfs.wrapper_copy import can_be_rebuilt, flags_of, rebuild_wrapper
+from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
+from torchtransient.plugins.node_walk import bsdfs_below, carries_derivatives, objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
 
 # Probability of a part of less weight, where the derivative by the weight is asked for and the mixture is taken apart.
@@ -68,9 +73,10 @@ class Mixture:
         self.textures: list[Any] = []
         # (the wrapper of the scene, the one around a part), whose plain numbers have to be kept equal
         self.wrapped: list[tuple[Any, Any]] = []
+        self._flags: dict[int, dict[str, bool]] = {}
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        self.always = any(mixes_delta(part) for part in [node, *objects_below(node, kind)])
+        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
@@ -84,14 +90,16 @@ class Mixture:
                 nested = [self._null, *nested]
             first, second = (self._tree_of(part, wrappers) for part in nested)
             return Choice(texture, first, second)
-        if not any(is_mixture(part, self._kind) for part in nested):
+        if not is_mixture(node):
             return self._leaf(node, wrappers)
         trees = [self._tree_of(part, (*wrappers, node)) for part in nested]
         return trees[0] if len(trees) == 1 else Sides(*trees)
 
     def _leaf(self, node: Any, wrappers: tuple[Any, ...]) -> Leaf:
         for wrapper in reversed(wrappers):
-            node = rebuild_wrapper(wrapper, node)
+            if wrapper.ptr not in self._flags:
+                self._flags[wrapper.ptr] = flags_of(wrapper)
+            node = rebuild_wrapper(wrapper, node, self._flags[wrapper.ptr])
             self.wrapped.append((wrapper, node))
         self.parts.append(node)
         return Leaf(len(self.parts) - 1)
@@ -118,16 +126,80 @@ class Mixture:
         return any(carries_derivatives(texture) for texture in self.textures)
 
 
-def is_mixture(node: Any, kind: type) -> bool:
-    """Whether a BSDF or phase function is a mixture or holds one."""
-    return any(weight_slot(part) is not None for part in (node, *objects_below(node, kind)))
+class Seal:
+    """A plugin that holds mixtures and cannot be rebuilt around their parts: they are left to Mitsuba.
+
+    Raises SceneError where Mitsuba's values of them are wrong.
+    """
+
+    def __init__(self, node: Any, kind: type) -> None:
+        self.node, held = node, objects_below(node, kind)
+        self._mixtures = [part for part in held if weight_slot(part) is not None]
+        for part in self._mixtures:
+            if needs_choice(part):
+                raise SceneError(
+                    f"{self._names(part)}. Mitsuba samples a blend wrongly of which a part has a delta lobe or lets "
+                    f"light through, or works on other sides than another. {self._REMEDY}"
+                )
+        # One that says what its weights hide is taken at its word.
+        silent = getattr(node, "hides_lobe_probability", None) is None
+        self._hides = silent and any(hides_lobe_probability(part) for part in held)
+
+    _REMEDY = (
+        "Expected such mixtures outermost, or inside mask, blendbsdf, twosided, bumpmap and normalmap: put the other "
+        "plugin into the parts of the mixture."
+    )
+
+    def _names(self, mixture: Any) -> str:
+        return f"{type(self.node).__name__} '{self.node.id()}' holds {mixture.class_name()} '{mixture.id()}'"
+
+    def check(self, wanted: Any) -> None:
+        """Raise GradientError where derivatives need the mixture taken apart; asked with gradients enabled."""
+        if self._hides and (wanted.geometry or any(carries_derivatives(part) for part in self._mixtures)):
+            raise GradientError(
+                f"{self._names(self._mixtures[0])}, and a delta lobe in it hides the derivative of its probability. "
+                f"{self._REMEDY}"
+            )
+        for mixture in self._mixtures:
+            texture = dict(objects_of(mixture))[weight_slot(mixture)]
+            held = (texture, *objects_below(texture, mi.Object))
+            values = (shown.read(part) for part in held for shown in shown_by(part)[0])
+            weights = (np.array(dr.detach(value)) for value in values if dr.grad_enabled(value))
+            if any(((weight <= 0) | (weight >= 1)).any() for weight in weights):
+                raise GradientError(
+                    f"{self._names(mixture)}, whose weight is exactly 0 or 1, where the derivative by it is lost. "
+                    f"Start beside that value. {self._REMEDY}"
+                )
+
+
+def needs_choice(node: Any) -> bool:
+    """Whether a mixture has wrong values where Mitsuba samples it as a whole."""
+    held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
+    return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
+
+
+def is_mixture(node: Any) -> bool:
+    """Whether a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it holds."""
+    if weight_slot(node) is not None:
+        return True
+    return can_be_rebuilt(node) and any(is_mixture(part) for part in bsdfs_below(node))
+
+
+def seals_of(node: Any, kind: type) -> list[Seal]:
+    """Of a BSDF or phase function and all that it holds."""
+    others = (part for part in (node, *objects_below(node, kind)) if weight_slot(part) is None)
+    return [
+        Seal(part, kind)
+        for part in others
+        if not can_be_rebuilt(part) and any(weight_slot(below) is not None for below in objects_below(part, kind))
+    ]
 
 
 class Mixtures:
     """The mixtures of a scene: what of them does not change with their parameters."""
 
-    def __init__(self, mixtures: list[Mixture]) -> None:
-        self.mixtures = {mixture.node.ptr: mixture for mixture in mixtures}
+    def __init__(self, mixtures: list[Mixture], seals: list[Seal]) -> None:
+        self.mixtures, self._seals = {mixture.node.ptr: mixture for mixture in mixtures}, seals
         firsts, numbers = [], []
         for mixture in mixtures:
             firsts.append(len(numbers))
@@ -136,12 +208,14 @@ class Mixtures:
         self._numbers = mi.UInt32(numbers)
         dr.make_opaque(self._numbers)
 
-    def read(self, derivatives: bool) -> MixtureChoice | None:
-        """Which of them are taken apart in a job, None for none; ``derivatives``: it is one of derivatives."""
+    def read(self, wanted: Any) -> MixtureChoice | None:
+        """Which of them are taken apart in a job, None for none; ``wanted``: the derivatives of the job, or None."""
         for mixture in self.mixtures.values():
             mixture.follow()
         with dr.resume_grad():
-            chosen = {ptr: mixture.taken_apart(derivatives) for ptr, mixture in self.mixtures.items()}
+            for seal in self._seals if wanted is not None else ():
+                seal.check(wanted)
+            chosen = {ptr: mixture.taken_apart(wanted is not None) for ptr, mixture in self.mixtures.items()}
         chosen = {ptr: how for ptr, how in chosen.items() if any(how)}
         return MixtureChoice(self, chosen) if chosen else None
 
@@ -213,12 +287,15 @@ def mixtures_of(nodes: list[Any], kind: type) -> tuple[list[Any], Mixtures | Non
     """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
     apart is replaced by its parts, the parts of others join it.
     """
-    met, mixtures = [], []
+    met: list[Any] = []
+    mixtures: list[Mixture] = []
+    seals: list[Seal] = []
     for node in nodes:
-        if not is_mixture(node, kind):
+        seals += seals_of(node, kind)
+        if not is_mixture(node):
             met.append(node)
             continue
         mixture = Mixture(node, kind)
         mixtures.append(mixture)
         met += mixture.parts if mixture.always else [node, *mixture.parts]
-    return met, Mixtures(mixtures) if mixtures else None
+    return met, Mixtures(mixtures, seals) if mixtures or seals else None

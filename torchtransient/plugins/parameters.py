@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
+from torchtransient.plugins.black_textures import check_black, loses_black
 from torchtransient.plugins.mitsuba_compat import is_replaced_for, keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
@@ -123,6 +124,16 @@ class ParameterTracker:
         if isinstance(node, mi.BSDF):
             return [(node, "")]
         return [(holder, name) for holder, name in owners_of(node, self._holders) if is_replaced_for(holder, name)]
+
+    def loses_black(self, node: Any) -> bool:
+        """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
+        return loses_black(node, tuple(owners_of(node, self._holders)))
+
+    def check_black(self) -> None:
+        """Raise ``GradientError`` where it would be."""
+        check_black(
+            [(node, v.key, value, tuple(owners_of(node, self._holders))) for node, v, value in self._carrying()]
+        )
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
         """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""

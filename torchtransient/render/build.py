@@ -30,7 +30,15 @@ from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
 from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
-from torchtransient.render.nodes import check_finite, children, descendants, find_child, is_film, is_integrator, media_in_use
+from torchtransient.render.nodes import (
+    check_finite,
+    children,
+    descendants,
+    find_child,
+    is_film,
+    is_integrator,
+    media_in_use,
+)
 from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
 

@@ -20,6 +20,7 @@ import torch
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.plugins.black_textures import lifted
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.films.choice import FilmChoice
@@ -96,9 +97,11 @@ class _Session:
         import drjit as dr
 
         leaves = []
-        for value, batched, need in zip(values, self.job.batched, needs, strict=True):
+        for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
             leaf = _own_array(entry)
+            if need and slot.loses_black():
+                leaf = lifted(leaf)
             if need:
                 dr.enable_grad(leaf)
             leaves.append(leaf)

@@ -93,7 +93,7 @@ def take_inventory(state: Any, folder_lookup: Any, sensor: int = 0) -> SceneInve
 def like_mitsuba(plugin: str) -> str:
     """The plugin of Mitsuba that one of this library stands in for, ``dielectric`` for ``diff_dielectric``."""
     name = plugin.removeprefix(_TWIN)
-    return {"rough_dielectric": "roughdielectric"}.get(name, name)
+    return name.replace("rough_", "rough")
 
 
 def name_of(state: Any, index: int) -> str:

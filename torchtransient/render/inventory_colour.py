@@ -30,7 +30,7 @@ _TRANSPARENT = frozenset((
     "scene", "area", "angulararea", "directionalarea", "point", "spot", "directional", "constant", "projector",
     "diffuse", "dielectric", "thindielectric", "roughdielectric", "diff_dielectric", "diff_rough_dielectric",
     "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_polarizer", "diff_retarder", "diff_circular",
-    "conductor", "roughconductor", "plastic", "roughplastic",
+    "conductor", "roughconductor", "plastic", "roughplastic", "diff_rough_conductor", "diff_pplastic",
     "pplastic", "principled", "principledthin", "diff_principled", "diff_principled_thin",
     "blendbsdf", "mask", "twosided", "bumpmap",
     "normalmap", "null", "polarizer", "retarder", "circular", "delayed", "homogeneous", "heterogeneous",
@@ -98,7 +98,7 @@ def colour_of_node(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
         return Verdict(MEASURED, _MEASURED_PLUGINS[plugin])
     if plugin in _COLOURED_PLUGINS:
         return Verdict(COLOUR, _COLOURED_PLUGINS[plugin])
-    if plugin in ("conductor", "roughconductor", "diff_conductor"):
+    if plugin in ("conductor", "roughconductor", "diff_conductor", "diff_rough_conductor"):
         material = str(props.get("material", "none"))
         return None if material.lower() == "none" else Verdict(MEASURED, f"indices of {material!r} over wavelength")
     if plugin == "delayed" and any(key in props for key in ("emission", "excitation")):

@@ -59,6 +59,12 @@ def plastic(kind, **reflectances):
     return room(bsdf={"type": kind, **lobes}, light=area_light())
 
 
+def rough_metal(**rates):
+    """A room with a wall of rough metal."""
+    index = {name: {"type": "uniform", "value": value} for name, value in rates.items()}
+    return room(bsdf={"type": "diff_rough_conductor", "alpha": 0.3, **index}, light=area_light())
+
+
 CASES = [
     Case("diffuse_albedo", "diffuse albedo", room, set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
     Case(
@@ -329,6 +335,27 @@ CASES = [
         side=1,
         spp=16384,
         fd_spp=65536,
+    ),
+    Case(
+        "rough_metal_of_index_zero",
+        "complex index of a conductor",
+        lambda: rough_metal(eta=0.0, k=2.0),
+        set_color("wall.bsdf.eta.value"),
+        0.0,
+        0.01,
+        side=1,
+        spp=4096,
+    ),
+    Case(
+        "rough_metal_without_absorption",
+        "complex index of a conductor",
+        lambda: rough_metal(eta=0.02, k=0.0),
+        set_color("wall.bsdf.k.value"),
+        0.0,
+        # Next to the critical angle, which is 1 degree, the reflectance bends sharply.
+        1e-3,
+        side=1,
+        spp=4096,
     ),
     Case(
         "metal_of_index_zero",

@@ -18,6 +18,7 @@ DIM_MIRROR = {**MIRROR, "specular_reflectance": 0.4}
 GLASS = {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}
 THIN_GLASS = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}
 PLASTIC = {"type": "plastic", "int_ior": 1.5, "diffuse_reflectance": 0.5}
+ROUGH_GLASS = {"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.3}
 METAL = {"type": "roughconductor", "alpha": 0.1}
 
 
@@ -53,6 +54,16 @@ def wide_room(bsdf):
     scene = mirror_room(bsdf)
     scene["wall"]["to_world"] = transform().scale(30)
     scene["side"]["to_world"] = transform().translate([0, 0, 5]).rotate([0, 1, 0], 180).scale(30)
+    return scene
+
+
+def seen_through(bsdf):
+    """The wall from behind, with light on what lies beyond it."""
+    scene = mirror_room(bsdf)
+    scene["sensor"]["film"]["start_opl"] = 4.0
+    scene["wall"]["to_world"] = transform().rotate([0, 1, 0], 180).scale(3)
+    scene["side"]["to_world"] = transform().translate([0, 0, -1]).scale(30)
+    scene["light"]["position"] = [0.5, 0.3, -0.5]
     return scene
 
 
@@ -117,6 +128,25 @@ CASES = [
     weight("no_dim_mirror_yet", partial(blend, MIRROR, DIM_MIRROR), 0.0, side=1, **SLOW),
     opacity("nothing_of_a_mirror", MIRROR, 0.0, side=1),
     opacity("all_of_a_mirror", MIRROR, 1.0, side=-1, **SLOW),
+    Case(
+        "roughness_of_blended_glass",
+        "roughness",
+        lambda: seen_through(blend(ROUGH_GLASS, DIFFUSE)),
+        set_color("wall.bsdf.bsdf_0.alpha.value"),
+        0.3,
+        0.02,
+        spp=4096,
+    ),
+    Case(
+        "index_of_blended_glass",
+        "eta of diff_rough_dielectric",
+        lambda: seen_through(blend(ROUGH_GLASS, DIFFUSE)),
+        set_color("wall.bsdf.bsdf_0.eta"),
+        1.5,
+        0.02,
+        spp=4096,
+        **SLOW,
+    ),
     Case(
         "index_of_masked_thin_glass",
         "eta of thindielectric",

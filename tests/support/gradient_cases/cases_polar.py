@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import area_light, camera, glass_slab, mirror_room, room, transform
 from support.gradient_cases.unknowns import move, move_point, rotate, set_color
@@ -63,6 +65,23 @@ ALBEDO, INDEX, ROUGHNESS = "polarized: albedo, plastic", "polarized: index, real
 ELEMENT = "polarized: polarizer, wave plate, circular polarizer"
 MOTION = "polarized: shapes, lights, sensor pose"
 
+
+def black_plastic(lobe):
+    """A wall of plastic of which one lobe is black."""
+    black = {**PLASTIC, "type": "diff_pplastic", lobe: {"type": "uniform", "value": 0.0}}
+    case = polar(
+        f"polar_black_{lobe}",
+        ALBEDO,
+        lambda: metal_room(black, light=area_light()),
+        set_color(f"wall.bsdf.{lobe}.value"),
+        0.0,
+        0.1,
+        spp=8192,
+        fd_spp=16384,
+    )
+    return replace(case, side=1, tags=("slow",))
+
+
 CASES = [
     polar(
         "polar_albedo",
@@ -81,6 +100,19 @@ CASES = [
         set_color("wall.bsdf.diffuse_reflectance.value"),
         0.4,
         0.02,
+    ),
+    black_plastic("diffuse_reflectance"),
+    black_plastic("specular_reflectance"),
+    replace(
+        polar(
+            "polar_metal_of_index_zero",
+            INDEX,
+            lambda: metal_room({**METAL, "type": "diff_rough_conductor", "eta": 0.0}),
+            set_color("wall.bsdf.eta.value"),
+            0.0,
+            0.01,
+        ),
+        side=1,
     ),
     polar("polar_metal_eta", INDEX, metal_room, set_color("wall.bsdf.eta.value"), 0.8, 0.02),
     polar("polar_metal_k", INDEX, metal_room, set_color("wall.bsdf.k.value"), 2.5, 0.02),

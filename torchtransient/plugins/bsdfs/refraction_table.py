@@ -27,29 +27,46 @@ class RefractiveBSDFs:
     ``blendbsdf``, ``normalmap``, ``bumpmap`` and in shape groups. Attached where the plugin's ``eta`` (``specular``
     for ``principled``) is. Delta lobes are left out: nothing connects through them, and ``sample`` returns their
     index.
+
+    ``entries``: (BSDF, its parts that hold an index).
     """
 
-    def __init__(self, entries: list[tuple[Any, Any]]) -> None:
+    def __init__(self, entries: list[tuple[Any, list[Any]]]) -> None:
         self._entries = entries
+        self._check()
 
     @staticmethod
     def of(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
         """Those of ``scene``, or None when nothing in it refracts through a lobe that can be connected to.
 
         ``bsdfs``: those of the scene where they are known already.
-        Raises SceneError for a blend of two refractive BSDFs with different indices, where a connection has no single
-        optical length, and for a refractive plugin that does not expose ``eta``.
+        Raises SceneError for a BSDF of which two parts have different indices, where a connection has no single optical
+        length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of a scene
+        (:mod:`..mixtures`); a plugin of others may hold several.
         """
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
         leaves = ((bsdf, _refractive_leaves(bsdf, (mi.BSDFFlags.GlossyTransmission,))) for bsdf in found)
-        entries = [(bsdf, _one_index(bsdf, parts)) for bsdf, parts in leaves if parts]
+        entries = [(bsdf, parts) for bsdf, parts in leaves if parts]
         return RefractiveBSDFs(entries) if entries else None
 
     def read(self) -> RefractionTable:
-        """The indices as they are now; to be called outside of loops, once a job."""
+        """The indices as they are now; to be called outside of loops, once a job. Raises as :meth:`of` where values
+        were installed since; a call that is recorded cannot look at numbers.
+        """
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            self._check()
         with dr.resume_grad():
-            indices = [index_of(leaf) for _, leaf in self._entries]
+            indices = [index_of(parts[0]) for _, parts in self._entries]
             return RefractionTable(PointerTable([bsdf for bsdf, _ in self._entries], indices, default=1))
+
+    def _check(self) -> None:
+        for bsdf, parts in self._entries:
+            indices = {_number(part) for part in parts} if len(parts) > 1 else set()
+            if len(indices) > 1:
+                raise SceneError(
+                    f"BSDF '{bsdf.id()}': one relative index of refraction per surface is expected, its parts have "
+                    f"{', '.join(map(str, sorted(indices)))}. Give the parts the same index, or use separate surfaces."
+                )
 
 
 class RefractionTable:
@@ -101,15 +118,8 @@ def _refractive_leaves(bsdf: Any, lobes: tuple[Any, ...]) -> list[Any]:
     return leaves
 
 
-def _one_index(bsdf: Any, leaves: list[Any]) -> Any:
-    """The first of the parts, which must have one index."""
-    indices = {round(float(dr.slice(dr.detach(index_of(leaf)), 0)), 6) for leaf in leaves}
-    if len(indices) > 1:
-        raise SceneError(
-            f"BSDF '{bsdf.id()}': one relative index of refraction per surface is expected, its parts have "
-            f"{', '.join(map(str, sorted(indices)))}. Give the parts the same index, or use separate surfaces."
-        )
-    return leaves[0]
+def _number(part: Any) -> float:
+    return round(float(dr.slice(dr.detach(index_of(part)), 0)), 6)
 
 
 def _has_refraction_lobe(bsdf: Any, lobes: tuple[Any, ...]) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -9,34 +11,76 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.mitsuba_compat import is_two_sided_itself, normal_texture
-from torchtransient.plugins.node_walk import objects_of, shown_by
+from torchtransient.plugins.mitsuba_compat import HIDDEN_FLAGS, is_two_sided_itself, normal_texture
+from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 
 
-def rebuild_wrapper(wrapper: Any, nested: Any) -> Any:
+def can_be_rebuilt(wrapper: Any) -> bool:
+    """Whether a BSDF is one that :func:`rebuild_wrapper` knows."""
+    return is_two_sided_itself(wrapper) or normal_texture(wrapper) is not None
+
+
+def rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
     """A BSDF that does to ``nested`` what ``wrapper`` (two-sided, bump or normal map) does to the one it holds. Shares
-    the textures. Raises SceneError for other BSDFs.
+    the textures. ``flags``: see :func:`flags_of`.
     """
-    name, slot = wrapper.class_name(), normal_texture(wrapper)
-    if is_two_sided_itself(wrapper):
-        return mi.load_dict({"type": "twosided", "allow_transmission": True, "nested": nested})
+    slot = normal_texture(wrapper)
     if slot is None:
-        raise SceneError(
-            f"BSDF '{wrapper.id()}': expected mask and blendbsdf outermost or inside twosided, bumpmap and normalmap, "
-            f"got one inside {name}. Put {name} inside the mixture."
-        )
-    held = dict(objects_of(wrapper))
-    own = next(value for value in held.values() if isinstance(value, mi.BSDF))
+        return mi.load_dict({"type": "twosided", "allow_transmission": True, "nested": nested})
     plain = {shown.key: shown.read(wrapper) for shown in shown_by(wrapper)[0]}
-    candidates = []
-    for flips, shadows in ((True, True), (True, False), (False, True), (False, False)):
-        plain |= {"flip_invalid_normals": flips, "use_shadowing_function": shadows}
-        kind = {"type": name.lower(), slot: held[slot], **plain}
-        candidates.append(kind)
-    # A built plugin does not show these two flags: the first that samples alike.
-    reference = samples_of(wrapper)
-    found = (kind for kind in candidates if samples_of(mi.load_dict({**kind, "nested": own})) == reference)
-    return mi.load_dict({**next(found, candidates[0]), "nested": nested})
+    texture = dict(objects_of(wrapper))[slot]
+    return mi.load_dict({"type": wrapper.class_name().lower(), slot: texture, **plain, **flags, "nested": nested})
+
+
+def flags_of(wrapper: Any) -> dict[str, bool]:
+    """Properties of a bump or normal map that a built one does not show.
+
+    They are told by what it samples, with values of textures by which all choices differ: not with those of now, since
+    a map that is flat or a surface that is black now may be changed.
+    """
+    if normal_texture(wrapper) is None:
+        return {}
+    own = next(value for _, value in objects_of(wrapper) if isinstance(value, mi.BSDF))
+    with _telling_values(wrapper):
+        reference = samples_of(wrapper)
+        for number in reversed(range(2 ** len(HIDDEN_FLAGS))):
+            flags = {name: bool(number >> place & 1) for place, name in enumerate(HIDDEN_FLAGS)}
+            if samples_of(rebuild_wrapper(wrapper, own, flags)) == reference:
+                return flags
+    raise SceneError(
+        f"{wrapper.class_name()} '{wrapper.id()}': expected one that samples as those of Mitsuba with some choice of "
+        f"{', '.join(HIDDEN_FLAGS)}, got other samples. Put it into the parts of the mixture that it holds."
+    )
+
+
+@contextmanager
+def _telling_values(wrapper: Any) -> Iterator[None]:
+    """For the time of a question: random numbers in all textures below a BSDF, and a scale that is not zero."""
+    rng, before = np.random.default_rng(0), []
+    with dr.resume_grad():
+        for node in (wrapper, *objects_below(wrapper, mi.Texture)):
+            params = mi.traverse(node)
+            for key in {"value", "data", "scale"} & set(params.keys()):
+                value = params[key]
+                before.append((params, key, type(value)(value)))
+                params[key] = _random(value, rng)
+            params.update()
+    try:
+        yield
+    finally:
+        with dr.resume_grad():
+            for params, key, value in before:
+                params[key] = value
+                params.update()
+
+
+def _random(value: Any, rng: np.random.Generator) -> Any:
+    """Numbers between 0.6 and 1 (of the range of whole ones) of the shape of a parameter."""
+    numbers = np.array(dr.detach(value))
+    drawn = rng.uniform(0.6, 1.0, numbers.shape)
+    if np.issubdtype(numbers.dtype, np.integer):
+        drawn = drawn * np.iinfo(numbers.dtype).max
+    return type(value)(drawn.astype(numbers.dtype) if dr.is_array_v(value) else float(drawn))
 
 
 def samples_of(bsdf: Any) -> list[bytes]:

@@ -269,7 +269,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         self._seen_scene(scene).follow_derivatives(scene, True)
         contents = self.contents(scene, sensor)
         with dr.resume_grad():  # the question whether a parameter is attached is answered no while suspended
-            effects = self.parameters(scene).attached()
+            tracker = self.parameters(scene)
+            effects = tracker.attached()
+            tracker.check_black()
         check_stand_ins(effects)
         check_slope(moving_names(effects), film.has_slope, film.response_name, film.slope_remedy)
         if self.max_depth == UNLIMITED:

@@ -34,6 +34,7 @@ class SeenScene:
         self._pointers: tuple[int, ...] = ()
         self._lobes: list[int] = []
         self._bsdfs: list[Any] = []
+        self._followers: list[Any] = []
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
 
@@ -47,10 +48,8 @@ class SeenScene:
         """
         self._forget_replaced(scene)
         with dr.resume_grad():
-            for bsdf in self._bsdfs:
-                follow = getattr(bsdf, "follow_derivatives", None)
-                if follow is not None:
-                    follow(asked)
+            for bsdf in self._followers:
+                bsdf.follow_derivatives(asked)
 
     def contents_for(self, scene: Any, sensor: Any) -> SceneContents:
         """What the scene contains for a sensor, which may stand in a medium."""
@@ -76,6 +75,7 @@ class SeenScene:
             outermost = {bsdf.ptr: bsdf for bsdf in bsdfs}.values()
             nested = [part for bsdf in outermost for part in objects_below(bsdf, mi.BSDF)]
             self._bsdfs = list({bsdf.ptr: bsdf for bsdf in [*outermost, *nested]}.values())
+            self._followers = [bsdf for bsdf in self._bsdfs if hasattr(bsdf, "follow_derivatives")]
         # Changed parameters may add a lobe, which those around a BSDF do not tell of.
         lobes = [bsdf.flags() for bsdf in self._bsdfs]
         if pointers != self._pointers or lobes != self._lobes:

@@ -1,8 +1,9 @@
-"""Preliminary intersections with derivatives, for the shapes whose hit points Mitsuba leaves detached.
+"""Interactions with derivatives, for the shapes whose hit points Mitsuba leaves detached or misplaces.
 
 The interactions of its ellipsoids and linear curves lie at the ray's point of the *detached* distance: they follow
 neither the shape nor a ray that moves. The rest of the interaction is computed from distance and place on the shape, so
-it is enough to attach these two.
+it is enough to attach these two. Its B-spline curves follow, but the place along the curve does so wrongly, and the
+normal with it: these are put right afterwards.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import leaves_hits_detached
+from torchtransient.plugins.mitsuba_compat import leaves_hits_detached, misplaces_hits
 from torchtransient.plugins.node_walk import shapes_of_scene, shown_by
 from torchtransient.plugins.pointer_table import PointerTable
 
@@ -27,23 +28,29 @@ class DetachedHits:
     def __init__(self, shapes: Sequence[Any]) -> None:
         shown = [(shape, {value.key: value for value in shown_by(shape)[0]}) for shape in shapes]
         self._ellipsoids = [(shape, values) for shape, values in shown if "data" in values]
-        self._curves = [(shape, values) for shape, values in shown if "control_points" in values]
+        curves = [(shape, values) for shape, values in shown if "control_points" in values]
+        self._curves = [entry for entry in curves if not misplaces_hits(entry[0])]
+        self._splines = [entry for entry in curves if misplaces_hits(entry[0])]
         self._starts: list[list[int]] = []
         self._find_starts()
 
     def _find_starts(self) -> None:
         """Where each shape's ellipsoids or segments begin, counted from one: what is not listed has none."""
         ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
-        segments = _starts([values["segment_indices"].read(shape) for shape, values in self._curves], 1)
-        if [ellipsoids, segments] != self._starts:
+        segments, pieces = (
+            _starts([values["segment_indices"].read(shape) for shape, values in curves], 1)
+            for curves in (self._curves, self._splines)
+        )
+        if [ellipsoids, segments, pieces] != self._starts:
             self._first_ellipsoid = PointerTable([shape for shape, _ in self._ellipsoids], [1 + n for n in ellipsoids])
             self._first_segment = PointerTable([shape for shape, _ in self._curves], [1 + n for n in segments])
-            self._starts = [ellipsoids, segments]
+            self._first_piece = PointerTable([shape for shape, _ in self._splines], [1 + n for n in pieces])
+            self._starts = [ellipsoids, segments, pieces]
 
     @staticmethod
     def of(scene: Any) -> DetachedHits | None:
         """Those of ``scene``, shape groups included; None when it has none."""
-        found = [shape for shape in shapes_of_scene(scene) if leaves_hits_detached(shape)]
+        found = [s for s in shapes_of_scene(scene) if leaves_hits_detached(s) or misplaces_hits(s)]
         return DetachedHits(found) if found else None
 
     def read(self) -> HitTable:
@@ -55,6 +62,8 @@ class DetachedHits:
                 kinds.append(EllipsoidTable(self._ellipsoids, self._first_ellipsoid))
             if self._curves:
                 kinds.append(CurveTable(self._curves, self._first_segment))
+            if self._splines:
+                kinds.append(SplineTable(self._splines, self._first_piece))
             return HitTable(kinds)
 
 
@@ -75,8 +84,23 @@ class HitTable:
             kind.attach(pi, shape, ray, active)
         return pi
 
+    def put_right(self, si: Any, pi: Any, active: Any) -> None:
+        """Attach what Mitsuba has computed of the hit at ``pi`` with a wrong derivative; ``si`` stays on its ray."""
+        for kind in self._kinds:
+            kind.put_right(si, pi, active)
 
-class EllipsoidTable:
+
+class _Kind:
+    """One kind of shape."""
+
+    def attach(self, pi: Any, shape: Any, ray: Any, active: Any) -> None:
+        """Attach the intersections with such shapes, before Mitsuba computes the interaction."""
+
+    def put_right(self, si: Any, pi: Any, active: Any) -> None:
+        """Attach interactions with such shapes, after it."""
+
+
+class EllipsoidTable(_Kind):
     """The ellipsoids of all shapes, one after the other."""
 
     def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
@@ -105,7 +129,7 @@ class EllipsoidTable:
         pi.t = dr.replace_grad(pi.t, dr.select(meets, t, 0))
 
 
-class CurveTable:
+class CurveTable(_Kind):
     """The segments of all linear curves, one after the other.
 
     A segment is what spheres around the points of a line cover, whose radius changes along the line. At a hit ``p`` the
@@ -144,6 +168,62 @@ class CurveTable:
         bend = dr.detach(dr.squared_norm(along) - dr.square(r_slope))
         inside = meets & (v > 0) & (v < 1) & (bend > 0)
         pi.prim_uv.x = dr.replace_grad(v, dr.select(inside, v + half / dr.select(inside, bend, 1), 0))
+
+
+class SplineTable(_Kind):
+    """The pieces of all B-spline curves, one after the other.
+
+    The surface is what circles around the curve ``c(v)`` cover: at a hit ``p``, ``(p - c) . c'`` is zero.
+    """
+
+    def __init__(self, shapes: Sequence[tuple[Any, dict[str, Any]]], first: PointerTable) -> None:
+        points = [_floats(values["control_points"].read(shape)) for shape, values in shapes]
+        pieces = [mi.UInt32(values["segment_indices"].read(shape)) for shape, values in shapes]
+        self._first = first
+        self._points = dr.concat(points)
+        self._pieces = dr.concat([s + n for s, n in zip(pieces, _starts(points, _POINT), strict=True)])
+        self._counts = dr.concat([dr.full(mi.Float, dr.width(s), dr.width(s)) for s in pieces])
+
+    def tables(self) -> list[Any]:
+        return [self._points]
+
+    def put_right(self, si: Any, pi: Any, active: Any) -> None:
+        first = self._first.look_up(si.shape, active)
+        here = active & (first > 0)
+        number = first - 1 + pi.prim_index
+        piece = dr.gather(mi.UInt32, self._pieces, number, here)
+        points = [
+            [dr.gather(mi.Float, self._points, (piece + i) * _POINT + k, here) for k in range(_POINT)] for i in range(4)
+        ]
+        v = dr.detach(pi.prim_uv.x)
+        (c, _), (slope, _), (bend, _) = _spline(points, v)
+        away = dr.select(here, mi.Vector3f(si.p) - c, 0)
+        rate = dr.detach(dr.squared_norm(slope) - dr.dot(away, bend))
+        meets = here & (rate != 0)
+        step = dr.dot(away, slope) / dr.select(meets, rate, 1)
+        v = dr.replace_grad(v, dr.select(meets, v + step, 0))
+        (c, r), (slope, r_slope), (bend, _) = _spline(points, v)
+        away = mi.Vector3f(si.p) - c
+        n = (dr.squared_norm(slope) - dr.dot(away, bend)) * away - (r_slope * r) * slope
+        n = mi.Normal3f(dr.normalize(dr.select(meets, n, mi.Vector3f(0, 0, 1))))
+        si.n = dr.select(meets, dr.replace_grad(si.n, n), si.n)
+        along = v / dr.gather(mi.Float, self._counts, number, meets)
+        si.uv.y = dr.select(meets, dr.replace_grad(si.uv.y, along), si.uv.y)
+        frame = mi.Frame3f(dr.normalize(si.dp_du - n * dr.dot(n, si.dp_du)), mi.Vector3f(0), n)
+        frame.t = dr.cross(frame.n, frame.s)
+        si.sh_frame = dr.select(meets, dr.replace_grad(si.sh_frame, frame), si.sh_frame)
+
+
+def _spline(points: Sequence[Sequence[Any]], v: Any) -> list[tuple[Any, Any]]:
+    """(place, radius) at ``v`` of a piece of a uniform cubic B-spline, and their first two derivatives by ``v``."""
+    w, v2 = 1 - v, dr.square(v)
+    weights = [
+        [w * w * w / 6, (3 * v2 * v - 6 * v2 + 4) / 6, (-3 * v2 * v + 3 * v2 + 3 * v + 1) / 6, v2 * v / 6],
+        [-w * w / 2, (3 * v2 - 4 * v) / 2, (-3 * v2 + 2 * v + 1) / 2, v2 / 2],
+        [w, 3 * v - 2, 1 - 3 * v, v],
+    ]
+    sums = [[sum(w * p[k] for w, p in zip(row, points, strict=True)) for k in range(_POINT)] for row in weights]
+    return [(mi.Vector3f(x, y, z), r) for x, y, z, r in sums]
 
 
 def _floats(value: Any) -> Any:

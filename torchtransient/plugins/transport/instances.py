@@ -97,6 +97,8 @@ class InstanceTable:
         if hits is not None:
             pi = hits.attach(pi, si.shape, local_ray, active & valid)
         local = si.shape.compute_surface_interaction(local_ray, pi, flags, active & valid)
+        if hits is not None and not mi.has_flag(flags, mi.RayFlags.FollowShape):
+            hits.put_right(local, pi, active & valid)
 
         # What Mitsuba found keeps its value to the bit.
         si.p = dr.replace_grad(si.p, _point(M, dr.select(valid, local.p, 0)))
@@ -138,7 +140,10 @@ class AttachedSurfaces:
         if self._instances is not None:
             return self._instances.interaction(pi, ray, flags, active, self._hits)
         pi = self._hits.attach(pi, pi.shape, ray, active & pi.is_valid())
-        return pi.compute_surface_interaction(ray, flags, active)
+        si = pi.compute_surface_interaction(ray, flags, active)
+        if not mi.has_flag(flags, mi.RayFlags.FollowShape):
+            self._hits.put_right(si, pi, active & si.is_valid())
+        return si
 
 
 def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:

@@ -37,7 +37,7 @@ class SurfaceOrMedium(Surface):
     def prepare(self, world):
         super().prepare(world)
         blends = world.contents.media.phase_mixtures
-        self.blends = None if blends is None else blends.read(world.wanted is not None)
+        self.blends = None if blends is None else blends.read(world.wanted)
 
     def _phase_and_scattering(self, mei, u, active):
         """(phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""

@@ -37,7 +37,7 @@ class Surface(Scattering):
         contents = world.contents
         self.refraction = None if contents.refraction is None else contents.refraction.read()
         self.delays = None if contents.delays is None else contents.delays.read()
-        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted is not None)
+        self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted)
         for guide in self.guides:
             guide.prepare(world)
 

@@ -1,0 +1,131 @@
+"""Surfaces that users write in Python: what they hold counts as it does without them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support import foreign_bsdfs
+from support.gradient_cases.cases_mixtures import (
+    DIFFUSE,
+    METAL,
+    MIRROR,
+    ROUGH_GLASS,
+    THIN_GLASS,
+    blend,
+    mask,
+    mirror_room,
+    transform,
+    two_sided,
+)
+from torchtransient import plugins
+from torchtransient.errors import GradientError, SceneError
+
+MONO, POLARIZED = "llvm_ad_mono", "llvm_ad_mono_polarized"
+
+
+def activate(variant):
+    mi.set_variant(variant)
+    plugins.sync()
+    foreign_bsdfs.register()
+
+
+def load(bsdf, behind=False):
+    """A room whose paths meet the wall once, so that light is linear in what it scatters."""
+    scene = mirror_room(bsdf)
+    scene["integrator"]["max_depth"] = 3
+    if behind:
+        scene["wall"]["to_world"] = transform().rotate([0, 1, 0], 180)
+    return mi.load_dict(scene, optimize=False)
+
+
+def tint(nested, plugin="tint"):
+    return {"type": plugin, "inner": nested}
+
+
+def image(bsdf, behind=False):
+    scene = load(bsdf, behind)
+    return np.array(scene.integrator().render(scene, seed=3, spp=256)[1])
+
+
+def slope(bsdf, key, value=None, spp=256):
+    """Derivative of the light in the film by a parameter of the wall's BSDF, in reverse mode."""
+    scene = load(bsdf)
+    params = mi.traverse(scene)
+    x = mi.Float(params[f"wall.bsdf.{key}"] if value is None else value)
+    dr.enable_grad(x)
+    params[f"wall.bsdf.{key}"] = x
+    params.update()
+    adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
+    scene.integrator().render_backward(scene, params, (None, adjoint), seed=3, spp=spp)
+    return float(dr.grad(x)[0])
+
+
+@pytest.mark.parametrize("plugin", ["tint", "mended_tint"])
+def test_lobe_probabilities_that_a_nested_bsdf_hides(plugin):
+    activate(MONO)
+    assert slope(tint(THIN_GLASS, plugin), "inner.eta") == pytest.approx(0.5 * slope(THIN_GLASS, "eta"), rel=1e-4)
+
+
+def test_matrices_of_a_nested_two_sided_surface_from_behind():
+    activate(POLARIZED)
+    metal = two_sided({**METAL, "alpha": 0.3, "eta": 0.5, "k": 2.0})
+    direct, tinted = image(metal, behind=True), image(tint(metal), behind=True)
+    assert np.abs(direct[..., 1:]).max() > 1e-3 * direct.max(), "no polarization: the test would prove nothing"
+    np.testing.assert_allclose(tinted, 0.5 * direct, rtol=1e-3, atol=1e-5 * direct.max())
+
+
+def test_a_surface_that_does_not_describe_itself():
+    activate(MONO)
+    np.testing.assert_allclose(image({"type": "nameless"}), image(DIFFUSE), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("mixture", [blend(DIFFUSE, METAL), mask(MIRROR), mask(THIN_GLASS)])
+def test_mixtures_inside_that_mitsuba_samples_rightly(mixture):
+    activate(MONO)
+    np.testing.assert_allclose(image(tint(mixture)), 0.5 * image(mixture), rtol=1e-4, atol=1e-6)
+
+
+def test_derivatives_by_a_mixture_inside():
+    activate(MONO)
+    mixture = blend(DIFFUSE, METAL)
+    # Each draws other random numbers.
+    inside, bare = slope(tint(mixture), "inner.weight.value", spp=8192), slope(mixture, "weight.value", spp=8192)
+    assert inside == pytest.approx(0.5 * bare, rel=2e-2)
+
+
+def test_a_mixture_inside_one_that_is_taken_apart():
+    activate(MONO)
+    inner = blend(DIFFUSE, METAL, 0.5)
+    found = image(blend(MIRROR, tint(inner), 0.5))
+    np.testing.assert_allclose(found.sum(), 0.5 * image(MIRROR).sum() + 0.25 * image(inner).sum(), rtol=2e-2)
+
+
+@pytest.mark.parametrize("other", [MIRROR, ROUGH_GLASS], ids=["mirror", "rough glass"])
+def test_mixtures_inside_that_mitsuba_samples_wrongly_are_refused(other):
+    activate(MONO)
+    with pytest.raises(SceneError, match=r"Tint .* holds BlendBSDF .* into the parts of the mixture"):
+        image(two_sided_or_bare(other))
+
+
+def two_sided_or_bare(other):
+    mixture = tint(blend(DIFFUSE, other))
+    return two_sided(mixture) if other is MIRROR else mixture
+
+
+@pytest.mark.parametrize(
+    ("mixture", "key", "value", "reason"),
+    [
+        (mask(THIN_GLASS), "inner.nested_bsdf.eta", None, "hides the derivative of its probability"),
+        (mask(THIN_GLASS), "inner.opacity.value", None, "hides the derivative of its probability"),
+        (blend(DIFFUSE, METAL), "inner.weight.value", 0.0, "exactly 0 or 1"),
+        (mask(MIRROR), "inner.opacity.value", 1.0, "exactly 0 or 1"),
+    ],
+)
+def test_lost_derivatives_of_mixtures_inside_are_refused(mixture, key, value, reason):
+    activate(MONO)
+    with pytest.raises(GradientError, match=reason):
+        slope(tint(mixture), key, value)
+    assert slope(tint(mixture), "tint") > 0

@@ -1,0 +1,92 @@
+"""Blends of what works on one side of a surface with what works on both, or lets light through."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from torchtransient import plugins
+from torchtransient.plugins.mixtures import needs_choice
+from torchtransient.testing.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
+from torchtransient.testing.gradient_sweep.measure import Subject
+from torchtransient.testing.gradient_sweep.stages import between_lights, matte
+
+PAINT = {"type": "diffuse", "reflectance": 0.5}
+GLASS = {"type": "roughdielectric", **ROUGH_GLASS}
+METALLIC = {"type": "roughconductor", **METAL, "alpha": 0.3}
+
+
+@pytest.fixture(autouse=True)
+def rgb():
+    mi.set_variant("llvm_ad_rgb")
+    plugins.sync()
+
+
+def light_from_below(bsdf, n=2**18):
+    """(mean weight of samples, its standard error) for light that arrives from below."""
+    rng = mi.PCG32(n)
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wi = dr.normalize(mi.Vector3f(0.1, 0.0, -0.9))
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    u = mi.Point2f(rng.next_float32(), rng.next_float32())
+    weight = np.array(bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), u)[1])[0]
+    return weight.mean(), weight.std() / np.sqrt(n)
+
+
+def test_mitsuba_counts_light_twice():
+    """Black paint over rough glass: from below the paint does nothing, and its samples are weighed as if they were
+    those of the glass.
+    """
+    glass, _ = light_from_below(mi.load_dict(GLASS))
+    blended, error = light_from_below(
+        mi.load_dict({"type": "blendbsdf", "weight": 0.4, "a": GLASS, "b": matte(0.0)})
+    )
+    assert blended > 0.6 * glass * 1.03 + 5 * error
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        (GLASS, PAINT, True),
+        ({"type": "twosided", "nested": PAINT}, METALLIC, True),
+        (GLASS, GLASS | {"alpha": 0.1}, True),
+        (PAINT, METALLIC, False),
+        ({"type": "twosided", "nested": PAINT}, {"type": "twosided", "nested": METALLIC}, False),
+    ],
+)
+def test_which_are_taken_apart(a, b, expected):
+    assert needs_choice(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": a, "b": b})) == expected
+    assert not needs_choice(mi.load_dict(a)) and not needs_choice(mi.load_dict(b))
+
+
+def total(bsdf, spp):
+    """Light in all bins, with the sum over a few seeds."""
+    scene = tt.load(between_lights(bsdf), variant="llvm_ad_rgb")
+    sums = [float(tt.render(scene, spp=spp, seed=seed).transient.sum()) for seed in range(4)]
+    return np.mean(sums), np.std(sums, ddof=1) / 2
+
+
+def test_values():
+    """A weight by which nothing is blended is the same as none: black paint takes away its share."""
+    blended, error = total({"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": matte(0.0)}, 16384)
+    # Glass that is half as bright, once: paths of depth 2 meet the plate once.
+    half = {name: GLASS[name] / 2 for name in ("specular_reflectance", "specular_transmittance")}
+    once, other = total(GLASS | half, 16384)
+    assert blended == pytest.approx(once, abs=4 * np.hypot(error, other) + 0.01 * once)
+
+
+def test_derivative_by_the_roughness():
+    """It was 35 % too large."""
+    scene = tt.load(between_lights(blend(GLASS)), variant="llvm_ad_rgb")
+    subject = Subject(scene, "plate.bsdf.bsdf_0.alpha.value")
+    (tangent,) = subject.tangents()
+    gaps, differences = [], []
+    for seed in range(6):
+        difference, _ = subject.difference(tangent, seed, 8192, 0.05)
+        gaps.append(float(subject.reverse(seed, 8192) @ tangent.direction.double().reshape(-1).numpy()) - difference)
+        differences.append(difference)
+    assert abs(np.mean(gaps)) < 4 * np.std(gaps) / np.sqrt(6) + 0.03 * abs(np.mean(differences))
+    assert np.std(gaps) / np.sqrt(6) < 0.05 * abs(np.mean(differences))
