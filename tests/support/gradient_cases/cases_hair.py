@@ -9,6 +9,8 @@ from support.gradient_cases.unknowns import rotate, set_color
 PIGMENTS = {"eumelanin": 0.3, "pheomelanin": 0.4}
 GREY = {"sigma_a": {"type": "uniform", "value": 0.3}}
 COLOURED = {"sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}
+# Each case compiles kernels of its own.
+QUICK = ("longitudinal_roughness", "index", "coloured_absorption")
 
 
 def fibres(**settings):
@@ -21,7 +23,9 @@ def fibres(**settings):
 def of_hair(name, key, value, step, variant="llvm_ad_mono", spp=4096, **settings):
     settings = settings or GREY
     scene = lambda: fibres(**settings)  # noqa: E731
-    return Case(f"hair_{name}", f"{key} (hair)", scene, set_color(f"wall.bsdf.{key}"), value, step, variant, spp)
+    unknown = set_color(f"wall.bsdf.{key}")
+    tags = () if name in QUICK else ("slow",)
+    return Case(f"hair_{name}", f"{key} (hair)", scene, unknown, value, step, variant, spp, tags=tags)
 
 
 # Light is absorbed again and again: differences over larger steps see the curvature.
@@ -36,6 +40,14 @@ CASES = [
     of_hair("pigments_in_wavelengths", "eumelanin", 0.3, 0.01, "llvm_ad_spectral", **PIGMENTS),
     of_hair("grey_absorption", "sigma_a.value", 0.3, 0.008),
     of_hair("coloured_absorption", "sigma_a.value", 0.3, 0.008, "llvm_ad_rgb", **COLOURED),
-    Case("hair_turns", "shape: rotation", lambda: fibres(**GREY), rotate("wall.to_world", (0, 0, 1)), 20.0, 1.0),
+    Case(
+        "hair_turns",
+        "shape to_world",
+        lambda: fibres(**GREY),
+        rotate("wall.to_world", (0, 0, 1)),
+        20.0,
+        1.0,
+        tags=("slow",),
+    ),
     of_hair("polarized", "longitudinal_roughness", 0.3, 0.003, "llvm_ad_mono_polarized"),
 ]
