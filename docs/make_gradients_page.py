@@ -102,8 +102,10 @@ def table() -> str:
             else:
                 values.setdefault(cls, []).append(key)
         lines += [row(", ".join(classes), *cells) for cells, classes in rows.items()]
+    alike: dict[tuple[Any, ...], list[str]] = {}
     for cls, key, condition, effect in conditional_rows():
-        lines.append(row(cls, key, moves_of(effect), state_of(effect), why(effect, condition)))
+        alike.setdefault((key, moves_of(effect), state_of(effect), why(effect, condition)), []).append(cls)
+    lines += [row(", ".join(classes), *cells) for cells, classes in alike.items()]
     lines += ["", "Move nothing, and their derivatives are right: " + listed(values) + "."]
     lines += ["", "Move nothing and have no derivative (Mitsuba marks them so): " + listed(none) + "."]
     return "\n".join(lines)

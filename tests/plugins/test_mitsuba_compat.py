@@ -409,6 +409,20 @@ def test_colours_are_kept_as_coefficients_in_spectral_variants():
         assert compat.keeps_coefficients(mi.load_dict({"type": "bitmap", "bitmap": pixels, "raw": False})) == kept
 
 
+def test_attributes_of_meshes_do_not_say_that_they_vary():
+    activate(RGB)
+    texture = mi.load_dict({"type": "mesh_attribute", "name": "vertex_color", "scale": 2.0})
+    mesh = mi.load_dict({"type": "cube"})
+    mesh.add_attribute("vertex_color", 1, np.linspace(0, 1, mesh.vertex_count()).tolist())
+    rays = mi.Ray3f(mi.Point3f([-0.5, 0.5], 0.0, 3.0), mi.Vector3f(0, 0, -1))
+    values = np.array(texture.eval_1(mi.load_dict({"type": "scene", "mesh": mesh}).ray_intersect(rays)))
+    assert values[0] != values[1]
+    assert not texture.is_spatially_varying() and compat.varies(texture)
+    assert not compat.varies(mi.load_dict({"type": "uniform", "value": 0.5}))
+    assert compat.attribute_name(texture) == "vertex_color"
+    assert compat.attribute_name(mi.load_dict({"type": "checkerboard"})) is None
+
+
 @pytest.mark.parametrize(("plugin", "name"), [("normalmap", "normalmap"), ("bumpmap", "nested_texture")])
 def test_slots_of_normals(plugin, name):
     activate(RGB)

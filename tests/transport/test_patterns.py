@@ -40,6 +40,13 @@ def test_textures_of_what_is_held():
     assert scatters_by_place(mi.load_dict(paint))
 
 
+def test_attributes_of_meshes():
+    """Mitsuba's texture of them says that it does not vary."""
+    attribute = {"type": "mesh_attribute", "name": "vertex_color"}
+    assert scatters_by_place(mi.load_dict({"type": "diffuse", "reflectance": attribute}))
+    assert light("cube", type="area", radiance=attribute)
+
+
 def register_those_of_another():
     class Stripes(mi.BSDF):
         """Asks the place itself, and says nothing of it."""

@@ -22,9 +22,11 @@ ALMOST_BLACK = 1e-30
 
 def loses_black(node: Any, owners: Sequence[tuple[Any, str]]) -> bool:
     """Whether the derivative by a plugin's numbers is lost where they are zero; ``owners``: all that holds it. Weights
-    of mixtures are none of these, since paths are handed a part.
+    of mixtures are none of these, since paths are handed a part. Of a mesh, its attributes are numbers that textures
+    hold, and shapes themselves are in no normal map.
     """
-    if not isinstance(node, mi.Texture) or any(weight_slot(holder) == name for holder, name in owners):
+    has_numbers = isinstance(node, mi.Texture | mi.Volume | mi.Mesh)
+    if not has_numbers or any(weight_slot(holder) == name for holder, name in owners):
         return False
     return any(forgets_black_samples(holder) and normal_texture(holder) != name for holder, name in owners)
 

@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.finite_values import check_parameters
+from torchtransient.plugins.height_maps import check_heights
 from torchtransient.plugins.sampling.distant import distant_reference
 
 
@@ -33,7 +34,7 @@ class DescribedScene:
         self.reference = distant_reference(scene)
         self._key = _key_of(scene)
         self._kept = [shape for shape in scene.shapes() if not shape.is_sensor()][:1]
-        self.is_finite = False
+        self.is_checked = False
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
@@ -66,14 +67,17 @@ def note_scene(plugin: Any, callback: Any) -> None:
 
 
 def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = None) -> None:
-    """Raise ``SceneError`` where a number of a scene is NaN or infinite; a scene that was found right is not asked
-    again. ``params``: its ``mi.traverse``, ``known``: what is known of it, where the caller has them.
+    """Raise ``SceneError`` where a number of a scene is NaN or infinite, or a bump map has a texture without a slope; a
+    scene that was found right is not asked again. ``params``: its ``mi.traverse``, ``known``: what is known of it,
+    where the caller has them.
     """
     known = known or described(scene)
-    if known.is_finite or dr.flag(dr.JitFlag.FreezingScope):  # a recording has no values
+    if known.is_checked or dr.flag(dr.JitFlag.FreezingScope):  # a recording has no values
         return
-    check_parameters(mi.traverse(scene) if params is None else params)
-    known.is_finite = True
+    params = mi.traverse(scene) if params is None else params
+    check_parameters(params)
+    check_heights(params)
+    known.is_checked = True
 
 
 def _keepers_of(scene: Any) -> list[Any]:

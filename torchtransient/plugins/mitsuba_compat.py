@@ -344,6 +344,22 @@ def near_clip(sensor: Any) -> Any:
 
 # ------------------------------------------------------------------------------------------------------------ textures
 
+
+def attribute_name(texture: Any) -> str | None:
+    """Which attribute of the shapes that it lies on a texture reads (``vertex_color``), None for other textures. It
+    shows the name in its description alone.
+    """
+    if texture.class_name() != "MeshAttribute":
+        return None
+    found = re.search(r'name = "([^"]*)"', str(texture))
+    return found.group(1) if found else None
+
+
+def varies(texture: Any) -> bool:
+    """Whether a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say so."""
+    return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
+
+
 _COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
 
 

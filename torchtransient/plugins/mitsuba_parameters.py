@@ -260,6 +260,9 @@ IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a p
 
 OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
 
+# Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
+OF_NUMBERS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT)
+
 # ---------------------------------------------------------------------------------------------------------------- rows
 
 declare_effects("Shape", {"to_world": SHAPE})
@@ -277,6 +280,8 @@ declare_effects(
             Row(PATTERN, _places_light, "a light with a textured radiance"),
             Row(COORDINATES),
         ),
+        # Attributes: what a `mesh_attribute` makes of them is told by where that one is.
+        ANY_KEY: OF_NUMBERS,
     },
 )
 for _curve in ("BSplineCurve", "LinearCurve"):
@@ -313,14 +318,7 @@ declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
-declare_effects(
-    "Texture",
-    {
-        ANY_KEY: (
-            IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT,
-        )
-    },
-)  # fmt: skip
-declare_effects("Volume", {ANY_KEY: (IN_EXTINCTION,)})
+declare_effects("Texture", {ANY_KEY: OF_NUMBERS})
+declare_effects("Volume", {ANY_KEY: OF_NUMBERS})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

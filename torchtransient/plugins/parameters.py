@@ -17,8 +17,8 @@ import mitsuba as mi
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
 from torchtransient.plugins.black_textures import check_black, loses_black
-from torchtransient.plugins.mitsuba_compat import is_replaced_for, keeps_coefficients
-from torchtransient.plugins.node_walk import ShownValue, owners_of, shown_by
+from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for, keeps_coefficients
+from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
 from torchtransient.plugins.parameter_effect import ParameterEffect as ParameterEffect
@@ -54,25 +54,19 @@ def attached_effects(params: Any) -> list[tuple[Any, str, ParameterEffect]]:
     """
     if isinstance(params, ParameterTracker):
         return params.attached()
-    found = []
+    attached = []
     for name, (handle, cpptype, node, flags) in params.properties.items():
         value = handle if cpptype is None else mi.get_property(handle, cpptype, node)
         if can_carry_gradients(value) and dr.grad_enabled(value):
-            key = name.rsplit(".", 1)[-1]
-            found.append((node, key, effect_of(node, key, flags, _owners_by_name(params.hierarchy, node, name))))
-    return found
+            attached.append((node, name.rsplit(".", 1)[-1], flags))
+    # A walk of its own: the names in ``params`` tell of one holder of each plugin, and not of what reads an attribute.
+    tracker = ParameterTracker(_root_of(params.hierarchy)) if attached else None
+    return [(node, key, tracker.effect_of(node, key, flags)) for node, key, flags in attached]
 
 
-def _owners_by_name(hierarchy: Mapping[Any, Any], node: Any, name: str) -> tuple[tuple[Any, str], ...]:
-    """What holds a plugin, told from the full name of one of its parameters."""
-    owners = []
-    holder = hierarchy[node][0]
-    above = name.rsplit(".", 1)[0]
-    while holder is not None:
-        above, _, own = above.rpartition(".")
-        owners.append((holder, own))
-        holder = hierarchy[holder][0]
-    return tuple(owners)
+def _root_of(hierarchy: Mapping[Any, Any]) -> Any:
+    """The plugin that ``mi.traverse`` started at."""
+    return next(node for node, (holder, *_) in hierarchy.items() if holder is None)
 
 
 class ParameterTracker:
@@ -86,6 +80,8 @@ class ParameterTracker:
 
     def __init__(self, root: Any) -> None:
         self._holders: dict[int, list[tuple[Any, str]]] = {}
+        # By shape and name: the textures that read an attribute.
+        self._readers: dict[tuple[int, str], list[Any]] = {}
         self._fixed: list[tuple[Any, ShownValue]] = []
         self._shown_anew: list[tuple[Any, int]] = []
         self._walk(root)
@@ -93,8 +89,11 @@ class ParameterTracker:
     def _walk(self, root: Any) -> None:
         visited = {root.ptr}
         waiting = [(root, 0)]
+        readers = []
         while waiting:
             node, inherited = waiting.pop()
+            if isinstance(node, mi.Texture) and attribute_name(node) is not None:
+                readers.append(node)
             values, objects = shown_by(node)
             is_scene = isinstance(node, mi.Scene)
             if not is_scene:
@@ -105,6 +104,24 @@ class ParameterTracker:
                 if value.ptr not in visited:
                     visited.add(value.ptr)
                     waiting.append((value, inherited | flags))
+        for reader in readers:
+            self._note_reader(reader, str(attribute_name(reader)))
+
+    def _note_reader(self, reader: Any, name: str) -> None:
+        """What a texture reads off the shapes that it lies on, it holds: an attribute of a mesh, or a texture."""
+        shapes = {holder.ptr: holder for holder, _ in self._owners_of(reader) if isinstance(holder, mi.Shape)}
+        for shape in shapes.values():
+            self._readers.setdefault((shape.ptr, name), []).append(reader)
+            for own, texture in objects_of(shape):
+                if own == name:
+                    self._holders[texture.ptr].append((reader, name))
+
+    def _owners_of(self, node: Any, key: str = "") -> tuple[tuple[Any, str], ...]:
+        """What holds the parameter ``key`` of a plugin, as in :class:`Site`."""
+        found: list[tuple[Any, str]] = []
+        for reader in self._readers.get((node.ptr, key), ()):
+            found += [(reader, key), *owners_of(reader, self._holders)]
+        return (*found, *owners_of(node, self._holders))
 
     def _note(self, node: Any, values: list[ShownValue], inherited: int) -> None:
         differentiable = [v for v in values if can_carry_gradients(v.read(node))]
@@ -115,29 +132,29 @@ class ParameterTracker:
 
     def effect_of(self, node: Any, key: str, flags: int = 0) -> ParameterEffect:
         """As the function of this name, with everything that holds the plugin ``node``."""
-        return effect_of(node, key, flags, tuple(owners_of(node, self._holders)))
+        return effect_of(node, key, flags, self._owners_of(node, key.rsplit(".", 1)[-1]))
 
-    def stood_in_for(self, node: Any) -> list[tuple[Any, str]]:
+    def stood_in_for(self, node: Any, key: str) -> list[tuple[Any, str]]:
         """The plugins that are built as others where the derivative by a parameter of ``node`` is asked for, if there
         is a ``stand_in``: itself, or the holders of a texture, each with the name it has there.
         """
         if isinstance(node, mi.BSDF):
             return [(node, "")]
-        return [(holder, name) for holder, name in owners_of(node, self._holders) if is_replaced_for(holder, name)]
+        owners = [entry for entry in dict.fromkeys(self._owners_of(node, key)) if isinstance(entry[0], mi.BSDF)]
+        return [(holder, name) for holder, name in owners if is_replaced_for(holder, name)]
 
-    def loses_black(self, node: Any) -> bool:
+    def loses_black(self, node: Any, key: str) -> bool:
         """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
-        return loses_black(node, tuple(owners_of(node, self._holders)))
+        return loses_black(node, self._owners_of(node, key))
 
     def check_black(self) -> None:
         """Raise ``GradientError`` where it would be."""
-        check_black(
-            [(node, v.key, value, tuple(owners_of(node, self._holders))) for node, v, value in self._carrying()]
-        )
+        check_black([(node, v.key, value, self._owners_of(node, v.key)) for node, v, value in self._carrying()])
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
         """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""
-        return location_of(Site(node, key.rsplit(".", 1)[-1], tuple(owners_of(node, self._holders))))
+        name = key.rsplit(".", 1)[-1]
+        return location_of(Site(node, name, self._owners_of(node, name)))
 
     def _carrying(self) -> list[tuple[Any, ShownValue, Any]]:
         found = [(node, shown, shown.read(node)) for node, shown in self._fixed]

@@ -171,7 +171,7 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
             # What stands in for the plugin has a number there, whatever Mitsuba's has.
             kind, shape, value = "number", (), float(np.reshape(value, ()))
             effect = tracker.effect_of(node, name)
-        exchanged = frozenset((plugin.id(), slot) for plugin, slot in tracker.stood_in_for(node))
+        exchanged = frozenset((plugin.id(), slot) for plugin, slot in tracker.stood_in_for(node, name))
         return replace(_info(key, kind, shape, value, effect), substitute=exchanged)
     if kind == "plain":
         effect = replace(effect, supported=False, reason="a plain value, fixed when the scene is built")
@@ -262,7 +262,8 @@ class Slot:
         if self.kind == "mesh_transform":
             return False
         scene = self._built.scene
-        return bool(scene.integrator().parameters(scene).loses_black(self._built.params.properties[self.key][2]))
+        node = self._built.params.properties[self.key][2]
+        return bool(scene.integrator().parameters(scene).loses_black(node, self.key.rsplit(".", 1)[-1]))
 
     @property
     def size(self) -> int:

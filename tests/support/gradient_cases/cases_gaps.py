@@ -75,6 +75,15 @@ def corner(gap=GAP, **arguments):
     return scene_of(sensor=view, wall=wall, floor=floor, light=light, **arguments)
 
 
+def striped_corner():
+    """A corner whose floor has stripes of some centimetres, which its surface reads as an attribute of the shape."""
+    scene = corner()
+    shades = {"type": "mesh_attribute", "name": "vertex_shades", "scale": 0.1}
+    scene["floor"]["bsdf"] = {"type": "diffuse", "reflectance": shades}
+    scene["floor"]["vertex_shades"] = stripes() | {"to_uv": mi.ScalarTransform3f().scale([1500, 1500])}
+    return scene
+
+
 def smooth_mesh():
     """A block with normals at its vertices instead of the paper's far wall."""
     scene = plates()
@@ -117,6 +126,7 @@ CASES = [
     near("plates_tilt", tilted, rotate("wall.to_world", (0, 1, 0)), step=0.02),
     near("corner", corner, move("wall.to_world", (1, 0, 0))),
     near("corner_floor", corner, move("floor.to_world", (0, 0, 1))),
+    near("striped_corner", striped_corner, move("wall.to_world", (1, 0, 0)), step=STEP / 4),
     near("block", smooth_mesh),
     near("fog", in_fog),
     near("through_a_mask", with_mirror),

@@ -7,7 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import EMIT_ALIKE, SCATTER_ALIKE, is_flat_shape
+from torchtransient.plugins.mitsuba_compat import EMIT_ALIKE, SCATTER_ALIKE, is_flat_shape, varies
 from torchtransient.plugins.node_walk import objects_below
 
 
@@ -31,7 +31,7 @@ def emits_by_place(emitter: Any) -> bool:
 
 def _varies_by_texture(plugin: Any) -> bool:
     textures = objects_below(plugin, mi.Texture)
-    return any(t.is_spatially_varying() or _room(t) not in ("mitsuba", "torchtransient") for t in textures)
+    return any(varies(t) or _room(t) not in ("mitsuba", "torchtransient") for t in textures)
 
 
 def _is_known(plugin: Any, names: Iterable[str]) -> bool:

@@ -31,6 +31,11 @@ BARE = ("", "rectangle", "reflectance", "homogeneous", "constvolume as extinctio
 # Plugins with parameters that matter to polarized light alone.
 FILTERS = ("polarizer", "retarder", "diff_polarizer", "diff_retarder")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
+# Attributes that nothing reads.
+COORDINATES = ("plate.vertex_texcoords", "group.plate.vertex_texcoords", "lamp.vertex_texcoords")
+COLOURS = ("plate.vertex_color", "group.plate.vertex_color", "lamp.vertex_color")
+# The edges between its facets are silhouettes in a mirror.
+FACETED = ("ellipsoidsmesh",)
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ def shape_settings() -> Iterator[Setting]:
         "normal map over a mirror": bsdfs.normal_map(MIRROR),
         "texture": {"type": "diffuse", "reflectance": bsdfs.picture()},
     }
-    textured = ("rectangle", "obj", "ply", "cube")
+    textured, unread = ("rectangle", "obj", "ply", "cube"), COORDINATES + COLOURS
 
     def coated(make: Maker, coat: Description) -> Maker:
         return lambda folder: between_lights(coat) | {"plate": make(folder) | {"bsdf": coat}}
@@ -125,11 +130,15 @@ def shape_settings() -> Iterator[Setting]:
 
     for name, make in shapes.shapes().items():
         for inside, coat in coats.items():
-            if inside not in ("normal map over a mirror", "texture") or name in textured:
-                yield Setting("shape", name, inside, coated(make, coat), ("plate.",))
+            if inside in ("normal map over a mirror", "texture"):
+                if name in textured:
+                    yield Setting("shape", name, inside, coated(make, coat), ("plate.",), without=COLOURS)
+            elif inside != "mirror" or name not in FACETED:
+                yield Setting("shape", name, inside, coated(make, coat), ("plate.",), without=unread)
         if name not in shapes.NOT_IN_GROUPS:
-            yield Setting("shape", name, "instance", copied(make, matte()), GROUP)
-            yield Setting("shape", name, "instance, mirror", copied(make, MIRROR), GROUP)
+            yield Setting("shape", name, "instance", copied(make, matte()), GROUP, without=unread)
+            if name not in FACETED:
+                yield Setting("shape", name, "instance, mirror", copied(make, MIRROR), GROUP, without=unread)
 
 
 def emitter_settings() -> Iterator[Setting]:
@@ -144,14 +153,14 @@ def emitter_settings() -> Iterator[Setting]:
                 shape,
                 lambda folder, e=light, m=make: lit_by(m(folder) | {"emitter": e()}),
                 LAMP,
-                without=PAINT_OF_LAMPS,
+                without=PAINT_OF_LAMPS + COORDINATES + COLOURS,
             )
     for name in lights.area_emitters():
         yield Setting("emitter", name, "small sphere", lambda _, n=name: _small_lamp(n), LAMP, without=PAINT_OF_LAMPS)
     for name in ("area", "directionalarea"):
         for shape in ("rectangle", "ply", "sphere") if name == "area" else ("rectangle",):
             make = lambda folder, n=name, s=shape: _picture_lamp(folder, n, s)  # noqa: E731
-            yield Setting("emitter", name, f"{shape}, textured", make, LAMP, without=PAINT_OF_LAMPS)
+            yield Setting("emitter", name, f"{shape}, textured", make, LAMP, without=PAINT_OF_LAMPS + COLOURS)
 
 
 def _small_lamp(emitter: str) -> Description:
@@ -168,7 +177,8 @@ def _picture_lamp(folder: Path, emitter: str, shape: str) -> Description:
 def sensor_settings() -> Iterator[Setting]:
     """Sensors before paint and before a mirror."""
     for name, sensor in lights.sensors().items():
-        yield Setting("sensor", name, "", lambda _, s=sensor: seen_by(s), SENSOR)
+        # No light comes back from the shape that carries one.
+        yield Setting("sensor", name, "", lambda _, s=sensor: seen_by(s), SENSOR, without=("sensor.bsdf.",))
         if name in ("perspective", "thinlens", "orthographic"):
             yield Setting(
                 "sensor", name, "before a mirror", lambda _, s=sensor: between_lights(MIRROR) | {"sensor": s}, SENSOR
@@ -179,13 +189,14 @@ def texture_settings() -> Iterator[Setting]:
     """Textures and spectra in every kind of slot."""
     for slot_name, slot in textures.slots().items():
         for name, texture in textures.textures().items():
-            yield Setting(
-                "texture",
-                name,
-                slot_name,
-                lambda folder, s=slot, t=texture: _on_a_mesh(folder, s.make(t(s.low, s.high, s.channels))),
-                (f"plate.bsdf.{slot.key}.", "plate.vertex_color"),
-            )
+            if slot.takes(name):
+                yield Setting(
+                    "texture",
+                    name,
+                    slot_name,
+                    lambda folder, s=slot, t=texture: _on_a_mesh(folder, s.make(t(s.low, s.high, s.channels))),
+                    (f"plate.bsdf.{slot.key}.", *(COLOURS if name == "mesh_attribute" else ())),
+                )
         for name, spectrum in textures.spectra().items():
             if slot.channels == 3:
                 yield Setting(
@@ -205,6 +216,14 @@ def texture_settings() -> Iterator[Setting]:
                 lambda _, s=surface, t=texture: between_lights(s(t)),
                 ("plate.bsdf.normalmap.",),
             )
+    mirror = textures.maps_of_normals()["mirror"]({"type": "mesh_attribute", "name": "vertex_tilt"})
+    yield Setting(
+        "texture",
+        "mesh_attribute",
+        "normal map over mirror",
+        lambda _: _with_normals_of_its_own(mirror),
+        ("plate.vertex_tilt.",),
+    )
     for name, spectrum in textures.spectra().items():
         yield Setting("spectrum", name, "radiance", lambda _, t=spectrum: _spectral_lamp(t), LAMP, SPECTRAL)
 
@@ -213,6 +232,12 @@ def _on_a_mesh(folder: Path, bsdf: Description) -> Description:
     """The plate as a mesh that has colours at its vertices."""
     plate = shapes.shapes()["ply"](folder) | {"bsdf": bsdf, "face_normals": True}
     return between_lights(bsdf) | {"plate": plate}
+
+
+def _with_normals_of_its_own(bsdf: Description) -> Description:
+    """The plate as a shape that has a texture of normals for an attribute."""
+    scene = between_lights(bsdf)
+    return {**scene, "plate": scene["plate"] | {"vertex_tilt": bsdfs.normals()}}
 
 
 def _spectral_lamp(spectrum: textures.Number) -> Description:

@@ -56,7 +56,7 @@ def spectra() -> dict[str, Number]:
 @dataclass(frozen=True)
 class Slot:
     """A place for a texture in a surface: the surface around it, its name there, bounds of its values, how many
-    channels it takes.
+    channels it takes. ``sloping``: it asks for their slope.
     """
 
     make: Callable[[Description], Description]
@@ -64,6 +64,11 @@ class Slot:
     low: float = 0.3
     high: float = 0.7
     channels: int = 3
+    sloping: bool = False
+
+    def takes(self, texture: str) -> bool:
+        """Whether a texture matters there. Of Mitsuba's, others have no slope, or none that is not zero."""
+        return not self.sloping or texture == "bitmap"
 
 
 def slots() -> dict[str, Slot]:
@@ -86,9 +91,12 @@ def slots() -> dict[str, Slot]:
         "weight of a mirror": Slot(
             lambda t: {"type": "blendbsdf", "weight": t, "a": matte(), "b": mirror}, "weight", channels=1
         ),
-        "heights": Slot(lambda t: {"type": "bumpmap", "t": t, "nested": matte()}, "nested_texture", 0.0, 1.0, 1),
+        # Steeper for paint, which hardly notices how it leans.
+        "heights": Slot(
+            lambda t: {"type": "bumpmap", "t": t, "scale": 4.0, "nested": matte()}, "nested_texture", 0.0, 1.0, 1, True
+        ),
         "heights of a mirror": Slot(
-            lambda t: {"type": "bumpmap", "t": t, "nested": mirror}, "nested_texture", 0.0, 1.0, 1
+            lambda t: {"type": "bumpmap", "t": t, "nested": mirror}, "nested_texture", 0.0, 1.0, 1, True
         ),
     }
 

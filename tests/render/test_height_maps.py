@@ -1,0 +1,63 @@
+"""Bump maps around textures that have no slope are refused when a scene is built, by name."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from support.gradient_cases.scenes import room
+from torchtransient.errors import SceneError
+
+VARIANT = "llvm_ad_rgb"
+HEIGHTS = {"type": "constvolume", "value": 0.5}
+
+
+def bitmap(channels):
+    return lambda: {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, channels), 0.5, np.float32)), "raw": True}
+
+
+WITHOUT_SLOPE = {
+    "checkerboard": {"type": "checkerboard"},
+    "volume": {"type": "volume", "volume": HEIGHTS},
+    "rawconstant": {"type": "rawconstant", "value": 0.5},
+    "mesh_attribute": {"type": "mesh_attribute", "name": "vertex_color"},
+    "regular": {"type": "regular", "wavelength_min": 400.0, "wavelength_max": 700.0, "values": "0.3, 0.4"},
+}
+WITH_SLOPE = {
+    "bitmap": bitmap(1),
+    "bitmap of three channels": bitmap(3),
+    "uniform": {"type": "uniform", "value": 0.5},
+}
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant(VARIANT)
+
+
+def bumpy(texture):
+    """A room with the bump map inside of something."""
+    texture = texture() if callable(texture) else texture
+    bump = {"type": "bumpmap", "id": "bumps", "heights": texture | {"id": "heights"}, "nested": {"type": "diffuse"}}
+    return room({"type": "twosided", "nested": bump})
+
+
+@pytest.mark.parametrize("name", WITHOUT_SLOPE)
+def test_textures_without_a_slope_are_named(name):
+    with pytest.raises(SceneError, match=r"'bumps.*bumpmap.*'heights.*bitmap"):
+        tt.load(bumpy(WITHOUT_SLOPE[name]), variant=VARIANT).parameters()
+
+
+@pytest.mark.parametrize("name", WITHOUT_SLOPE)
+def test_in_a_scene_of_mitsuba(name):
+    scene = mi.load_dict(bumpy(WITHOUT_SLOPE[name]), optimize=False)
+    with pytest.raises(SceneError, match="bumpmap"):
+        scene.integrator().render(scene, spp=1)
+
+
+@pytest.mark.parametrize("name", WITH_SLOPE)
+def test_textures_with_one_are_taken(name):
+    renderer = tt.TransientRenderer(tt.load(bumpy(WITH_SLOPE[name]), variant=VARIANT), spp=1)
+    assert float(renderer(seed=0).steady.sum()) > 0
