@@ -280,4 +280,5 @@ def test_against_finite_differences(tmp_path):
     results = file.results()
     assert {line["setting"] for line in results} >= {setting.name for setting in sample() if setting.kind == "bsdf"}
     assert [line for line in results if line["verdict"] in WRONG and not line["biased"]] == []
-    assert sum(line["verdict"] == "agree" for line in results) > 0.5 * len(results)
+    compared = [line for line in results if line["verdict"] not in ("no effect", "refused")]
+    assert sum(line["verdict"] == "agree" for line in compared) > 0.5 * len(compared) > 10
