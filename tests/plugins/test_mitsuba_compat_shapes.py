@@ -158,3 +158,15 @@ def test_grids_that_turn_are_not_drawn():
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 4), mi.Vector3f(0, 0, -1))
         seen.append(bool(scene.ray_intersect_preliminary(ray).is_valid()[0]))
     assert seen == [True, False]
+
+
+def test_attributes_of_lights_read_as_zero_where_they_are_sampled():
+    """When this fails, lights may have them: `texture_uses.py`."""
+    glow = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_glow"}}
+    pose = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180)
+    lamp = {"type": "rectangle", "to_world": pose, "emitter": glow, "vertex_glow": {"type": "uniform", "value": 5.0}}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp})
+    sample, weight = scene.sample_emitter_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.4, 0.6), False)
+    found = scene.ray_intersect(mi.Ray3f(mi.Point3f(0), sample.d))
+    assert sample.pdf[0] > 0 and found.emitter(scene).eval(found)[0][0] == 5
+    assert weight[0][0] == 0

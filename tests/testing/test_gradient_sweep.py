@@ -186,6 +186,12 @@ def test_directions():
     assert len(tangents_of("lamp.position", "vector", torch.zeros(3))) == 2
 
 
+def test_some_parameters_are_differentiated_in_forward_mode_too():
+    names = [f"{name}: plate.to_world" for name in SETTINGS]
+    assert 0.2 * len(names) < sum(QUICK.in_both_modes(name) for name in names) < 0.5 * len(names)
+    assert all(compare.Effort().in_both_modes(name) for name in names)
+
+
 @pytest.mark.parametrize(("value", "sign"), [(0.0, 1), (1.0, -1)])
 def test_directions_lead_inwards(value, sign):
     (tangent,) = tangents_of("plate.bsdf.opacity.value", "number", torch.tensor(value))
@@ -265,20 +271,19 @@ def test_from_the_command_line(tmp_path):
 
 
 def sample():
-    """Some bare plugins, and some of what is inside others, of those that have been measured."""
-    measured = {row["setting"] for row in read_rows(DOCS)}
-    bare = [setting for setting in SETTINGS.values() if setting.is_bare and setting.name in measured]
-    nested = [setting for setting in SETTINGS.values() if not setting.is_bare and setting.name in measured]
-    return [*random.Random(3).sample(bare, 16), *random.Random(3).sample(nested, 4)]
+    """Every bare plugin, and some of what is inside others."""
+    bare = [setting for setting in SETTINGS.values() if setting.is_bare]
+    nested = [setting for setting in SETTINGS.values() if not setting.is_bare]
+    return [*bare, *random.Random(3).sample(nested, 6)]
 
 
 @pytest.mark.slow
 def test_against_finite_differences(tmp_path):
-    """One round of few samples: what it cannot decide, the whole sweep does."""
+    """Few samples: what they cannot decide, the whole sweep does."""
     file = ResultFile(tmp_path / "results.jsonl")
     runner.sweep(sample(), file, quick=True)
     results = file.results()
     assert {line["setting"] for line in results} >= {setting.name for setting in sample() if setting.kind == "bsdf"}
     assert [line for line in results if line["verdict"] in WRONG and not line["biased"]] == []
-    compared = [line for line in results if line["verdict"] not in ("no effect", "refused")]
-    assert sum(line["verdict"] == "agree" for line in compared) > 0.5 * len(compared) > 10
+    compared = [line["verdict"] for line in results if line["verdict"] != "refused"]
+    assert compared.count("agree") > 0.8 * len(compared)

@@ -20,8 +20,8 @@ import mitsuba as mi
 
 from torchtransient.interfaces import IntegratorInterface, is_time_resolved
 from torchtransient.plugins.finite_values import check_parameters
-from torchtransient.plugins.height_maps import check_heights
 from torchtransient.plugins.sampling.distant import distant_reference
+from torchtransient.plugins.texture_uses import check_textures
 
 
 class DescribedScene:
@@ -67,8 +67,8 @@ def note_scene(plugin: Any, callback: Any) -> None:
 
 
 def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = None) -> None:
-    """Raise ``SceneError`` where a number of a scene is NaN or infinite, or a bump map has a texture without a slope; a
-    scene that was found right is not asked again. ``params``: its ``mi.traverse``, ``known``: what is known of it,
+    """Raise ``SceneError`` where a number of a scene is NaN or infinite, or a texture stands where it cannot be read;
+    a scene that was found right is not asked again. ``params``: its ``mi.traverse``, ``known``: what is known of it,
     where the caller has them.
     """
     known = known or described(scene)
@@ -76,7 +76,7 @@ def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = N
         return
     params = mi.traverse(scene) if params is None else params
     check_parameters(params)
-    check_heights(params)
+    check_textures(params)
     known.is_checked = True
 
 

@@ -30,29 +30,30 @@ def results_of(setting: Setting, folder: Path, effort: Effort) -> Iterator[Resul
         scene = load(setting.make(folder), variant=setting.variant)
         for key, info in scene.parameters().items():
             if setting.takes(key) and info.shape is not None and info.kind not in ("plain", "integer"):
-                for result in _results_of_key(scene, key, info, effort):
+                both_modes = effort.in_both_modes(f"{setting.name}: {key}")
+                for result in _results_of_key(scene, key, info, effort, both_modes):
                     result.setting = setting.name
                     yield result
     del scene
     gc.collect()
 
 
-def _results_of_key(scene: Any, key: str, info: ParameterInfo, effort: Effort) -> Iterator[Result]:
-    for result in _judgements(scene, key, info, effort):
+def _results_of_key(scene: Any, key: str, info: ParameterInfo, effort: Effort, both_modes: bool) -> Iterator[Result]:
+    for result in _judgements(scene, key, info, effort, both_modes):
         result.table = info.reason.removesuffix(f"; {UNCHECKED}")
         result.biased = info.biased
         result.place = list(info.place)
         yield result
 
 
-def _judgements(scene: Any, key: str, info: ParameterInfo, effort: Effort) -> Iterator[Result]:
+def _judgements(scene: Any, key: str, info: ParameterInfo, effort: Effort, both_modes: bool) -> Iterator[Result]:
     if not info.differentiable:
         yield Result("", key, "", "refused")
         return
     try:
         subject = Subject(scene, key)
         for tangent in subject.tangents()[: effort.directions]:
-            yield judge(subject, tangent, effort)
+            yield judge(subject, tangent, effort, both_modes)
     except TorchTransientError as error:
         yield Result("", key, "", "error", note=f"{type(error).__name__}: {error}")
     except Exception:  # noqa: BLE001  one parameter that fails must not end the sweep

@@ -1,4 +1,4 @@
-"""Bump maps around textures that have no slope are refused when a scene is built, by name."""
+"""Textures in places where they cannot be read are refused when a scene is built, by name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def bumpy(texture):
 
 @pytest.mark.parametrize("name", WITHOUT_SLOPE)
 def test_textures_without_a_slope_are_named(name):
-    with pytest.raises(SceneError, match=r"'bumps.*bumpmap.*'heights.*bitmap"):
+    with pytest.raises(SceneError, match=r"'bumps.*bumpmap.*heights.*bitmap"):
         tt.load(bumpy(WITHOUT_SLOPE[name]), variant=VARIANT).parameters()
 
 
@@ -61,3 +61,27 @@ def test_in_a_scene_of_mitsuba(name):
 def test_textures_with_one_are_taken(name):
     renderer = tt.TransientRenderer(tt.load(bumpy(WITH_SLOPE[name]), variant=VARIANT), spp=1)
     assert float(renderer(seed=0).steady.sum()) > 0
+
+
+# -------------------------------------------------------------------------------------------------------------- lights
+
+
+def glowing(kind):
+    """A room under a lamp whose radiance is an attribute of its shape."""
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0.6, 0.2, 2.5]).rotate([0, 1, 0], 200).scale(0.3),
+        "emitter": {"type": kind, "radiance": {"type": "mesh_attribute", "name": "vertex_glow"}},
+        "vertex_glow": {"type": "uniform", "value": 5.0},
+    }
+    return room(light=lamp)
+
+
+@pytest.mark.parametrize("kind", ["area", "angulararea"])
+def test_attributes_of_lights_are_named(kind):
+    with pytest.raises(SceneError, match=r"'vertex_glow'.*bitmap"):
+        tt.load(glowing(kind), variant=VARIANT).parameters()
+
+
+def test_lights_that_stay_dark_may_have_them():
+    assert tt.load(glowing("directionalarea"), variant=VARIANT).parameters()
