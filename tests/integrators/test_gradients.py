@@ -7,6 +7,8 @@ sums alone.
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,9 @@ SIGMAS = 3.0
 # Forward and reverse mode add the same float32 terms in another order; a sum of n terms of mixed signs is good to about
 # sqrt(n) ulp.
 ROUNDING = 2e-3
-# Cases of more than a second that need many samples; the set of slow tests runs them.
+# So many cases of each row of the support table are in the default set; the set of slow tests runs the others.
+FIRST = 3
+# So does it run cases of more than a second that need many samples.
 LONG = {
     "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",
     "phasor_glass_index", "meter_moves", "camera_before_an_instance", "instance_of_a_grid_turns",
@@ -31,8 +35,12 @@ LONG = {
 
 def marked(cases):
     """Parameters of a test, with the marker that a case's cost asks for."""
-    slow = pytest.mark.slow
-    return [pytest.param(c, id=c.name, marks=[slow] if "slow" in c.tags or c.name in LONG else []) for c in cases]
+    found, seen = [], Counter()
+    for case in cases:
+        slow = "slow" in case.tags or case.name in LONG or seen[case.row] >= FIRST
+        seen[case.row] += not slow
+        found.append(pytest.param(case, id=case.name, marks=[pytest.mark.slow] if slow else []))
+    return found
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
@@ -128,9 +129,9 @@ def test_blends_count_samples_that_a_part_threw_away():
     si = interaction(unit(0.3, 0.0, -0.9))
     _, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
     wo = mi.warp.square_to_uniform_sphere(mi.Point2f(u[3], u[4]))
-    scattered = np.array(bsdf.eval(mi.BSDFContext(), si, wo).x) * 4 * np.pi
-    error = scattered.std() / np.sqrt(n)
-    assert float(dr.mean(weight.x)[0]) - scattered.mean() > 10 * error
+    light = np.array(bsdf.eval(mi.BSDFContext(), si, wo).x) * 4 * np.pi
+    error = light.std() / np.sqrt(n)
+    assert float(dr.mean(weight.x)[0]) - light.mean() > 10 * error
     assert adds_up_wrongly(bsdf)
 
 
@@ -264,6 +265,30 @@ def test_a_lobe_of_weight_zero_is_skipped():
     assert 0 in compat.LOST_AT["Principled"]["clearcoat"]
 
 
+@pytest.mark.parametrize("plugin", compat.METALS.values())
+@pytest.mark.parametrize(("slot", "index"), [("eta", (0.0, 2.0)), ("k", (0.4, 0.0))])
+def test_metals_lose_their_slopes_without_index_or_absorption(plugin, slot, index):
+    activate("llvm_ad_mono")
+
+    def reflected(x):
+        numbers = {"eta": index[0], "k": index[1]}
+        textures = {name: {"type": "uniform", "value": value} for name, value in numbers.items()}
+        params = mi.traverse(bsdf := mi.load_dict({"type": plugin, **textures}))
+        params[f"{slot}.value"] = x
+        params.update()
+        # Every facet that light reaches here is beyond the angle of total reflection.
+        ctx, si = mi.BSDFContext(), interaction(unit(0.6, 0.0, 0.8))
+        smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        return bsdf.sample(ctx, si, 0.5, mi.Point2f(0.5))[1] if smooth else bsdf.eval(ctx, si, unit(-0.6, 0.0, 0.8))
+
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    dr.backward(reflected(x)[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    change = float((reflected(mi.Float(0.01))[0] - reflected(mi.Float(0))[0])[0]) / 0.01
+    assert dr.grad(x)[0] == 0 and abs(change) > 0.3
+    assert compat.loses_slope_of_metal(slot, (index[0],) * 2, (index[1],) * 2)
+
+
 @pytest.mark.parametrize("cls", compat.PLASTICS)
 @pytest.mark.parametrize("black", [0, 1])
 def test_black_lobes_of_plastics_are_never_sampled(cls, black):
@@ -304,6 +329,37 @@ def test_rough_plastic_has_no_derivative_through_its_tables():
     assert derivative(compat.DIFFERENTIABLE_PLUGINS["roughplastic"]) < -0.01
 
 
+def test_lobes_of_hair_are_not_those_of_its_samples():
+    """Too dark where the series of the Bessel function ends, of another slope, and flat past three crossings."""
+    activate(RGB)
+    absorbing = {"sigma_a": {"type": "uniform", "value": 0.5}, "int_ior": 1.55, "ext_ior": 1.0}
+    wi, wo = unit(0.1, 0.0, 1.0), unit(0.1, 0.02, 1.0)
+
+    def value(plugin, roughness):
+        bsdf = mi.load_dict({"type": plugin, "longitudinal_roughness": roughness, **absorbing})
+        return float(bsdf.eval(mi.BSDFContext(), interaction(wi), wo)[0][0])
+
+    def truth(roughness):
+        return scattered(np.array(wi), np.array(wo), 0.5, (roughness, 0.3))[0]
+
+    ours = compat.DIFFERENTIABLE_PLUGINS["hair"]
+    for plugin, largest in (("hair", 0.005), (ours, 1e-4)):
+        # The reflected lobe has a concentration of 12 there.
+        error = value(plugin, 0.296) / truth(0.296) - 1
+        assert (abs(error) > 0.003) == (plugin == "hair") and abs(error) < 2 * largest
+
+    samples = {}
+    for plugin in ("hair", ours):
+        bsdf = mi.load_dict({"type": plugin, "sigma_a": 0.0, "int_ior": 3.0})
+        rng = mi.PCG32(20000)
+        points = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        si = dr.zeros(mi.SurfaceInteraction3f, 20000)
+        si.wi = unit(0.3, 0.5, 0.8)
+        samples[plugin] = np.array(bsdf.sample(mi.BSDFContext(), si, *points)[0].wo.y)
+    assert np.mean(np.abs(samples["hair"]) < 1e-6) > 0.03
+    assert np.mean(np.abs(samples[ours]) < 1e-6) < 1e-3
+
+
 def test_the_sun_shows_its_angle_in_its_description_alone():
     activate(RGB)
     sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8], "sun_aperture": 2.5, "sky_scale": 0.0})
@@ -337,7 +393,8 @@ def test_hair_has_a_lobe_like_an_interface():
     flags = [hair.flags(i) for i in range(hair.component_count())]
     lobe = (mi.BSDFFlags.GlossyTransmission, mi.BSDFFlags.NonSymmetric)
     assert any(all(mi.has_flag(f, flag) for flag in lobe) for f in flags)
-    assert compat.has_equal_sides(hair) and not compat.has_equal_sides(mi.load_dict({"type": "roughdielectric"}))
+    assert compat.has_equal_sides(hair) and compat.has_equal_sides(mi.load_dict({"type": "diff_hair"}))
+    assert not compat.has_equal_sides(mi.load_dict({"type": "roughdielectric"}))
 
 
 def test_colours_are_kept_as_coefficients_in_spectral_variants():

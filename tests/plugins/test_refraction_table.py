@@ -34,6 +34,7 @@ def test_none_where_nothing_refracts_through_a_lobe():
         {"type": "thindielectric"},
         {"type": "diff_dielectric"},
         {"type": "hair"},
+        {"type": "diff_hair", "sigma_a": 0.5},
     ):
         assert RefractiveBSDFs.of(scene_of(bsdf)) is None
     assert RefractiveBSDFs.of(scene_of({"type": "principled", "roughness": 0.5})) is None

@@ -122,7 +122,9 @@ def test_values_that_are_given(room):
     assert said(renderer, seed=0)[1] == []
     _, messages = said(renderer, {COLOUR: torch.tensor([0.5, -0.5, 0.2])}, seed=0)
     assert len(messages) == 1 and repr(COLOUR) in messages[0] and "reaches -0.5," in messages[0]
-    assert said(renderer, {COLOUR: torch.tensor([0.5, 1.5, 0.2])}, seed=0)[1] == []
+    # The other end is another finding.
+    assert len(said(renderer, {COLOUR: torch.tensor([0.5, 1.5, 0.2])}, seed=0)[1]) == 1
+    assert said(renderer, {COLOUR: torch.tensor([0.5, 1.4, -0.2])}, seed=0)[1] == []
     assert "reaches 1.5," in said(renderer, {GREY: torch.tensor([0.5, 1.5])}, seed=0)[1][0]
     for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
         assert said(twin, {GREY: 1.5}, seed=0)[1] == []

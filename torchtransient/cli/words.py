@@ -8,7 +8,7 @@ _WORDS = {
     "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
     "tt.plan(scene) finds a window": "`torchtransient plan SCENE` finds a window",
     " RenderOutput.stats has the energies.": "",
-    ", for instance by .clamp(0, 1) or a sigmoid": "",
+    ", by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)": "",
     "tt.plan: outputs are some of": "--outputs takes some of",
     "tt.plan: ": "",
     "tt.load: ": "",

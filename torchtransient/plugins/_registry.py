@@ -86,6 +86,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
         "torchtransient.plugins.bsdfs.principled", (("bsdf", "diff_principled"), ("bsdf", "diff_principled_thin"))
     ),
     PluginModule("torchtransient.plugins.bsdfs.polarized_plastic", (("bsdf", "diff_pplastic"),)),
+    PluginModule("torchtransient.plugins.bsdfs.hair", (("bsdf", "diff_hair"),)),
     PluginModule("torchtransient.plugins.bsdfs.conductor", (("bsdf", "diff_conductor"),)),
     PluginModule("torchtransient.plugins.bsdfs.rough_conductor", (("bsdf", "diff_rough_conductor"),)),
     PluginModule(

@@ -64,7 +64,7 @@ def is_two_sided_itself(bsdf: Any) -> bool:
 
 def has_equal_sides(bsdf: Any) -> bool:
     """Whether the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
-    return bool(bsdf.class_name() == "Hair")
+    return bool(bsdf.class_name() == "Hair" or getattr(bsdf, "has_equal_sides", False))
 
 
 # Slots of BSDFs that hold a texture of normals or heights, which turns the frame that the nested BSDF works in.
@@ -92,9 +92,13 @@ def is_bump_map(bsdf: Any) -> bool:
     """
     return bool(bsdf.class_name() == "BumpMap")
 
+
 # Built in place of Mitsuba's when a key is asked for whose derivative it lacks: its dielectric and its plastic have a
 # plain number for the index, its rough dielectric detaches it where directions are sampled, and its rough plastic
 # computes tables from roughness and index outside of the graph. Plastics and principled surfaces lose lobes, see below.
+# The lobes of its hair are not those of its samples: a Bessel function that is up to 0.6 % too small, of a slope that
+# is wrong by as much; less one, as derivatives have it, 12 %. What crosses a fibre three times or more is sent into
+# one plane.
 DIFFERENTIABLE_PLUGINS = {
     "dielectric": "diff_dielectric",
     "roughdielectric": "diff_rough_dielectric",
@@ -105,16 +109,15 @@ DIFFERENTIABLE_PLUGINS = {
     "roughconductor": "diff_rough_conductor",
     "principled": "diff_principled",
     "principledthin": "diff_principled_thin",
+    "hair": "diff_hair",
 }
 # Where the weight of a lobe has one of these values, these lose a lobe: they never sample it, or do not evaluate it,
 # and the derivative by the weight is zero or wrong there although its slope is not. By class and the slot of the
 # texture; plastics go by its mean. Where a principled surface transmits and its base is black, the derivative by the
-# colour is NaN, or counts samples that were thrown away. Fresnel's term of a metal is a small difference under a root
-# where the index or the absorption is small: its slope loses its digits below 0.01, and is zero below 1e-3.
+# colour is NaN, or counts samples that were thrown away. Metals go by `loses_slope_of_metal`, near these values too.
 PLASTICS = {"SmoothPlastic": "plastic", "RoughPlastic": "roughplastic", "PolarizedPlastic": "pplastic"}
 METALS = {"SmoothConductor": "conductor", "RoughConductor": "roughconductor"}
 LOSING = PLASTICS | METALS | {"Principled": "principled", "PrincipledThin": "principledthin"}
-LEAST_INDEX = 0.01
 LOST_AT: dict[str, dict[str, tuple[float, ...]]] = {
     **{name: {"diffuse_reflectance": (0,), "specular_reflectance": (0,)} for name in PLASTICS},
     **{name: {"eta": (0,), "k": (0,)} for name in METALS},
@@ -132,6 +135,36 @@ def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
     if slot == "base_color" and name in LOST_AT and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
         return (0,)
     return LOST_AT.get(name, {}).get(slot, ())
+
+
+# Below this share of `1 + k^2` in `eta k`, Mitsuba's Fresnel term of a metal loses more than 0.1 % of its slopes.
+_LEAST_PRODUCT = 0.008
+
+
+def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, float]) -> bool:
+    """Whether Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges ``eta, k``.
+
+    It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
+    in single precision where ``eta k`` is small: in total reflection (``eta < 1``), and in metals without losses. Its
+    Mueller matrix takes a complex root instead, and loses that of no absorption alone.
+    """
+    least, (low, high) = eta[0], k
+    if mi.is_polarized:
+        return slot == "k" and low == 0 and 0 < least < 1
+    # The slope by one of them is proportional to the other, and truly zero without it.
+    if (high if slot == "eta" else eta[1]) <= 0:
+        return False
+    return any(least * x < _LEAST_PRODUCT * (1 + x * x) and (least < 1 or x > least) for x in (low, high))
+
+
+def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
+    """Whether what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
+    return bool(bsdf.class_name() == "Hair" and slot == "sigma_a")
+
+
+def is_replaced_for(bsdf: Any, slot: str) -> bool:
+    """Whether another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked for."""
+    return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
 
 
 # In polarized variants these stand in for Mitsuba's always. At normal incidence, where frames coincide, derivatives of
@@ -198,6 +231,14 @@ def misplaces_hits(shape: Any) -> bool:
 def has_vertices(shape: Any) -> bool:
     """Whether a shape is a mesh whose vertices move with its parameters. Mitsuba's rectangles are meshes too."""
     return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
+
+
+def has_smooth_shape(emitter: Any) -> bool:
+    """Whether a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point on it
+    is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and more.
+    """
+    shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
+    return shape is not None and has_vertices(shape) and bool(shape.has_vertex_normals())
 
 
 # Their normal is the same everywhere.

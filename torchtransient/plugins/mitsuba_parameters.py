@@ -12,13 +12,15 @@ import mitsuba as mi
 
 from torchtransient.plugins.mitsuba_compat import (
     DIFFERENTIABLE_PLUGINS,
-    LEAST_INDEX,
     LOSING,
     LOST_AT,
     METALS,
     PLASTICS,
+    is_absorption_of_hair,
     is_bump_map,
     is_dark,
+    keeps_coefficients,
+    loses_slope_of_metal,
     lost_at,
     normal_texture,
 )
@@ -33,6 +35,7 @@ from torchtransient.plugins.parameter_effect import (
     Site,
     declare_effects,
 )
+from torchtransient.plugins.shares import NUMBERS
 
 VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.
@@ -79,6 +82,10 @@ VARNISH = ParameterEffect(
     reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['plastic']} when asked for, whose index is no plain number",
     trusted=True,
     stand_in=DIFFERENTIABLE_PLUGINS["plastic"],
+)
+FIBRE = ParameterEffect(
+    reason=f"{CORRECT}; built as {DIFFERENTIABLE_PLUGINS['hair']} when asked for, whose lobes are those of its samples",
+    stand_in=DIFFERENTIABLE_PLUGINS["hair"],
 )
 DARK = ParameterEffect(
     supported=False,
@@ -193,13 +200,35 @@ def _is_lost_in(cls: str, site: Site) -> bool:
         if cls in PLASTICS:
             textures = [dict(objects_of(holder))[name] for holder, name in held]
             return any(dr.all(mi.Float(texture.mean()) <= 0) for texture in textures)
+        if cls in METALS:
+            return any(_loses_slope_of_metal(holder, name) for holder, name in held)
         shown = mi.traverse(site.node)[site.key] if held else None
         if not (dr.is_array_v(shown) and dr.is_float_v(shown)):
             return False
         entries = shown.array if dr.is_tensor_v(shown) else shown
         ends = {end for holder, name in held for end in lost_at(holder, name)}
-        within = LEAST_INDEX if cls in METALS else 0
-        return any(bool(dr.any(dr.abs(entries - end) <= within, axis=None)) for end in ends)
+        return any(bool(dr.any(entries == end, axis=None)) for end in ends)
+
+
+def _loses_slope_of_metal(metal: Any, slot: str) -> bool:
+    textures = dict(objects_of(metal))
+    eta, k = (_range_of(textures[name]) for name in ("eta", "k"))
+    return eta is not None and k is not None and loses_slope_of_metal(slot, eta, k)
+
+
+def _range_of(texture: Any) -> tuple[float, float] | None:
+    """Smallest and largest number of a texture, None if it shows none."""
+    found: list[float] = []
+    for node in (texture, *objects_below(texture, mi.Texture)):
+        if keeps_coefficients(node):
+            found += [float(dr.slice(mi.Float(node.mean()), 0))]
+            continue
+        numbers = [shown.read(node) for shown in shown_by(node)[0] if shown.key in NUMBERS]
+        for value in numbers:
+            value = mi.Float(value) if isinstance(value, float) else dr.detach(value)
+            value = value.array if dr.is_tensor_v(value) else dr.ravel(value)
+            found += [float(dr.slice(least_or_most(value), 0)) for least_or_most in (dr.min, dr.max)]
+    return (min(found), max(found)) if found else None
 
 
 def _rows_of_weights() -> Iterator[Row]:
@@ -209,8 +238,13 @@ def _rows_of_weights() -> Iterator[Row]:
             twin = DIFFERENTIABLE_PLUGINS[plugin]
             reason = f"{CORRECT}; built as {twin} when asked for, which has the derivatives at zero"
             effect = ParameterEffect(reason=reason, stand_in=twin, stand_in_needed=now)
-            words = f"in {plugin}, {', '.join(LOST_AT[cls])}" + (" where a lobe is lost" if now else "")
+            lost = f" where {'a slope' if cls in METALS else 'a lobe'} is lost" if now else ""
+            words = f"in {plugin}, {', '.join(LOST_AT[cls])}{lost}"
             yield Row(effect, partial(condition, cls), words)
+
+
+def _is_in_hair(site: Site) -> bool:
+    return any(is_absorption_of_hair(holder, name) for holder, name in site.owners)
 
 
 def _is_of_a_dark_light(site: Site) -> bool:
@@ -220,13 +254,14 @@ def _is_of_a_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
+IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
 OF_A_DARK_LIGHT = Row(DARK, _is_of_a_dark_light, "the radiance of a directionalarea")
 
 # Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
-OF_NUMBERS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), OF_A_DARK_LIGHT)
+OF_NUMBERS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, OF_A_DARK_LIGHT)
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -261,9 +296,7 @@ for _blobs in ("Ellipsoids", "EllipsoidsMesh"):
 CLAMPED = replace(
     SHAPE, trusted=False, reason=SILHOUETTES + "; Mitsuba keeps the bounding boxes that the shape was built with"
 )
-declare_effects(
-    "Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))}
-)
+declare_effects("Ellipsoids", {"opacities": (Row(CLAMPED, _is_clamped, "with extent_adaptive_clamping"), Row(VALUE))})
 
 declare_effects("Sensor", dict.fromkeys(SENSOR_KEYS, SENSOR))
 
@@ -280,7 +313,8 @@ _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_o
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.
 declare_effects("ThinDielectric", {"eta": VALUE})
-declare_effects("Hair", {"eta": VALUE})
+_OF_HAIR = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
+declare_effects("Hair", dict.fromkeys(_OF_HAIR, FIBRE))
 declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 

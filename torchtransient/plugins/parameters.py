@@ -17,7 +17,7 @@ import mitsuba as mi
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
 from torchtransient.plugins.black_textures import check_black, loses_black
-from torchtransient.plugins.mitsuba_compat import attribute_name, keeps_coefficients, lost_at
+from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for, keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
 from torchtransient.plugins.parameter_effect import SILHOUETTES as SILHOUETTES
@@ -140,8 +140,8 @@ class ParameterTracker:
         """
         if isinstance(node, mi.BSDF):
             return [(node, "")]
-        owners = dict.fromkeys(self._owners_of(node, key))
-        return [(holder, name) for holder, name in owners if isinstance(holder, mi.BSDF) and lost_at(holder, name)]
+        owners = [entry for entry in dict.fromkeys(self._owners_of(node, key)) if isinstance(entry[0], mi.BSDF)]
+        return [(holder, name) for holder, name in owners if is_replaced_for(holder, name)]
 
     def loses_black(self, node: Any, key: str) -> bool:
         """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""

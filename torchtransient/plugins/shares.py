@@ -18,7 +18,7 @@ _OF_BSDFS = (
 _OF_MEDIA = ("albedo",)
 _NAMES = frozenset((*_OF_BSDFS, *_OF_MEDIA))
 # Of a texture or volume the numbers, not where they lie.
-_NUMBERS = ("value", "values", "data", "color0", "color1")
+NUMBERS = ("value", "values", "data", "color0", "color1")
 
 
 def is_share(params: Any, key: str) -> bool:
@@ -29,7 +29,7 @@ def is_share(params: Any, key: str) -> bool:
     node = params.properties[key][2]
     if names[-1] in _NAMES:
         return _belongs(node, names[-1])
-    if names[-1] not in _NUMBERS or not isinstance(node, mi.Texture | mi.Volume) or keeps_coefficients(node):
+    if names[-1] not in NUMBERS or not isinstance(node, mi.Texture | mi.Volume) or keeps_coefficients(node):
         return False
     for name in reversed(names[:-1]):
         node = params.hierarchy[node][0]

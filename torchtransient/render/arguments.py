@@ -64,6 +64,8 @@ def as_float(key: str, value: Any, device: str) -> torch.Tensor:
     """The value as float32, by an operation that gradients pass. Numbers, lists and arrays come to ``device``, tensors
     must be there. Raises ``ShapeError`` for what is not real numbers, ``DeviceError`` for another device.
     """
+    if value is None:  # which numpy takes for a number that is none
+        raise ShapeError(f"value of {key!r}: expected numbers, got None. Leave the key out to keep the current value.")
     if not isinstance(value, torch.Tensor):
         value = _tensor_of(key, value).to(device)
     if value.is_complex() or value.dtype == torch.bool:

@@ -52,7 +52,7 @@ _MEASURED_PLUGINS = {
 _COLOURED_PLUGINS = {
     "sunsky": "coloured sky",
     "timed_sunsky": "coloured sky",
-    "hair": "coloured absorption of hair",
+    **dict.fromkeys(("hair", "diff_hair"), "coloured absorption of hair"),
     "mesh_attribute": "attribute of a mesh, which may be coloured",
 }
 

@@ -92,11 +92,11 @@ class ParameterTable(Mapping[str, ParameterInfo]):
     __repr__ = __str__
 
 
-def unknown_key(key: str, known: list[str]) -> str:
-    """The message for a parameter key that a scene does not have."""
+def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
+    """The message for a parameter key that a scene, or another ``owner``, does not have."""
     close = difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
     hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
-    return f"the scene has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
+    return f"{owner} has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
 
 def _short(value: Any) -> str:

@@ -68,13 +68,15 @@ class PhysicsWatch:
 
     def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
         """A value of a call, with its smallest and largest number."""
-        if self.mode == "error" or key not in self._told:
-            if key in self.shares and (low < -_SLACK or high > 1 + _SLACK):
+        if key in self.shares:
+            if high > 1 + _SLACK:
                 self._tell(key, outside_message(key, low, high))
-            elif key in self.transforms:
-                matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
-                if any(is_singular(matrix) for matrix in matrices):
-                    self._tell(key, singular_message(key))
+            elif low < -_SLACK:
+                self._tell(f"{key} below zero", outside_message(key, low, high))
+        elif key in self.transforms and (self.mode == "error" or key not in self._told):
+            matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
+            if any(is_singular(matrix) for matrix in matrices):
+                self._tell(key, singular_message(key))
 
     def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
         """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""
@@ -117,7 +119,7 @@ def outside_message(key: str, low: float, high: float) -> str:
     number = f"{high:.6g}, more than all" if high > 1 + _SLACK else f"{low:.6g}, less than nothing"
     return (
         f"{key!r} is a share of the light and reaches {number}: no surface or medium scatters so. Keep it in [0, 1], "
-        "for instance by .clamp(0, 1) or a sigmoid."
+        "by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)."
     )
 
 

@@ -345,8 +345,8 @@ class TransientRenderer(nn.Module):
         given = dict(values or {})
         for key in given:
             if key not in self._shapes:
-                hint = unknown_key(key, list(self._shapes))
-                raise SceneError(f"values: {hint} This renderer has parameters={list(self._keys)}.")
+                hint = unknown_key(key, list(self._shapes), "this renderer")
+                raise SceneError(f"values: {hint} It was made with parameters={list(self._keys)}.")
         expected = device_type(self.scene.variant)
         tensors, batched, batch = [], [], None
         for key in self._keys:

@@ -106,7 +106,7 @@ def bsdfs() -> dict[str, dict[str, Any]]:
         "diffuse", "dielectric", "thindielectric", "roughdielectric", "conductor", "roughconductor", "plastic",
         "roughplastic", "pplastic", "hair", "polarizer", "retarder", "circular", "diff_dielectric",
         "diff_rough_dielectric", "diff_plastic", "diff_rough_plastic", "diff_conductor", "diff_polarizer",
-        "diff_retarder", "diff_circular", "diff_rough_conductor", "diff_pplastic",
+        "diff_retarder", "diff_circular", "diff_rough_conductor", "diff_pplastic", "diff_hair",
     )  # fmt: skip
     thick = {"metallic": 0.1, "clearcoat": 0.1, "clearcoat_gloss": 0.1, **_PRINCIPLED}
     thin = {"diff_trans": 0.1, **_PRINCIPLED}

@@ -116,6 +116,24 @@ def bare_light(kind="area", **arguments):
     return lit_by_mesh(BARE, {"type": kind, "radiance": 3.0, **arguments}, "bare.obj")
 
 
+SMOOTH = """v -1 -1 0
+v 1 -1 0
+v 1 1 0
+v -1 1 0
+vn -0.2 -0.2 0.9
+vn 0.2 -0.2 0.9
+vn 0.2 0.2 0.9
+vn -0.2 0.2 0.9
+f 1//1 2//2 3//3
+f 1//1 3//3 4//4
+"""
+
+
+def smooth_light(kind="area", **arguments):
+    """One with normals at its vertices, which are not those of its faces."""
+    return lit_by_mesh(SMOOTH, {"type": kind, "radiance": 3.0, **arguments}, "smooth.obj")
+
+
 def change_pattern(direction):
     def apply(params, x):
         along("light.vertex_texcoords", direction)(params, x)
@@ -136,6 +154,7 @@ TURNED = (0, 0, 0, 0.3, 0.2, 1, 0.3, 1, 0.5, 0)
 BENT = (0.1, 0, 1, 0.2, 0.3, 0.1, -0.5, 0.1, -0.2, 0, 0.7, 0, 0, 0.2, 0.4, -0.1, 0.3, 0, 0.2, 0.1)
 
 # Of four corners, none as its neighbours.
+CONE = {"kind": "angulararea", "cutoff_angle": 80.0, "beam_width": 5.0}
 GROWS = (-0.3, 0.1, 0, 0.6, 0, 0.1, 0.5, 0.4, 0, 0, 0.8, -0.1)
 
 CASES = [
@@ -235,4 +254,20 @@ CASES = [
         1e-2,
         spp=4096,
     ),
-]
+    Case(
+        "smooth_light_grows", "area light shape", smooth_light, along("light.vertex_positions", GROWS), 0.0, 1e-2,
+        spp=4096,
+    ),
+    Case(
+        "smooth_light_with_a_cone_grows", "area light shape", lambda: smooth_light(**CONE),
+        along("light.vertex_positions", GROWS), 0.0, 1e-2, spp=4096,
+    ),
+    Case(
+        "smooth_light_with_a_cone_bends", "area light shape", lambda: smooth_light(**CONE),
+        along("light.vertex_normals", GROWS), 0.0, 2e-2, spp=4096,
+    ),
+    Case(
+        "wall_under_a_smooth_light", "shape to_world", smooth_light, move("wall.to_world", (0, 0, 1)), 0.0, 1e-2,
+        spp=4096,
+    ),
+]  # fmt: skip

@@ -11,7 +11,7 @@ import mitsuba as mi
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
-from torchtransient.plugins.mitsuba_compat import has_vertices, is_flat, lacks_directions
+from torchtransient.plugins.mitsuba_compat import has_smooth_shape, has_vertices, is_flat, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
@@ -40,7 +40,8 @@ class SceneContents:
     blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
-    (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own. Tables,
+    (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own;
+    ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
     instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
@@ -65,6 +66,7 @@ class SceneContents:
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
         self.media = media_of(scene, sensor)
         self.sphere_lights = SphereLights.of(scene)
+        self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())

@@ -11,6 +11,7 @@ from typing import Any
 from torchtransient.plugins.parameter_effect import SILHOUETTES
 from torchtransient.plugins.swept_parameters import FILE
 from torchtransient.testing.gradient_sweep.compare import RESOLVED, SCALE, SIGMAS, TOLERANCE, WEAK
+from torchtransient.testing.gradient_sweep.settings import all_settings
 
 PAGE, DATA = "gradients_sweep.md", "gradients_sweep.json"
 # Columns of the JSON file, one row for a comparison.
@@ -91,6 +92,10 @@ def _table(rows: Iterable[dict[str, Any]]) -> list[str]:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """The page."""
     lines = [HEAD, summary(rows), ""]
+    measured, settings = {row["setting"] for row in rows}, all_settings()
+    if missing := [setting.name for setting in settings if setting.name not in measured]:
+        # What they alone hold counts as unchecked.
+        lines += [f"Not measured yet, {len(missing)} of {len(settings)} scenes: {'; '.join(missing)}.", ""]
     for kind, title in TITLES.items():
         chosen = [row for row in rows if row["setting"].split(" ")[0] == kind]
         if chosen:

@@ -47,6 +47,8 @@ class EmitterFound(Connection):
         prev.p, prev.n = path.prev_p, path.prev_n
         prev.time, prev.wavelengths = path.ray.time, path.ray.wavelengths
         ds = mi.DirectionSample3f(world.scene, si=vertex.si, ref=prev)
+        if world.contents.smooth_lights is not None:
+            ds.n = vertex.si.n
         connected = hit & ~path.prev_unconnected
         sampled = [c.density(world, prev, ds, connected) for c in world.connections if c is not self]
         sampled = sum(density for density in sampled if density is not None)

@@ -35,8 +35,18 @@ class EmitterSampled(Connection):
     def sample(self, world, ref, u, active):
         """(direction sample, emission over density) towards an emitter."""
         if self.spheres is not None:
-            return self.spheres.sample(world.scene, ref, u, active)
-        return world.scene.sample_emitter_direction(ref, u, False, active)
+            found = self.spheres.sample(world.scene, ref, u, active)
+        else:
+            found = world.scene.sample_emitter_direction(ref, u, False, active)
+        return found if world.contents.smooth_lights is None else self._by_faces(world, ref, *found, active)
+
+    def _by_faces(self, world, ref, ds, weight, active):
+        """The sample with the solid angle of the face that it lies on; Mitsuba takes the interpolated normal for it."""
+        _, _, there, n = self._found_by_ray(world, ref, ds, active & world.contents.smooth_lights.lists(ds.emitter))
+        cos = dr.abs_dot(ds.n, ds.d)
+        ratio = dr.select(there & (cos > 0), dr.abs_dot(n, ds.d) / cos, 1)
+        ds.pdf = dr.select(ratio > 0, ds.pdf / ratio, 0)
+        return ds, weight * ratio
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -136,6 +146,8 @@ class EmitterSampled(Connection):
             surface = lit & mi.has_flag(flags, mi.EmitterFlags.Surface) & ~far
         light = Local(ds=ds, weight=mi.unpolarized_spectrum(weight), far=far, near=lit & ~far, surface=surface)
         light.p, light.n, light.uv, light.area = mi.Point3f(ds.p), mi.Normal3f(ds.n), mi.Point2f(ds.uv), mi.Float(1)
+        # That of the face, and the one that emission is told by.
+        light.face_n = mi.Normal3f(ds.n)
         light.longer, light.found = mi.Float(0), None
         light.cone, light.cone_weight, light.sun = mi.Bool(False), None, mi.Bool(False)
         if self.sun is not None:
@@ -149,28 +161,38 @@ class EmitterSampled(Connection):
             light.surface = surface & ~light.cone
             moving, light.cone_weight = self.sample(world, si, u, light.cone)
             light.p = dr.replace_grad(light.p, dr.select(light.cone, moving.p, dr.detach(moving.p)))
+        if wanted.geometry and world.contents.smooth_lights is not None:
+            _, _, there, n = self._found(world, si, light)
+            light.face_n = dr.select(there, n, light.face_n)
         if wanted.emitter_shape:
             self._follow_shape(world, si, light)
         return light
 
     @staticmethod
-    def _found(world, si, light):
-        """(the ray to the point of a light, its intersection, where it finds the light): what knows the shape."""
+    def _found_by_ray(world, ref, ds, active):
+        """(the ray to the point of a light, its intersection, where it finds the light, the normal of the face there):
+        what knows the shape.
+        """
+        with dr.suspend_grad():
+            ray = dr.detach(ref).spawn_ray(ds.d)
+            pi = world.segment.next_surface(world, ray, active)
+            there = active & pi.is_valid()
+            found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+            return ray, pi, there & (found.emitter(world.scene) == ds.emitter), found.n
+
+    def _found(self, world, si, light):
+        """As above, of the point of ``light``, looked for once."""
         if light.found is None:
-            with dr.suspend_grad():
-                ray = dr.detach(si).spawn_ray(light.ds.d)
-                pi = world.segment.next_surface(world, ray, light.surface)
-                there = light.surface & pi.is_valid()
-                found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
-                light.found = ray, pi, there & (found.emitter(world.scene) == light.ds.emitter)
+            light.found = self._found_by_ray(world, si, light.ds, light.surface)
         return light.found
 
     def _follow_shape(self, world, si, light):
         """Make the point a material one of the light's shape."""
-        ray, pi, there = self._found(world, si, light)
+        ray, pi, there, _ = self._found(world, si, light)
         found, area = material_point(pi, ray, there, world.contents.emitting_meshes)
         light.p = dr.select(there, dr.replace_grad(light.p, found.p), light.p)
-        light.n = dr.select(there, dr.replace_grad(light.n, found.n), light.n)
+        light.n = dr.select(there, dr.replace_grad(light.n, found.sh_frame.n), light.n)
+        light.face_n = dr.select(there, dr.replace_grad(light.face_n, found.n), light.face_n)
         light.uv = dr.select(there, dr.replace_grad(light.uv, found.uv), light.uv)
         light.area = dr.relative_grad(dr.select(there, area, 1))
 
@@ -179,18 +201,19 @@ class EmitterSampled(Connection):
         that are found must move as those that are sampled.
         """
         si, ds, near, on_surface = vertex.scattered_si, light.ds, light.near, light.surface
+        n = dr.detach(light.face_n)
         δ = displacement(si.p, near) - displacement(light.p, near)
-        motion = damped_motion(δ, mi.Vector3f(ds.d), ds.dist, ds.n, near, vertex.damping_radius, ~on_surface)
+        motion = damped_motion(δ, mi.Vector3f(ds.d), ds.dist, n, near, vertex.damping_radius, ~on_surface)
         light.J = motion.J
         if wanted.emitter_shape:
-            light.J = light.J * motion.of_material(light.n, light.area)
+            light.J = light.J * motion.of_material(light.face_n, light.area)
         light.J = dr.select(on_surface, light.J, 1)
-        light.p = light.p + dr.select(on_surface, motion.slide(ds.n), 0)
-        light.longer = dr.select(near, motion.longer(ds.n), 0)
+        light.p = light.p + dr.select(on_surface, motion.slide(n), 0)
+        light.longer = dr.select(near, motion.longer(n), 0)
         if world.contents.patterned_lights:
-            ray, pi, there = self._found(world, si, light)
+            ray, pi, there, _ = self._found(world, si, light)
             slide = slide_on_shape(pi, ray, motion.drag, there)
-            light.uv, light.n = light.uv + slide.uv, light.n + slide.n
+            light.uv, light.n = light.uv + slide.uv, light.n + slide.sh_n
         return motion.d
 
     @staticmethod

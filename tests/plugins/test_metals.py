@@ -1,0 +1,233 @@
+"""``diff_rough_conductor`` against Mitsuba's ``roughconductor``, and the slopes that Mitsuba's metals lose."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from support.gradient_cases.cases_metals import slanted
+from support.gradient_cases.scenes import mirror_room, room
+from torchtransient import plugins
+from torchtransient.errors import GradientError
+from torchtransient.plugins.mitsuba_compat import METALS, loses_slope_of_metal
+
+MONO, POLARIZED = "llvm_ad_mono", "llvm_ad_mono_polarized"
+LANES = 1000
+
+
+def activate(variant):
+    mi.set_variant(variant)
+    plugins.sync()
+
+
+def number(value):
+    return {"type": "uniform", "value": value}
+
+
+def directions(seed):
+    """Directions above and somewhat below the surface, along the normal and next to the surface among them."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(-0.2, 1, LANES)
+    z[:3] = 1, 0.999999, 1e-3
+    phi = rng.uniform(0, 2 * np.pi, LANES)
+    s = np.sqrt(1 - z * z)
+    return mi.Vector3f(*np.array([s * np.cos(phi), s * np.sin(phi), z], dtype=np.float32))
+
+
+def interaction(wi):
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
+    si.wi, si.sh_frame, si.uv = wi, mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Point2f(0.5)
+    if mi.is_spectral:
+        si.wavelengths = mi.UnpolarizedSpectrum(450, 500, 550, 600)
+    return si
+
+
+def entries(value):
+    """The numbers of a BSDF value, the lane last."""
+    values = [value[i, j] for i in range(4) for j in range(4)] if mi.is_polarized else [value]
+    return np.concatenate([np.broadcast_to(np.array(x), (len(x), LANES)) for x in values]).astype(float)
+
+
+GGX, ALL_NORMALS = {"distribution": "ggx"}, {"sample_visible": False}
+COLOURED = {"material": "Al", "specular_reflectance": 0.5}
+ROUGH_METALS = [
+    {"material": "Au", "alpha": 0.5},
+    {**COLOURED, **GGX, "alpha_u": 0.1, "alpha_v": 0.4},
+    {**COLOURED, **ALL_NORMALS, "alpha_u": 0.4, "alpha_v": 0.2},
+    {"eta": number(0.5), "k": number(0.0), **GGX, **ALL_NORMALS, "alpha": 0.3},
+    {"eta": number(0.2), "k": number(3.0), "alpha": 0.0},
+    {},
+]
+
+
+@pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, "llvm_ad_spectral_polarized"])
+def test_rough_metal_equals_mitsubas(variant):
+    activate(variant)
+    si, wo = interaction(directions(1)), directions(2)
+    u = mi.Point2f(*np.random.default_rng(3).random((2, LANES)).astype(np.float32))
+    for metal in ROUGH_METALS[1:4] if mi.is_polarized else ROUGH_METALS:
+        ours, theirs = (mi.load_dict({"type": name, **metal}) for name in ("diff_rough_conductor", "roughconductor"))
+        assert list(mi.traverse(ours).keys()) == list(mi.traverse(theirs).keys())
+        assert (ours.flags(), ours.component_count()) == (theirs.flags(), theirs.component_count())
+        for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance)[: 1 + mi.is_polarized]:
+            ctx = mi.BSDFContext(mode)
+            got, expected = (entries(bsdf.eval(ctx, si, wo)) for bsdf in (ours, theirs))
+            # Phases of a total reflection have a few digits less in Mitsuba's matrices.
+            np.testing.assert_allclose(got, expected, rtol=2e-5, atol=1e-4 if mi.is_polarized else 1e-6)
+            got, expected = (np.array(bsdf.pdf(ctx, si, wo)) for bsdf in (ours, theirs))
+            np.testing.assert_allclose(got, expected, rtol=2e-5, atol=1e-6)
+            (bs, got), (their_bs, expected) = (bsdf.sample(ctx, si, 0.3, u) for bsdf in (ours, theirs))
+            got, expected = entries(got), entries(expected)
+            drawn = np.abs(expected).max(axis=0) > 0
+            assert 0.5 < drawn.mean() < 1
+            np.testing.assert_allclose(np.array(bs.wo)[:, drawn], np.array(their_bs.wo)[:, drawn], atol=1e-6)
+            # Where all normals are drawn, one in the surface's plane has few digits left.
+            np.testing.assert_allclose(got, expected, rtol=5e-4, atol=1e-4)
+            np.testing.assert_allclose(np.array(bs.pdf)[drawn], np.array(their_bs.pdf)[drawn], rtol=5e-4, atol=1e-6)
+
+
+def test_materials_are_mitsubas_and_so_are_mistakes():
+    activate(MONO)
+    for wrong in (
+        {"distribution": "phong"}, {"alpha_u": 0.1}, {"alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.1},
+        {"material": "Au", "eta": 0.5}, {"material": "unobtainium"}, {"roughness": 0.1},
+    ):  # fmt: skip
+        with pytest.raises(RuntimeError):
+            mi.load_dict({"type": "diff_rough_conductor", **wrong})
+    shown = str(mi.load_dict({"type": "diff_rough_conductor", "alpha_u": 0.1, "alpha_v": 0.4, "distribution": "ggx"}))
+    assert "ggx" in shown and "alpha_v" in shown and "eta" in shown
+
+
+# -------------------------------------------------------------------------------------------------------------- slopes
+
+
+def reflectance(cosine, eta, k):
+    """Of a metal to unpolarized light, in double precision; ``k`` from above."""
+    root = np.sqrt(complex(eta, -k) ** 2 - (1 - cosine**2))
+    root = -root if root.imag > 0 or root.real < 0 else root
+    across = (cosine - root) / (cosine + root)
+    along = (complex(eta, -k) ** 2 * cosine - root) / (complex(eta, -k) ** 2 * cosine + root)
+    return (abs(across) ** 2 + abs(along) ** 2) / 2
+
+
+def slope_of(plugin, slot, eta, k, cosine=0.7):
+    """Derivative of the reflectance of one facet by ``slot``."""
+    bsdf = mi.load_dict({"type": plugin, "eta": number(eta), "k": number(k)})
+    params, x = mi.traverse(bsdf), mi.Float(eta if slot == "eta" else k)
+    dr.enable_grad(x)
+    params[f"{slot}.value"] = x
+    params.update()
+    sine = math.sqrt(1 - cosine**2)
+    si, ctx = interaction(mi.Vector3f(sine, 0, cosine)), mi.BSDFContext()
+    if plugin.endswith("rough_conductor") or plugin == "roughconductor":
+        value = mi.unpolarized_spectrum(bsdf.eval(ctx, si, mi.Vector3f(-sine, 0, cosine)))[0]
+        mirror = mi.load_dict({"type": "roughconductor"}).eval(ctx, si, mi.Vector3f(-sine, 0, cosine))
+        value = value / dr.detach(mi.unpolarized_spectrum(mirror)[0])
+    else:
+        value = mi.unpolarized_spectrum(bsdf.sample(ctx, si, 0.5, mi.Point2f(0.5))[1])[0]
+    dr.backward(value, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    return float(dr.grad(x)[0])
+
+
+def true_slope(slot, eta, k, cosine=0.7):
+    h = 1e-7
+    step = (h, 0) if slot == "eta" else (0, h)
+    near, far = (reflectance(cosine, eta + n * step[0], k + n * step[1]) for n in (1, 2))
+    return (4 * near - 3 * reflectance(cosine, eta, k) - far) / (2 * h)
+
+
+AT = [(0.0, 2.0), (1e-4, 2.0), (2e-3, 2.0), (0.4, 0.0), (0.4, 1e-4), (0.4, 1e-3), (0.2, 3.0), (1.5, 0.0), (1.5, 0.5)]
+
+
+@pytest.mark.parametrize("variant", [MONO, POLARIZED])
+@pytest.mark.parametrize("plugin", ["diff_conductor", "diff_rough_conductor"])
+def test_slopes_of_metals(variant, plugin):
+    activate(variant)
+    for (eta, k), slot in itertools.product(AT, ("eta", "k")):
+        right = true_slope(slot, eta, k)
+        assert slope_of(plugin, slot, eta, k) == pytest.approx(right, rel=2e-4, abs=2e-5), (eta, k, slot)
+
+
+@pytest.mark.parametrize("variant", [MONO, POLARIZED])
+@pytest.mark.parametrize("plugin", METALS.values())
+def test_where_mitsubas_metals_lose_their_slopes(variant, plugin):
+    """They do, and what is said of them covers all of it."""
+    activate(variant)
+    lost = set()
+    for (eta, k), slot in itertools.product(AT, ("eta", "k")):
+        right, theirs = true_slope(slot, eta, k), slope_of(plugin, slot, eta, k)
+        if abs(theirs - right) > 2e-3 * abs(right) + 1e-4:
+            lost.add((eta, k, slot))
+            assert loses_slope_of_metal(slot, (eta, eta), (k, k)), (eta, k, slot)
+    assert (0.4, 0.0, "k") in lost
+    assert ((0.0, 2.0, "eta") in lost) == (variant == MONO)
+    for slot in ("eta", "k"):
+        assert not loses_slope_of_metal(slot, (1.5, 1.5), (0.0, 0.0))
+        assert not loses_slope_of_metal(slot, (0.2, 0.5), (1.0, 3.0))
+
+
+@pytest.mark.parametrize(("slot", "index"), [("eta", (0.0, 2.0)), ("k", (0.4, 0.0))])
+@pytest.mark.parametrize("plugin", METALS.values())
+def test_a_described_metal_is_built_anew(plugin, slot, index):
+    bsdf = {"type": plugin, "eta": number(index[0]), "k": number(index[1])}
+    activate(MONO)
+    scene = tt.load(slanted(bsdf) if slot == "k" else mirror_room(bsdf), variant=MONO)
+    key = f"wall.bsdf.{slot}.value"
+    info = scene.parameters()[key]
+    assert info.differentiable and not info.biased and "diff_" in info.reason
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=256)
+    renderer(seed=0).steady.sum().backward()
+    assert float(renderer.values[key].grad) < -1e-3
+
+
+@pytest.mark.parametrize("plugin", METALS.values())
+def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
+    activate(MONO)
+    for index, slot, lost in (
+        ((0.0, 2.0), "eta", True), ((0.0, 2.0), "k", False), ((0.4, 0.0), "k", True), ((0.3, 2.0), "eta", False),
+    ):  # fmt: skip
+        scene = mi.load_dict(room({"type": plugin, "eta": number(index[0]), "k": number(index[1])}), optimize=False)
+        params, x = mi.traverse(scene), mi.Float(index[slot == "k"])
+        dr.enable_grad(x)
+        params[f"wall.bsdf.{slot}.value"] = x
+        params.update()
+        film = scene.sensors()[0].film()
+        adjoint = mi.TensorXf(np.ones(film.cube_shape(), dtype=np.float32))
+
+        def backward(scene=scene, params=params, adjoint=adjoint):
+            scene.integrator().render_backward(scene, params, (None, adjoint), seed=0, spp=4)
+
+        if lost:
+            with pytest.raises(GradientError, match="diff_"):
+                backward()
+        else:
+            backward()
+        params[f"wall.bsdf.{slot}.value"] = dr.detach(x)
+        params.update()
+
+
+def test_ranges_of_textures():
+    """The partner's numbers count wherever they are: in bitmaps, and in spectra over wavelength."""
+    activate(MONO)
+    from torchtransient.plugins.parameters import ParameterTracker
+
+    grid = mi.TensorXf(np.array([[0.3, 2.0], [1.0, 3.0]], dtype=np.float32)[..., None])
+    dark = mi.TensorXf(np.array([[0.3, 2.0], [0.0, 3.0]], dtype=np.float32)[..., None])
+    for data, needed in ((grid, False), (dark, True)):
+        k = {"type": "bitmap", "data": data, "raw": True}
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "wall": {"type": "sphere", "bsdf": {"type": "roughconductor", "eta": number(0.5), "k": k}},
+            }
+        )
+        tracker = ParameterTracker(scene)
+        _, _, node, flags = next(v for key, v in mi.traverse(scene).properties.items() if key.endswith("k.data"))
+        assert tracker.effect_of(node, "data", flags).stand_in == "diff_rough_conductor"
+        assert tracker.effect_of(node, "data", flags).stand_in_needed == needed
