@@ -34,7 +34,7 @@ LONGER_STEPS = 4.0
 class Effort:
     """How much is done for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
     begin with, at most so many directions, at most so many paths a seed, seeds to confirm a contradiction with. Of so
-    many parameters, one is differentiated in forward mode too.
+    many parameters, one is differentiated in forward mode too. What calls for so many times as many paths is given up.
     """
 
     seconds: float = 45.0
@@ -44,6 +44,7 @@ class Effort:
     paths: int = 2**21
     confirming: int = 12
     forward_of: int = 1
+    patience: float = float("inf")
 
     def in_both_modes(self, name: str) -> bool:
         """Whether the parameter of that name is differentiated in forward mode too."""
@@ -52,7 +53,7 @@ class Effort:
 
 # Of the bare parameters, two thirds are decided by 256 samples per pixel and nine tenths by 4096; what is left is the
 # matter of the whole sweep. Most of the time goes into building kernels, those of forward mode cost the most.
-QUICK = Effort(seconds=60.0, seeds=4, spp=256, directions=1, paths=2**16, confirming=6, forward_of=3)
+QUICK = Effort(seconds=60.0, seeds=4, spp=256, directions=1, paths=2**16, confirming=6, forward_of=3, patience=4.0)
 
 
 @dataclass
@@ -160,6 +161,8 @@ def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[R
             # Paths that differ between the two sides are as many as the step is long.
             needed /= 2
         factor = float(np.clip(needed, 1 if noisy else 1.5, 16))
+        if needed * spp * subject.pixels > effort.patience * effort.paths:
+            return runs, spp, tangent
         if spp * factor * subject.pixels > effort.paths or time.process_time() + 0.5 * lasted * factor > deadline:
             return runs, spp, tangent
         spp = int(np.ceil(spp * factor / 16) * 16)
