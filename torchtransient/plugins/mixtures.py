@@ -16,6 +16,7 @@ apart, which is an error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,8 +28,9 @@ from torchtransient.errors import GradientError, SceneError
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability
 from torchtransient.plugins.bsdfs.wrapper_copy import can_be_rebuilt, flags_of, rebuild_wrapper
 from torchtransient.plugins.mitsuba_compat import adds_up_wrongly, weight_slot
-from torchtransient.plugins.node_walk import bsdfs_below, carries_derivatives, objects_below, objects_of, shown_by
+from torchtransient.plugins.node_walk import bsdfs_below, objects_below, objects_of, shown_by
 from torchtransient.plugins.pointer_table import PointerTable, registry_number
+from torchtransient.plugins.texture_uses import numbers_below
 
 # Probability of a part of less weight, where the derivative by the weight is asked for and the mixture is taken apart.
 LEAST_PROBABILITY = 0.25
@@ -67,8 +69,8 @@ class Mixture:
     ``always``: it is taken apart in renders, too. ``for_derivatives``: it is taken apart where there are derivatives.
     """
 
-    def __init__(self, node: Any, kind: type) -> None:
-        self.node, self._kind = node, kind
+    def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:
+        self.node, self._kind, self._shapes = node, kind, shapes
         self.parts: list[Any] = []
         self.textures: list[Any] = []
         # (the wrapper of the scene, the one around a part), whose plain numbers have to be kept equal
@@ -123,7 +125,8 @@ class Mixture:
 
     def _has_derivative(self) -> bool:
         """Whether one of its weights carries derivatives; asked with gradients enabled."""
-        return any(carries_derivatives(texture) for texture in self.textures)
+        numbers = (value for texture in self.textures for value in numbers_below(texture, self._shapes))
+        return any(map(dr.grad_enabled, numbers))
 
 
 class Seal:
@@ -132,8 +135,8 @@ class Seal:
     Raises SceneError where Mitsuba's values of them are wrong.
     """
 
-    def __init__(self, node: Any, kind: type) -> None:
-        self.node, held = node, objects_below(node, kind)
+    def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:
+        self.node, held, self._shapes = node, objects_below(node, kind), shapes
         self._mixtures = [part for part in held if weight_slot(part) is not None]
         for part in self._mixtures:
             if needs_choice(part):
@@ -155,15 +158,15 @@ class Seal:
 
     def check(self, wanted: Any) -> None:
         """Raise GradientError where derivatives need the mixture taken apart; asked with gradients enabled."""
-        if self._hides and (wanted.geometry or any(carries_derivatives(part) for part in self._mixtures)):
+        parts = (value for mixture in self._mixtures for value in numbers_below(mixture, self._shapes))
+        if self._hides and (wanted.geometry or any(map(dr.grad_enabled, parts))):
             raise GradientError(
                 f"{self._names(self._mixtures[0])}, and a delta lobe in it hides the derivative of its probability. "
                 f"{self._REMEDY}"
             )
         for mixture in self._mixtures:
             texture = dict(objects_of(mixture))[weight_slot(mixture)]
-            held = (texture, *objects_below(texture, mi.Object))
-            values = (shown.read(part) for part in held for shown in shown_by(part)[0])
+            values = numbers_below(texture, self._shapes)
             weights = (np.array(dr.detach(value)) for value in values if dr.grad_enabled(value))
             if any(((weight <= 0) | (weight >= 1)).any() for weight in weights):
                 raise GradientError(
@@ -185,11 +188,11 @@ def is_mixture(node: Any) -> bool:
     return can_be_rebuilt(node) and any(is_mixture(part) for part in bsdfs_below(node))
 
 
-def seals_of(node: Any, kind: type) -> list[Seal]:
+def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
     """Of a BSDF or phase function and all that it holds."""
     others = (part for part in (node, *objects_below(node, kind)) if weight_slot(part) is None)
     return [
-        Seal(part, kind)
+        Seal(part, kind, shapes)
         for part in others
         if not can_be_rebuilt(part) and any(weight_slot(below) is not None for below in objects_below(part, kind))
     ]
@@ -283,19 +286,21 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
     return index, weight, end | a[2] | b[2] if at_ends else below
 
 
-def mixtures_of(nodes: list[Any], kind: type) -> tuple[list[Any], Mixtures | None]:
+def mixtures_of(
+    nodes: list[Any], kind: type, shapes: Sequence[Any] = ()
+) -> tuple[list[Any], Mixtures | None]:
     """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
-    apart is replaced by its parts, the parts of others join it.
+    apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes of.
     """
     met: list[Any] = []
     mixtures: list[Mixture] = []
     seals: list[Seal] = []
     for node in nodes:
-        seals += seals_of(node, kind)
+        seals += seals_of(node, kind, shapes)
         if not is_mixture(node):
             met.append(node)
             continue
-        mixture = Mixture(node, kind)
+        mixture = Mixture(node, kind, shapes)
         mixtures.append(mixture)
         met += mixture.parts if mixture.always else [node, *mixture.parts]
     return met, Mixtures(mixtures, seals) if mixtures or seals else None

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import has_surface, is_instance
+from torchtransient.plugins.mitsuba_compat import attribute_name, has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -85,8 +85,12 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
 
 
 def carries_derivatives(node: Any) -> bool:
-    """Whether a number of a plugin, or of what it holds, is attached; to be asked with gradients enabled."""
+    """Whether a number of a plugin, or of what it holds, is attached; to be asked with gradients enabled. Of textures
+    that read an attribute of the shapes that they lie on, it may be.
+    """
     below = (node, *objects_below(node, mi.Object))
+    if any(isinstance(part, mi.Texture) and attribute_name(part) is not None for part in below):
+        return True
     return any(dr.grad_enabled(shown.read(part)) for part in below for shown in shown_by(part)[0])
 
 

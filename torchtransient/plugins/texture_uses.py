@@ -1,4 +1,5 @@
-"""Textures in places where they cannot be read: found before anything is rendered, not inside a kernel or never.
+"""What textures read, and textures in places where they cannot be read: found before anything is rendered, not inside
+a kernel or never.
 
 A bump map asks for the slope of its texture: of Mitsuba's, bitmaps have one, and what is the same everywhere. A point
 that is sampled on a light knows neither its shape nor its face: attributes of shapes read as zero there.
@@ -6,6 +7,7 @@ that is sampled on a light knows neither its shape nor its face: attributes of s
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import drjit as dr
@@ -13,7 +15,23 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.mitsuba_compat import attribute_name, is_bump_map, is_dark, normal_texture
-from torchtransient.plugins.node_walk import objects_below, objects_of
+from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
+
+
+def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
+    """The numbers of a plugin and of what it holds, attached where they are; ``shapes``: those whose attributes its
+    textures read. Attributes belong to the shapes.
+    """
+    below = (node, *objects_below(node, mi.Object))
+    for part in below:
+        yield from (shown.read(part) for shown in shown_by(part)[0])
+    names = {attribute_name(part) for part in below if isinstance(part, mi.Texture)} - {None}
+    for shape in shapes if names else ():
+        values, objects = shown_by(shape)
+        yield from (shown.read(shape) for shown in values if shown.key in names)
+        for name, texture, _ in objects:
+            if name in names:
+                yield from numbers_below(texture, ())
 
 
 def check_textures(params: Any) -> None:

@@ -109,6 +109,18 @@ def phases(weight):
     return block({**homogeneous(), "phase": outer})
 
 
+def weight_of_the_shape(name, bsdf, value, **options):
+    """As :func:`weight`, of a weight that is an attribute of the wall."""
+    read, slot = {"type": "mesh_attribute", "name": "vertex_share"}, {"type": "uniform", "value": value}
+
+    def scene():
+        room = mirror_room(bsdf(read))
+        return {**room, "wall": room["wall"] | {"vertex_share": slot}}
+
+    apply = set_color("wall.vertex_share.value")
+    return Case(name, "blend weight", scene, apply, value, 0.02, **{"spp": 16384, **options})
+
+
 SLOW = {"tags": ("slow",)}
 CASES = [
     weight("blend_of_diffuse_and_mirror", partial(blend, DIFFUSE, MIRROR)),
@@ -126,6 +138,8 @@ CASES = [
     weight("mirror_alone", partial(blend, DIFFUSE, MIRROR), 1.0, side=-1, **SLOW),
     weight("no_metal_yet", partial(blend, DIFFUSE, METAL), 0.0, side=1, **SLOW),
     weight("no_dim_mirror_yet", partial(blend, MIRROR, DIM_MIRROR), 0.0, side=1, **SLOW),
+    weight_of_the_shape("no_metal_yet_by_an_attribute", partial(blend, DIFFUSE, METAL), 0.0, side=1),
+    weight_of_the_shape("nothing_of_paint_by_an_attribute", partial(mask, DIFFUSE), 0.0, side=1, seeds=16, **SLOW),
     opacity("nothing_of_a_mirror", MIRROR, 0.0, side=1),
     opacity("all_of_a_mirror", MIRROR, 1.0, side=-1, **SLOW),
     Case(

@@ -13,7 +13,7 @@ from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirro
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 from torchtransient.plugins.mitsuba_compat import has_smooth_shape, has_vertices, is_flat, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
-from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
+from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
@@ -54,7 +54,7 @@ class SceneContents:
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
         outermost = bsdfs_of_scene(scene)
         met, self.delays = delays_of(outermost)
-        self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF)
+        self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))
         self.delta = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) for bsdf in self.bsdfs)
         self.glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in self.bsdfs)
         self.instances, self.detached_hits = Instances.of(scene), DetachedHits.of(scene)
