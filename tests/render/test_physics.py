@@ -79,6 +79,48 @@ def test_surfaces_of_the_description(room, case):
         tt.TransientRenderer(scene, spp=1, physics="error")
 
 
+RANGES = {
+    "weight of a lobe": ({"type": "principled", "metallic": 1.5}, "metallic.value", "1.5", "at most 1"),
+    "roughness": ({"type": "roughconductor", "alpha": -0.1}, "alpha.value", "-0.1", "at least 0"),
+    "metal": ({"type": "conductor", "eta": 0.5, "k": -2.0}, "k.value", "-2", "at least 0"),
+}
+
+
+@pytest.mark.parametrize("case", RANGES)
+def test_ranges_of_surfaces(room, case):
+    room["wall"]["bsdf"], key, number, expected = RANGES[case]
+    _, messages = said(tt.TransientRenderer, loaded(room), spp=1)
+    assert len(messages) == 1 and f"wall.bsdf.{key}" in messages[0]
+    assert f"reaches {number}:" in messages[0] and expected in messages[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "bad", "good"),
+    [
+        ("wall.bsdf.eta", (0.0, -1.5), (0.5, 1.0)),
+        ("box.interior_medium.sigma_t.value.value", (-0.5,), (0.0, 30.0)),
+        ("box.interior_medium.phase_function.g", (1.0, -1.2), (0.9, 0.0)),
+        ("lamp.intensity.value", (-3.0,), (0.0, 1e6)),
+        ("sensor.x_fov", (-10.0, 0.0, 200.0), (1.0, 120.0)),
+    ],
+)
+def test_ranges_of_what_is_given(room, key, bad, good):
+    room["integrator"] = {"type": "transient_prbvolpath", "max_depth": 3}
+    room["box"] |= {"interior": {**FOG, "phase": {"type": "hg", "g": 0.2}}, "bsdf": {"type": "null"}}
+    room["wall"]["bsdf"] = {"type": "dielectric"}
+    room["lamp"] = {"type": "point", "position": [0, 0, 4], "intensity": 5.0}
+    scene = loaded(room)
+    for value in good:
+        assert said(tt.render, scene, {key: _filled(scene, key, value)}, spp=1, seed=0)[1] == []
+    for value in bad:
+        _, messages = said(tt.render, loaded(room), {key: _filled(scene, key, value)}, spp=1, seed=0)
+        assert len(messages) == 1 and repr(key) in messages[0] and f"reaches {value:g}:" in messages[0]
+
+
+def _filled(scene, key, value):
+    return torch.full(scene.parameters()[key].shape, value)
+
+
 def test_media_of_the_description(room):
     room["box"]["interior"] = {**FOG, "albedo": 1.5}
     room["box"]["bsdf"] = {"type": "null"}

@@ -35,7 +35,7 @@ from torchtransient.plugins.parameter_effect import (
     Site,
     declare_effects,
 )
-from torchtransient.plugins.shares import NUMBERS
+from torchtransient.plugins.physical_ranges import NUMBERS
 
 VERTICES = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 # What moves the rays of a sensor.

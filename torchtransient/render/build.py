@@ -24,7 +24,7 @@ from torchtransient.plugins.mitsuba_compat import (
     POLARIZED_PLUGINS,
     is_dark,
 )
-from torchtransient.plugins.shares import described_shares
+from torchtransient.plugins.physical_ranges import described_ranges
 from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
@@ -101,7 +101,7 @@ class BuiltScene:
         """What is unphysical in the description, by key."""
         if self._findings is None:
             dark = [emitter.id() for emitter in self.scene.emitters() if is_dark(emitter)]
-            self._findings = scene_findings(described_shares(self.params), self.to_world, dark)
+            self._findings = scene_findings(described_ranges(self.params), self.to_world, dark)
         return self._findings
 
     _findings: dict[str, str] | None = None

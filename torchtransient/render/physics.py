@@ -1,5 +1,5 @@
-"""What can be rendered and cannot be: more light scattered than arrives, transforms without an inverse, windows that
-miss the light.
+"""What can be rendered and cannot be: more light scattered than arrives, numbers out of their range, transforms without
+an inverse, windows that miss the light.
 
 Nothing of it stops a computation by itself: an optimiser steps over the edge of [0, 1] and comes back, and a window may
 be meant to be short. So it is said once, and where it would be a mistake, it can be made an error.
@@ -12,20 +12,19 @@ import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from torchtransient.errors import PhysicsError, PhysicsWarning, SceneError
+from torchtransient.plugins.physical_ranges import SHARE, PhysicalRange
 
 MODES = ("warn", "error", "ignore")
 # Light outside of the window, as a share of all light, from which on it is said.
 MISSED = 0.05
 # Findings about a description that are said one by one.
 _SAID_OF_A_SCENE = 4
-# What single precision makes of 0 and 1, and of a matrix that has an inverse.
-_SLACK = 1e-5
+# What single precision makes of a matrix that has an inverse.
 _SINGULAR = 1e-7
 
 
@@ -34,8 +33,8 @@ class PhysicsWatch:
     ``PhysicsError``, "ignore" looks at nothing.
 
     ``told``: what was said before, of the same scene: ``tt.render`` in a loop makes a renderer each time.
-    ``window_name``: what tells its window from others, empty where none is looked at. ``shares``: which of the
-    renderer's keys are shares of the light; ``transforms``: which are transforms.
+    ``window_name``: what tells its window from others, empty where none is looked at. ``ranges``: those that the
+    renderer's keys have; ``transforms``: which are transforms.
     """
 
     def __init__(self, mode: str, told: set[str]):
@@ -43,7 +42,7 @@ class PhysicsWatch:
             raise SceneError(f"physics: expected one of {', '.join(map(repr, MODES))}, got {mode!r}.")
         self.mode = mode
         self.window_name = ""
-        self.shares: frozenset[str] = frozenset()
+        self.ranges: dict[str, PhysicalRange] = {}
         self.transforms: frozenset[str] = frozenset()
         self._told = told
 
@@ -68,11 +67,12 @@ class PhysicsWatch:
 
     def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
         """A value of a call, with its smallest and largest number."""
-        if key in self.shares:
-            if high > 1 + _SLACK:
-                self._tell(key, outside_message(key, low, high))
-            elif low < -_SLACK:
-                self._tell(f"{key} below zero", outside_message(key, low, high))
+        limits = self.ranges.get(key)
+        if limits is not None:
+            if limits.above(high):
+                self._tell(key, outside_message(key, limits, low, high))
+            elif limits.below(low):
+                self._tell(f"{key} too small", outside_message(key, limits, low, high))
         elif key in self.transforms and (self.mode == "error" or key not in self._told):
             matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
             if any(is_singular(matrix) for matrix in matrices):
@@ -92,14 +92,18 @@ class PhysicsWatch:
             )
 
 
-def scene_findings(shares: Any, transforms: Mapping[str, np.ndarray], dark: Iterable[str] = ()) -> dict[str, str]:
-    """What is unphysical in a description, by key. ``shares``: (key, smallest, largest). ``dark``: names of the lights
-    that no path meets.
+def scene_findings(
+    ranges: Iterable[tuple[str, PhysicalRange, float, float]],
+    transforms: Mapping[str, np.ndarray],
+    dark: Iterable[str] = (),
+) -> dict[str, str]:
+    """What is unphysical in a description, by key. ``ranges``: (key, its range, smallest, largest). ``dark``: names of
+    the lights that no path meets.
     """
     found = {name: dark_message(name) for name in dark}
-    for key, low, high in shares:
-        if low < -_SLACK or high > 1 + _SLACK:
-            found[key] = outside_message(key, low, high)
+    for key, limits, low, high in ranges:
+        if limits.below(low) or limits.above(high):
+            found[key] = outside_message(key, limits, low, high)
     for key, matrix in transforms.items():
         if is_singular(matrix):
             found[key] = singular_message(key)
@@ -114,12 +118,19 @@ def dark_message(name: str) -> str:
     )
 
 
-def outside_message(key: str, low: float, high: float) -> str:
-    """The message for a share of the light outside of [0, 1]."""
-    number = f"{high:.6g}, more than all" if high > 1 + _SLACK else f"{low:.6g}, less than nothing"
+def outside_message(key: str, limits: PhysicalRange, low: float, high: float) -> str:
+    """The message for a number outside of its range."""
+    if limits == SHARE:
+        number = f"{high:.6g}, more than all" if limits.above(high) else f"{low:.6g}, less than nothing"
+        return (
+            f"{key!r} is a share of the light and reaches {number}: no surface or medium scatters so. Keep it in "
+            "[0, 1], by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)."
+        )
+    least = f"{'more than' if limits.is_open else 'at least'} {limits.low:g}"
+    most = f" and {'less than' if limits.is_open else 'at most'} {limits.high:g}" if math.isfinite(limits.high) else ""
     return (
-        f"{key!r} is a share of the light and reaches {number}: no surface or medium scatters so. Keep it in [0, 1], "
-        "by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)."
+        f"{key!r} is {limits.meaning} and reaches {high if limits.above(high) else low:.6g}: expected {least}{most}. "
+        "Keep it there, by torch.no_grad() and x.clamp_() after each step or by a function that stays inside."
     )
 
 

@@ -14,7 +14,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.plugins.parameters import check_slope
-from torchtransient.plugins.shares import is_share
+from torchtransient.plugins.physical_ranges import physical_range
 from torchtransient.pulses import Pulse
 from torchtransient.render import engine
 from torchtransient.render.arguments import (
@@ -201,7 +201,8 @@ class TransientRenderer(nn.Module):
             if self.film.count > 1 or self.effective_filter in ("", "box"):
                 # Of one bin for all times a wider filter spreads up to a half over the rim, and nobody looks there.
                 self._watch.window_name = f"window of {self.film.describe('')}"
-            self._watch.shares = frozenset(key for key in self._keys if is_share(built.params, key))
+            ranges = {key: physical_range(built.params, key) for key in self._keys}
+            self._watch.ranges = {key: limits for key, limits in ranges.items() if limits is not None}
             self._watch.transforms = frozenset(slot.key for slot in slots if slot.kind.endswith("transform"))
             # What is given replaces what is described.
             findings = self.scene.findings(self._options)
