@@ -138,6 +138,8 @@ _SIZES = {
 }  # fmt: skip
 
 
+# Maps of normals hold half of what they lean by; mirrors swing with them, so that steps are short.
+_NORMALMAP, _LEAN, _LEAN_STEP = "normalmap", 0.1, 0.1
 # What poses turn about, seen from the origin of the object: turned about its middle, a plate hardly changes.
 _PIVOT = np.array([0.7, -0.5, 0.4])
 # Poses that cannot have a rotation.
@@ -174,6 +176,8 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True, mo
         return [Tangent("random", _tensor(direction), _LENGTH_STEP)]
     size = float(value.double().square().mean().sqrt()) or 1.0
     step = _LENGTH_STEP if moves else _MEDIUM_STEP if "medium" in key else _VALUE_STEP
+    if _NORMALMAP in key.split("."):
+        size, step = _LEAN, _LEAN_STEP
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
     direction *= size / np.sqrt(np.mean(direction**2))
     words = "relative change" if value.numel() == 1 else "random"
