@@ -294,6 +294,9 @@ def test_a_key_that_the_table_does_not_have(room_scene):
 def test_unknown_key_suggests_the_right_one(room_scene):
     with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value"):
         tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])
+    for part in ("box", "bsdf", "reflectance"):
+        with pytest.raises(tt.errors.SceneError, match=r"Did you mean .*box\.bsdf\.reflectance\.value"):
+            tt.TransientRenderer(room_scene, parameters=[part])
 
 
 def test_key_without_derivative(room_scene):

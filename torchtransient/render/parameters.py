@@ -94,7 +94,8 @@ class ParameterTable(Mapping[str, ParameterInfo]):
 
 def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
     """The message for a parameter key that a scene, or another ``owner``, does not have."""
-    close = difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
+    inside = [other for other in known if f".{key}." in f".{other}."]
+    close = inside[:3] or difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
     hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
     return f"{owner} has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
 
