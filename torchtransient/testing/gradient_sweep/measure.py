@@ -128,8 +128,6 @@ def weights_of(film: Any) -> torch.Tensor:
 # ---------------------------------------------------------------------------------------------------------- directions
 
 _VALUE_STEP = 0.05
-# Other free flights are other paths: longer steps have less noise.
-_MEDIUM_STEP = 0.1
 _LENGTH_STEP = 0.01
 # By the last name of a key: the size of a change in its entries that is worth 1.
 _SIZES = {
@@ -175,7 +173,7 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True, mo
         direction = rng.normal(size=shape) * _SIZES[name]
         return [Tangent("random", _tensor(direction), _LENGTH_STEP)]
     size = float(value.double().square().mean().sqrt()) or 1.0
-    step = _LENGTH_STEP if moves else _MEDIUM_STEP if "medium" in key else _VALUE_STEP
+    step = _LENGTH_STEP if moves else _VALUE_STEP
     if _NORMALMAP in key.split("."):
         size, step = _LEAN, _LEAN_STEP
     direction = np.asarray(0.7 + 0.5 * rng.normal(size=shape)) if value.numel() > 1 else np.ones(shape)
