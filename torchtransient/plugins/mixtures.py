@@ -109,9 +109,7 @@ class Mixture:
     def follow(self) -> None:
         """Hand changed numbers of the scene's wrappers on to those around parts."""
         for original, copy in self.wrapped:
-            now, before = (
-                {shown.key: shown.read(node) for shown in shown_by(node)[0]} for node in (original, copy)
-            )
+            now, before = ({shown.key: shown.read(node) for shown in shown_by(node)[0]} for node in (original, copy))
             plain = {key: value for key, value in now.items() if isinstance(value, float) and value != before[key]}
             if plain:
                 params = mi.traverse(copy)
@@ -286,9 +284,7 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
     return index, weight, end | a[2] | b[2] if at_ends else below
 
 
-def mixtures_of(
-    nodes: list[Any], kind: type, shapes: Sequence[Any] = ()
-) -> tuple[list[Any], Mixtures | None]:
+def mixtures_of(nodes: list[Any], kind: type, shapes: Sequence[Any] = ()) -> tuple[list[Any], Mixtures | None]:
     """(BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always taken
     apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes of.
     """

@@ -33,18 +33,25 @@ LONGER_STEPS = 4.0
 @dataclass(frozen=True)
 class Effort:
     """How much is done for one parameter: seconds of a processor for one direction, seeds and samples per pixel to
-    begin with, at most so many directions, at most so many paths a seed, seeds to confirm a contradiction with. Of so
-    many parameters, one is differentiated in forward mode too. What calls for so many times as many paths is given up.
+    begin with, at most so many directions from which one on, at most so many paths a seed, seeds to confirm a
+    contradiction with. Of so many parameters, one is differentiated in forward mode too. What calls for so many times
+    as many paths is given up.
     """
 
     seconds: float = 45.0
     seeds: int = 6
     spp: int = 2048
     directions: int = 2
+    first_direction: int = 0
     paths: int = 2**21
     confirming: int = 12
     forward_of: int = 1
     patience: float = float("inf")
+
+    def chosen(self, tangents: list[Tangent]) -> list[Tangent]:
+        """Of the directions in a parameter those that are looked at."""
+        first = self.first_direction if self.first_direction < len(tangents) else 0
+        return tangents[first : first + self.directions]
 
     def in_both_modes(self, name: str) -> bool:
         """Whether the parameter of that name is differentiated in forward mode too."""

@@ -36,7 +36,8 @@ differences, in scenes in which no silhouette moves. Written by `make sweep`
 
 - The loss is the transient of 4 x 4 pixels weighed by a sine of the optical path length. What is differentiated is the
   loss along one fixed direction in the entries of a parameter: a change by its own size (textures and grids: another
-  one in each entry; normals: by a fifth); poses and positions along two directions, a metre and a fifth of a radian.
+  one in each entry; normals: by a fifth); poses and positions along two directions, a metre and a fifth of a radian,
+  inside others along one of the two.
 - Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
 - *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
   and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.

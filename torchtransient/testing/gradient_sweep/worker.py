@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import traceback
+import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +33,18 @@ def results_of(setting: Setting, folder: Path, effort: Effort) -> Iterator[Resul
         for key, info in scene.parameters().items():
             if setting.takes(key) and info.shape is not None and info.kind not in ("plain", "integer"):
                 both_modes = effort.in_both_modes(f"{setting.name}: {key}")
-                for result in _results_of_key(scene, key, info, effort, both_modes):
+                for result in _results_of_key(scene, key, info, for_setting(effort, setting), both_modes):
                     result.setting = setting.name
                     yield result
     del scene
     gc.collect()
+
+
+def for_setting(effort: Effort, setting: Setting) -> Effort:
+    """Inside others poses are looked at along one direction, this one here and that one there."""
+    if setting.is_bare or effort.directions < 2:
+        return effort
+    return replace(effort, directions=1, first_direction=zlib.crc32(setting.name.encode()) % 2)
 
 
 def _results_of_key(scene: Any, key: str, info: ParameterInfo, effort: Effort, both_modes: bool) -> Iterator[Result]:
@@ -52,7 +61,7 @@ def _judgements(scene: Any, key: str, info: ParameterInfo, effort: Effort, both_
         return
     try:
         subject = Subject(scene, key)
-        for tangent in subject.tangents()[: effort.directions]:
+        for tangent in effort.chosen(subject.tangents()):
             yield judge(subject, tangent, effort, both_modes)
     except TorchTransientError as error:
         yield Result("", key, "", "error", note=f"{type(error).__name__}: {error}")
