@@ -148,7 +148,7 @@ def around(bsdf, wrapper):
         "mask in a group": {"type": "mask", "opacity": 0.5, "nested": bsdf},
         "mask": {"type": "mask", "opacity": 0.5, "nested": bsdf},
         "twosided": {"type": "twosided", "nested": bsdf},
-        "bump map": {"type": "bumpmap", "heights": {"type": "checkerboard"}, "nested": bsdf},
+        "bump map": {"type": "bumpmap", "heights": {"type": "uniform", "value": 0.5}, "nested": bsdf},
     }[wrapper]
     description = instances(wrapped) if "group" in wrapper else room(bsdf=wrapped, depth=3)
     return mi.load_dict(description, optimize=False)
