@@ -91,12 +91,15 @@ class Result:
 
 @dataclass
 class Runs:
-    """Independent runs: derivative and difference of each seed."""
+    """Independent runs: derivative and difference of each seed. ``seconds``: what they take with kernels that are
+    built.
+    """
 
     reverse: Array
     differences: Array
     scale: float
     first_seed: int = 0
+    seconds: float = 0.0
 
     @property
     def larger(self) -> float:
@@ -141,13 +144,16 @@ class Runs:
 def run(subject: Subject, tangent: Tangent, seeds: range, spp: int, step: float) -> Runs:
     """Derivatives and differences of some seeds."""
     direction = tangent.direction.double().reshape(-1).numpy()
-    reverse, differences, scales = [], [], []
+    reverse, differences, scales, seconds = [], [], [], []
     for seed in seeds:
+        started = time.process_time()
         reverse.append(float(subject.reverse(seed, spp) @ direction))
         difference, scale = subject.difference(tangent, seed, spp, step)
         differences.append(difference)
         scales.append(scale)
-    return Runs(np.array(reverse), np.array(differences), SCALE * float(np.mean(scales)), seeds[0])
+        seconds.append(time.process_time() - started)
+    scale = SCALE * float(np.mean(scales))
+    return Runs(np.array(reverse), np.array(differences), scale, seeds[0], len(seeds) * min(seconds))
 
 
 def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[Runs, int, Tangent]:
@@ -157,9 +163,7 @@ def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[R
     deadline = time.process_time() + effort.seconds
     spp, longest = effort.spp * max(1, FILM // subject.pixels), LONGER_STEPS * tangent.step
     while True:
-        started = time.process_time()
         runs = run(subject, tangent, range(effort.seeds), spp, tangent.step)
-        lasted = time.process_time() - started
         if not np.isfinite(runs.gap) or runs.worst_error < RESOLVED or runs.is_nothing:
             return runs, spp, tangent
         needed = 1.5 * (runs.worst_error / RESOLVED) ** 2
@@ -170,7 +174,7 @@ def resolved_runs(subject: Subject, tangent: Tangent, effort: Effort) -> tuple[R
         factor = float(np.clip(needed, 1 if noisy else 1.5, 16))
         if needed * spp * subject.pixels > effort.patience * effort.paths:
             return runs, spp, tangent
-        if spp * factor * subject.pixels > effort.paths or time.process_time() + 0.5 * lasted * factor > deadline:
+        if spp * factor * subject.pixels > effort.paths or time.process_time() + runs.seconds * factor > deadline:
             return runs, spp, tangent
         spp = int(np.ceil(spp * factor / 16) * 16)
         tangent = replace(tangent, step=2 * tangent.step) if noisy else tangent
