@@ -80,10 +80,15 @@ def normal_texture(bsdf: Any) -> str | None:
 
 
 def forgets_black_samples(bsdf: Any) -> bool:
-    """Whether a BSDF reports no density for samples of the one it holds whose weight is zero: paths end there, and the
-    derivative of what is black, by the light that comes from elsewhere, is lost. Mitsuba's bump map keeps it.
+    """Whether a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is black,
+    by the light that comes from elsewhere, is lost. A normal map reports no density for them, and paths end there; a
+    bump map masks the weight, of which a delta lobe has no other value.
     """
-    return bool(bsdf.class_name() == "NormalMap")
+    return bsdf.class_name() in ("NormalMap", "BumpMap")
+
+
+# The key of an environment map's image.
+PIXELS = "data"
 
 
 def is_bump_map(bsdf: Any) -> bool:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_parameters as mitsuba_parameters
-from torchtransient.plugins.black_textures import check_black, loses_black
+from torchtransient.plugins.black_textures import Attached, check_black, loses_black
 from torchtransient.plugins.mitsuba_compat import attribute_name, is_replaced_for, keeps_coefficients
 from torchtransient.plugins.node_walk import ShownValue, objects_of, owners_of, shown_by
 from torchtransient.plugins.parameter_effect import CORRECT as CORRECT
@@ -145,11 +145,14 @@ class ParameterTracker:
 
     def loses_black(self, node: Any, key: str) -> bool:
         """Whether the derivative by a plugin's numbers is lost where they are zero (:mod:`.black_textures`)."""
-        return loses_black(node, self._owners_of(node, key))
+        return loses_black(node, key, self._owners_of(node, key))
 
     def check_black(self) -> None:
         """Raise ``GradientError`` where it would be."""
-        check_black([(node, v.key, value, self._owners_of(node, v.key)) for node, v, value in self._carrying()])
+        check_black(
+            Attached(node, v.key, value, self._owners_of(node, v.key), self._holders.get(node.ptr, ()))
+            for node, v, value in self._carrying()
+        )
 
     def location_of(self, node: Any, key: str) -> tuple[str, ...]:
         """Names of a parameter and of everything that it is in (:mod:`.swept_parameters`)."""

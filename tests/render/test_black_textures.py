@@ -1,0 +1,126 @@
+"""Textures that are exactly zero keep their derivatives: below a normal or bump map, and in lights."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.gradient_cases.scenes import area_light, room
+from torchtransient.errors import GradientError
+
+VARIANT = "llvm_ad_mono"
+ZERO = {"type": "uniform", "value": 0.0}
+MAPS = {
+    "normalmap": {"normalmap": {"type": "rgb", "value": [0.55, 0.48, 0.98]}},
+    "bumpmap": {"arbitrary": {"type": "uniform", "value": 0.1}},
+}
+NESTED = {
+    "diffuse": ("reflectance", {"type": "diffuse", "reflectance": ZERO}),
+    "rough metal": ("specular_reflectance", {"type": "roughconductor", "alpha": 0.4, "specular_reflectance": ZERO}),
+    "mirror": (
+        "specular_reflectance",
+        {"type": "conductor", "material": "none", "specular_reflectance": ZERO},
+    ),
+    "thin glass": ("specular_reflectance", {"type": "thindielectric", "specular_reflectance": ZERO}),
+    "plastic": ("diffuse_reflectance", {"type": "plastic", "diffuse_reflectance": ZERO}),
+    "principled": ("spec_trans", {"type": "principled", "roughness": 0.5, "spec_trans": ZERO, "base_color": 0.7}),
+}
+
+
+# What mirrors the lamp must not lean.
+LEVEL = {"normalmap": {"type": "bitmap", "data": np.full((2, 2, 3), (0.5, 0.5, 1.0), np.float32), "raw": True}}
+
+
+def described(kind, nested):
+    """A wall under a lamp with a bright panel beside it: much of its light comes from there."""
+    mirrors = nested["type"] in ("conductor", "thindielectric")
+    wall = {"type": kind, **(LEVEL if mirrors and kind == "normalmap" else MAPS[kind]), "nested": nested}
+    return room(bsdf=wall, light=area_light(), side_reflectance=0.95)
+
+
+@pytest.mark.parametrize("name", NESTED)
+@pytest.mark.parametrize("kind", MAPS)
+def test_slope_at_zero(kind, name):
+    slot, nested = NESTED[name]
+    scene = tt.load(described(kind, nested), variant=VARIANT)
+    key = f"wall.bsdf.nested_bsdf.{slot}.value"
+    assert not scene.parameters()[key].biased
+    compare(scene, key, 8192)
+
+
+def compare(scene, key, spp, step=0.1):
+    """The slope at a value of zero, from above."""
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=spp, grad_seed="same")
+    zero = torch.zeros_like(renderer.values[key])
+
+    def brightness(x, seed):
+        return renderer(values={key: x}, seed=seed).steady.double().sum()
+
+    found, expected = [], []
+    for seed in range(6):
+        x = zero.clone().requires_grad_()
+        brightness(x, seed).backward()
+        found.append(float(x.grad.sum()))
+        with torch.no_grad():
+            here, near, far = (brightness(zero + step * k, seed) for k in range(3))
+        expected.append(float(4 * near - 3 * here - far) / (2 * step))
+    found, expected = np.array(found), np.array(expected)
+    error = (found - expected).std(ddof=1) / np.sqrt(6)
+    assert abs(found.mean() - expected.mean()) < 4 * error + 0.02 * abs(expected.mean())
+    assert error < 0.1 * abs(expected.mean())
+
+
+def picture(value, channels=1):
+    return np.full((4, 4, channels), value, np.float32)
+
+
+@pytest.mark.parametrize("described_as", [0.0, 1.0])
+@pytest.mark.parametrize("shape", ["rectangle", "disk", "sphere"])
+def test_a_light_without_light(shape, described_as):
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(picture(described_as)), "raw": True}
+    lamp = area_light(shape) | {"emitter": {"type": "area", "radiance": radiance}}
+    compare(tt.load(room(light=lamp), variant=VARIANT), "light.emitter.radiance.data", 1024)
+
+
+def test_a_sky_without_light():
+    scene = room()
+    scene["light"] = {"type": "envmap", "bitmap": mi.Bitmap(picture(0.0, 3))}
+    compare(tt.load(scene, variant=VARIANT), "light.data", 1024)
+
+
+def test_black_that_weighs_elsewhere():
+    """One texture in a normal map and as the weight of a mixture."""
+    shared = {"type": "ref", "id": "nothing"}
+    wall = {"type": "normalmap", **MAPS["normalmap"], "nested": {"type": "diffuse", "reflectance": shared}}
+    side = {"type": "blendbsdf", "weight": shared, "a": {"type": "diffuse", "reflectance": 0.95}, "b": {"type": "null"}}
+    scene = {"nothing": ZERO | {"id": "nothing"}, **room(bsdf=wall, light=area_light())}
+    scene["side"] = scene["side"] | {"bsdf": side}
+    compare(tt.load(scene, variant=VARIANT), "nothing.value", 8192)
+
+
+REFUSED = {
+    "normal map": (lambda: described("normalmap", NESTED["diffuse"][1]), "wall.bsdf.nested_bsdf.reflectance.value"),
+    "bump map": (lambda: described("bumpmap", NESTED["mirror"][1]), "wall.bsdf.nested_bsdf.specular_reflectance.value"),
+    "light": (
+        lambda: room(light=area_light() | {"emitter": {"type": "area", "radiance": ZERO}}),
+        "light.emitter.radiance.value",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_scene_of_mitsuba_is_refused(name):
+    make, key = REFUSED[name]
+    scene = mi.load_dict(make(), optimize=False)
+    params = mi.traverse(scene)
+    value = type(params[key])(0.0)
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
+    with pytest.raises(GradientError, match="1e-30"):
+        scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)
