@@ -9,6 +9,7 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.scenes import room
 from torchtransient.errors import SceneError
+from torchtransient.plugins.texture_uses import check_textures
 
 VARIANT = "llvm_ad_rgb"
 HEIGHTS = {"type": "constvolume", "value": 0.5}
@@ -61,6 +62,61 @@ def test_in_a_scene_of_mitsuba(name):
 def test_textures_with_one_are_taken(name):
     renderer = tt.TransientRenderer(tt.load(bumpy(WITH_SLOPE[name]), variant=VARIANT), spp=1)
     assert float(renderer(seed=0).steady.sum()) > 0
+
+
+# ---------------------------------------------------------------------------------------------------------- attributes
+
+
+def painted(size, bsdf, kind="vertex"):
+    """A room whose wall has an attribute of so many numbers at each vertex or face, none for 0."""
+    wall = mi.load_dict({"type": "cube", "bsdf": bsdf, "id": "wall"})
+    if size:
+        count = {"vertex": wall.vertex_count, "face": wall.face_count}[kind]()
+        wall.add_attribute(f"{kind}_paint", size, [0.4] * (size * count))
+    return {**room(), "wall": wall}
+
+
+def read(kind="vertex"):
+    return {"type": "mesh_attribute", "name": f"{kind}_paint"}
+
+
+GLOSSY = {"type": "roughconductor", "alpha": 0.2}
+MATTE = {"type": "diffuse", "reflectance": 0.5}
+# Of a surface that reads an attribute: the sizes that it takes.
+READING = {
+    "colour": (lambda texture: {"type": "diffuse", "reflectance": texture}, (1, 3)),
+    "colour of a checkerboard": (
+        lambda texture: {"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": texture}}, (1, 3)
+    ),
+    "opacity": (lambda texture: {"type": "mask", "opacity": texture, "nested": MATTE}, (1,)),
+    "weight": (lambda texture: {"type": "blendbsdf", "weight": texture, "a": MATTE, "b": GLOSSY}, (1,)),
+    "roughness": (lambda texture: {"type": "twosided", "a": {"type": "roughconductor", "alpha": texture}}, (1,)),
+    "clearcoat": (lambda texture: {"type": "principled", "clearcoat": texture}, (1,)),
+    "normals": (lambda texture: {"type": "normalmap", "normalmap": texture, "nested": MATTE}, (3,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face"])
+@pytest.mark.parametrize("name", READING)
+def test_attributes_that_a_surface_cannot_read(name, kind):
+    make, sizes = READING[name]
+    for size in (0, 1, 3, 4):
+        params = mi.traverse(mi.load_dict(painted(size, make(read(kind)), kind), optimize=False))
+        if size in sizes:
+            check_textures(params)
+        else:
+            with pytest.raises(SceneError, match=rf"'wall'.*'{kind}_paint'.*zero"):
+                check_textures(params)
+
+
+def test_one_surface_on_two_shapes():
+    """One of them has no such attribute."""
+    bsdf = {"type": "diffuse", "id": "paint", "reflectance": read()}
+    shape = {"type": "cube", "bsdf": {"type": "ref", "id": "paint"}}
+    scene = {"paint": bsdf, **room(), "wall": shape | {"vertex_paint": HEIGHTS | {"type": "uniform"}}}
+    assert tt.load(scene, variant=VARIANT).parameters()
+    with pytest.raises(SceneError, match=r"'side'.*none"):
+        tt.load(scene | {"side": shape}, variant=VARIANT).parameters()
 
 
 # -------------------------------------------------------------------------------------------------------------- lights

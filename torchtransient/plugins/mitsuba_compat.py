@@ -360,6 +360,23 @@ def attribute_name(texture: Any) -> str | None:
     return found.group(1) if found else None
 
 
+# Slots of BSDFs of which Mitsuba reads a single number.
+_SINGLE = frozenset((
+    "opacity", "weight", "alpha", "alpha_u", "alpha_v", "roughness", "anisotropic", "metallic", "spec_trans",
+    "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness", "diff_trans",
+))  # fmt: skip
+
+
+def attribute_sizes(bsdf: Any, slot: str) -> tuple[int, ...]:
+    """How many numbers an attribute of a mesh may have at each place to be read by a BSDF under that name; any other
+    number of them reads as zero, and so does an attribute that a shape does not have.
+    """
+    if normal_texture(bsdf) == slot:
+        return (1,) if is_bump_map(bsdf) else (3,)
+    single = slot in _SINGLE or (slot == "eta" and "Principled" in bsdf.class_name())
+    return (1,) if single else (1, 3)
+
+
 def varies(texture: Any) -> bool:
     """Whether a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say so."""
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")

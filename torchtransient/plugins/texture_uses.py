@@ -1,20 +1,29 @@
 """What textures read, and textures in places where they cannot be read: found before anything is rendered, not inside
 a kernel or never.
 
-A bump map asks for the slope of its texture: of Mitsuba's, bitmaps have one, and what is the same everywhere. A point
-that is sampled on a light knows neither its shape nor its face: attributes of shapes read as zero there.
+A bump map asks for the slope of its texture: of Mitsuba's, bitmaps have one, and what is the same everywhere.
+Attributes that a shape does not have, or of another number of values than a surface asks for, read as zero; so do all
+of them where a point is sampled on a light, which knows neither its shape nor its face.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.mitsuba_compat import attribute_name, is_bump_map, is_dark, normal_texture
+from torchtransient.plugins.mitsuba_compat import (
+    attribute_name,
+    attribute_sizes,
+    has_surface,
+    is_bump_map,
+    is_dark,
+    normal_texture,
+)
+from torchtransient.plugins.mitsuba_parameters import VERTICES
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 
 
@@ -41,6 +50,63 @@ def check_textures(params: Any) -> None:
             _check_heights(node)
         elif isinstance(node, mi.Emitter) and not is_dark(node):
             _check_radiance(node)
+    read: dict[int, list[Read]] = {}
+    for node in params.hierarchy:
+        if isinstance(node, mi.Shape) and has_surface(node):
+            _check_attributes(node, read)
+
+
+class Read(NamedTuple):
+    """An attribute that a surface reads: its name, the texture, the slot that this is for, numbers it may have."""
+
+    name: str
+    texture: Any
+    slot: str
+    sizes: tuple[int, ...]
+
+
+def _check_attributes(shape: Any, known: dict[int, list[Read]]) -> None:
+    """``known``: what is read by surfaces that were looked at before, by their address."""
+    surface = shape.bsdf()
+    if surface is None:
+        return
+    if surface.ptr not in known:
+        known[surface.ptr] = list(_attributes_of(surface))
+    for read in known[surface.ptr]:
+        sizes = attributes_of(shape)
+        said = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
+        if read.name not in sizes:
+            has = ", ".join(map(repr, sizes)) or "none"
+            raise SceneError(
+                f"{said} ({_named(read.texture)}), got a shape that has {has}; Mitsuba would take it for zero. Give "
+                "the shape the attribute, or the surface another texture."
+            )
+        size = sizes[read.name]
+        if size is not None and size not in read.sizes:
+            raise SceneError(
+                f"{said} of size {' or '.join(map(str, read.sizes))} at each place, got one of size {size:g}, which "
+                "Mitsuba would take for zero. Add an attribute of that size (mesh.add_attribute) or give a 'bitmap'."
+            )
+
+
+def _attributes_of(surface: Any) -> Iterator[Read]:
+    for bsdf in (surface, *objects_below(surface, mi.BSDF)):
+        for slot, texture in objects_of(bsdf):
+            for part in (texture, *objects_below(texture, mi.Texture)) if isinstance(texture, mi.Texture) else ():
+                name = attribute_name(part)
+                if name is not None:
+                    yield Read(name, part, slot, attribute_sizes(bsdf, slot))
+
+
+def attributes_of(shape: Any) -> dict[str, float | None]:
+    """The attributes of a shape, by name: how many numbers they have at each place, None where a texture says so."""
+    values, objects = shown_by(shape)
+    found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}
+    for shown in values if isinstance(shape, mi.Mesh) else ():
+        count = {"vertex": shape.vertex_count, "face": shape.face_count}.get(shown.key.partition("_")[0])
+        if count is not None and shown.key not in VERTICES and dr.is_array_v(shown.read(shape)):
+            found[shown.key] = dr.width(shown.read(shape)) / max(count(), 1)
+    return found
 
 
 def _check_heights(bump_map: Any) -> None:

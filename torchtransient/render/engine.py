@@ -26,6 +26,7 @@ from torchtransient.render.build import BuildOptions
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import of_film
 from torchtransient.render.filter_override import temporal_filter
+from torchtransient.render.kernel_errors import named_errors
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
 from torchtransient.render.physics import PhysicsWatch, are_finite, smallest_and_largest
@@ -153,7 +154,7 @@ def _session(job: RenderJob) -> Iterator[_Session]:
         session = _Session(job, slots)
         films = [sensor.film() for sensor in session.sensors]
         try:
-            with temporal_filter(job.temporal_filter, session.integrator, films):
+            with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
                 yield session
         finally:
             try:

@@ -35,7 +35,7 @@ FILTERS = ("polarizer", "retarder", "diff_polarizer", "diff_retarder")
 MIRROR = {"type": "conductor", **bsdfs.METAL}
 # Attributes that nothing reads.
 COORDINATES = ("plate.vertex_texcoords", "group.plate.vertex_texcoords", "lamp.vertex_texcoords")
-COLOURS = ("plate.vertex_color", "group.plate.vertex_color", "lamp.vertex_color")
+COLOURS = tuple(f"{mesh}.vertex_{name}" for mesh in ("plate", "group.plate", "lamp") for name in ("color", "share"))
 # The edges between its facets are silhouettes in a mirror.
 FACETED = ("ellipsoidsmesh",)
 
@@ -199,7 +199,7 @@ def texture_settings() -> Iterator[Setting]:
                     name,
                     slot_name,
                     lambda folder, s=slot, t=texture: _on_a_mesh(folder, s.make(t(s.low, s.high, s.channels))),
-                    (f"plate.bsdf.{slot.key}.", *(COLOURS if name == "mesh_attribute" else ())),
+                    (f"plate.bsdf.{slot.key}.", *(_read_attributes(slot) if name == "mesh_attribute" else ())),
                 )
         for name, spectrum in textures.spectra().items():
             if slot.channels == 3:
@@ -230,6 +230,10 @@ def texture_settings() -> Iterator[Setting]:
     )
     for name, spectrum in textures.spectra().items():
         yield Setting("spectrum", name, "radiance", lambda _, t=spectrum: _spectral_lamp(t), LAMP, SPECTRAL)
+
+
+def _read_attributes(slot: textures.Slot) -> tuple[str, ...]:
+    return ("plate.vertex_color",) if slot.channels == 3 else ("plate.vertex_share",)
 
 
 def _on_a_mesh(folder: Path, bsdf: Description) -> Description:

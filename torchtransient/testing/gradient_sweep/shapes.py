@@ -42,13 +42,14 @@ def write_obj(path: Path) -> Path:
 
 
 def write_ply(path: Path) -> Path:
-    """With a colour at each vertex."""
+    """With a colour and a share at each vertex."""
     vertices, normals, texcoords, faces = grid_mesh()
-    colours = np.random.default_rng(4).uniform(0.3, 0.7, (len(vertices), 3))
-    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v", "r", "g", "b")
+    rng = np.random.default_rng(4)
+    colours, shares = rng.uniform(0.3, 0.7, (len(vertices), 3)), rng.uniform(0.3, 0.6, (len(vertices), 1))
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v", "r", "g", "b", "share_x")
     header = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *(f"property float {n}" for n in names)]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    rows = np.concatenate([vertices, normals, texcoords, colours], axis=1)
+    rows = np.concatenate([vertices, normals, texcoords, colours, shares], axis=1)
     lines = [" ".join(f"{n:.6f}" for n in row) for row in rows] + ["3 " + " ".join(map(str, f)) for f in faces]
     path.write_text("\n".join([*header, *lines]) + "\n", encoding="utf-8")
     return path

@@ -36,7 +36,9 @@ def textures() -> dict[str, Number]:
             "type": "checkerboard", "color0": high, "color1": low, "to_uv": np.diag([4.0, 4.0, 1.0]),
         },
         "volume": _volume,
-        "mesh_attribute": lambda *_: {"type": "mesh_attribute", "name": "vertex_color"},
+        "mesh_attribute": lambda low, high, channels: {
+            "type": "mesh_attribute", "name": "vertex_color" if channels == 3 else "vertex_share",
+        },
         "rawconstant": lambda low, high, _: {"type": "rawconstant", "value": (low + high) / 2},
         "uniform": lambda low, high, _: {"type": "uniform", "value": (low + high) / 2},
     }  # fmt: skip

@@ -1,0 +1,53 @@
+"""What goes wrong while a kernel is traced, as errors of this library: Dr.Jit's loops hide the reason in a chain."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from torchtransient.errors import GradientError, SceneError, TorchTransientError
+
+# Dr.Jit's words for an exception inside a loop or call that it traces, and for forward mode that it cannot do.
+_INSIDE = "encountered an exception"
+_ACROSS = "dr.isolate_grad() scope"
+
+
+@contextmanager
+def named_errors() -> Iterator[None]:
+    """For the time of a render: raise the error of this library that ended it, or one that names the reason."""
+    try:
+        yield
+    except RuntimeError as error:
+        chain = _chain(error)
+        own = next((cause for cause in chain if isinstance(cause, TorchTransientError)), None)
+        if own is error or (own is None and _INSIDE not in str(error)):
+            raise
+        # What is attached must not live on in the frames of a traceback: Dr.Jit would run into it.
+        for cause in chain:
+            traceback.clear_frames(cause.__traceback__)
+        if own is not None:
+            raise own from None
+        raise _named(chain[-1]) from error
+
+
+def _named(reason: BaseException) -> TorchTransientError:
+    words = str(reason).strip().rstrip("!.")
+    if _ACROSS in words:
+        return GradientError(
+            "forward mode: Dr.Jit cannot push the tangent of a value into the calls that read it (known of attributes "
+            "of shapes with one number at each place, read as a roughness or the weight of a lobe). Use reverse mode, "
+            "or a 'bitmap' in the surface itself."
+        )
+    return SceneError(
+        f"the scene cannot be rendered, {type(reason).__name__} while its kernel was built: {words}. A texture or "
+        "volume may have another number of channels than the place that it stands in."
+    )
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    """An exception and its causes, the first reason last."""
+    found = [error]
+    while (below := found[-1].__cause__ or found[-1].__context__) is not None and below not in found:
+        found.append(below)
+    return found
