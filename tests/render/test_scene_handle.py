@@ -375,3 +375,13 @@ def test_lists_that_are_no_row_of_numbers(wrong):
 def test_lists_of_other_plugins_stay_lists():
     node = {"type": "someone_elses_film", "frequencies": [1.0, 2.0, 3.0]}
     assert tt.load({"type": "scene", "film": node})._description.tree["film"]["frequencies"] == [1.0, 2.0, 3.0]
+
+
+def test_meshes_that_cannot_be_merged():
+    """Mitsuba merges meshes of one surface, and stops where their normals point to different sides."""
+    shape = {"type": "cube", "bsdf": {"type": "ref", "id": "paint"}, "to_world": pose(0.0, 0.0, 1.0, 0.1)}
+    paint = {"type": "diffuse", "id": "paint", "reflectance": {"type": "rgb", "value": 0.5}}
+    scene = {"paint": paint, **make_room(), "a": shape, "b": shape | {"flip_normals": True}}
+    loaded, key = tt.load(scene, variant=VARIANT), "paint.reflectance.value"
+    images = [tt.render(loaded, values, spp=64, seed=0).steady for values in ({}, {key: torch.full((3,), 0.5)})]
+    assert float(images[0].sum()) == pytest.approx(float(images[1].sum()), rel=1e-5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from support.gradient_cases.scenes import room
+from support.gradient_cases.scenes import area_light, room
 from torchtransient.errors import SceneError
 from torchtransient.plugins.texture_uses import check_textures
 
@@ -62,6 +62,49 @@ def test_in_a_scene_of_mitsuba(name):
 def test_textures_with_one_are_taken(name):
     renderer = tt.TransientRenderer(tt.load(bumpy(WITH_SLOPE[name]), variant=VARIANT), spp=1)
     assert float(renderer(seed=0).steady.sum()) > 0
+
+
+# ------------------------------------------------------------------------------------------------------------ channels
+
+
+def picture(channels):
+    return {"type": "bitmap", "data": np.full((2, 2, channels), 0.4, np.float32), "raw": True}
+
+
+def grid(channels):
+    volume = {"type": "gridvolume", "data": np.full((2, 2, 2, channels), 0.4, np.float32), "raw": True}
+    return {"type": "volume", "volume": volume}
+
+
+# A scene with the texture, the variant and what is expected instead.
+UNREADABLE = {
+    "colours in a spectral variant": (
+        lambda: room({"type": "diffuse", "reflectance": picture(3)}), "spectral", r"'reflectance'.*a colour.*raw"
+    ),
+    "a lamp in a spectral variant": (
+        lambda: room(light=area_light() | {"emitter": {"type": "area", "radiance": picture(3)}}),
+        "spectral",
+        "'radiance'.*a colour.*raw",
+    ),
+    "normals of one channel": (
+        lambda: room({"type": "normalmap", "normalmap": picture(1), "nested": {"type": "diffuse"}}),
+        "rgb",
+        "'normalmap'.*three numbers",
+    ),
+    "a volume of six": (lambda: room({"type": "diffuse", "reflectance": grid(6)}), "rgb", "'reflectance'.*1 or 3"),
+    "in a twosided": (
+        lambda: room({"type": "twosided", "a": {"type": "diffuse", "reflectance": grid(6)}}), "rgb", "'reflectance'"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_textures_of_other_channels(name):
+    make, kind, words = UNREADABLE[name]
+    with pytest.raises(SceneError, match=words):
+        tt.render(tt.load(make(), variant=f"llvm_ad_{kind}"), spp=1, seed=0)
+    # Nothing of it is left to be traced with other scenes.
+    assert float(tt.render(tt.load(room(), variant=f"llvm_ad_{kind}"), spp=4, seed=0).steady.sum()) > 0
 
 
 # ---------------------------------------------------------------------------------------------------------- attributes

@@ -360,21 +360,29 @@ def attribute_name(texture: Any) -> str | None:
     return found.group(1) if found else None
 
 
-# Slots of BSDFs of which Mitsuba reads a single number.
+# Slots of BSDFs of which Mitsuba reads a single number, and those of BSDFs and emitters of which it reads a spectrum.
 _SINGLE = frozenset((
     "opacity", "weight", "alpha", "alpha_u", "alpha_v", "roughness", "anisotropic", "metallic", "spec_trans",
     "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness", "diff_trans",
 ))  # fmt: skip
+_SPECTRA = frozenset((
+    "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance", "base_color", "k",
+    "transmittance", "radiance", "theta", "delta",
+))  # fmt: skip
+
+
+def read_as(node: Any, slot: str) -> str:
+    """The method of the texture in a slot that a BSDF or emitter calls, empty where that is not known."""
+    if isinstance(node, mi.BSDF) and normal_texture(node) == slot:
+        return "eval_1" if is_bump_map(node) else "eval_3"
+    if slot == "eta":
+        return "eval_1" if "Principled" in node.class_name() else "eval"
+    return "eval_1" if slot in _SINGLE else "eval" if slot in _SPECTRA else ""
 
 
 def attribute_sizes(bsdf: Any, slot: str) -> tuple[int, ...]:
-    """How many numbers an attribute of a mesh may have at each place to be read by a BSDF under that name; any other
-    number of them reads as zero, and so does an attribute that a shape does not have.
-    """
-    if normal_texture(bsdf) == slot:
-        return (1,) if is_bump_map(bsdf) else (3,)
-    single = slot in _SINGLE or (slot == "eta" and "Principled" in bsdf.class_name())
-    return (1,) if single else (1, 3)
+    """How many numbers an attribute of a mesh may have at each place for a BSDF; with others it reads as zero."""
+    return {"eval_1": (1,), "eval_3": (3,)}.get(read_as(bsdf, slot), (1, 3))
 
 
 def varies(texture: Any) -> bool:

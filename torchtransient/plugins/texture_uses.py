@@ -8,6 +8,7 @@ of them where a point is sampled on a light, which knows neither its shape nor i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from torchtransient.plugins.mitsuba_compat import (
     is_bump_map,
     is_dark,
     normal_texture,
+    read_as,
 )
 from torchtransient.plugins.mitsuba_parameters import VERTICES
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
@@ -50,10 +52,39 @@ def check_textures(params: Any) -> None:
             _check_heights(node)
         elif isinstance(node, mi.Emitter) and not is_dark(node):
             _check_radiance(node)
+        if isinstance(node, mi.BSDF | mi.Emitter):
+            _check_channels(node)
     read: dict[int, list[Read]] = {}
     for node in params.hierarchy:
         if isinstance(node, mi.Shape) and has_surface(node):
             _check_attributes(node, read)
+
+
+def _check_channels(node: Any) -> None:
+    """A texture that cannot be read ends the kernels of all scenes that are alive with it."""
+    for slot, texture in objects_of(node):
+        how = read_as(node, slot) if isinstance(texture, mi.Texture) else ""
+        reason = _refusal(texture, how) if how else ""
+        if reason:
+            raise SceneError(
+                f"{node.id()!r}: expected a texture for {slot!r} that can be read as "
+                f"{_READ[how]}, got {_named(texture)}, of which Mitsuba says: {reason}. Give one with that many "
+                "channels, colours in spectral variants without raw=True."
+            )
+
+
+_READ = {"eval_1": "one number", "eval_3": "three numbers", "eval": "a colour"}
+
+
+def _refusal(texture: Any, how: str) -> str:
+    """Why a method of a texture fails, in Mitsuba's words without its pictures of objects; empty where it does not."""
+    try:
+        with dr.suspend_grad():
+            getattr(texture, how)(dr.zeros(mi.SurfaceInteraction3f))
+    except (RuntimeError, TypeError, AttributeError) as error:
+        words = re.sub(r"\w+\[\n.*\n\]", "", str(error), flags=re.DOTALL)
+        return " ".join(words.split()).rstrip("!.")
+    return ""
 
 
 class Read(NamedTuple):
@@ -111,22 +142,12 @@ def attributes_of(shape: Any) -> dict[str, float | None]:
 
 def _check_heights(bump_map: Any) -> None:
     texture = dict(objects_of(bump_map))[normal_texture(bump_map)]
-    reason = _lack_of_slope(texture)
+    reason = _refusal(texture, "eval_1_grad")
     if reason:
         raise SceneError(
             f"{bump_map.id()!r}: expected a texture of heights with a slope in a bumpmap, got {_named(texture)}, of "
             f"which Mitsuba says: {reason}. Give the heights as a raw 'bitmap'."
         )
-
-
-def _lack_of_slope(texture: Any) -> str:
-    """Why a texture has no slope, in Mitsuba's words; empty where it has one."""
-    try:
-        with dr.suspend_grad():
-            texture.eval_1_grad(dr.zeros(mi.SurfaceInteraction3f))
-    except (RuntimeError, TypeError, AttributeError) as error:
-        return str(error).strip().splitlines()[0].rstrip("!.")
-    return ""
 
 
 def _check_radiance(emitter: Any) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -112,6 +112,10 @@ class BuiltScene:
         let_go(contents)
 
 
+# Mitsuba merges meshes of one surface, and stops where their normals are made in different ways.
+_CANNOT_MERGE = "Mesh::merge()"
+
+
 def build(description: Description, variant: str, options: BuildOptions) -> BuiltScene:
     """Instantiate a description under the active variant. Raises ``SceneError`` with file and line where Mitsuba
     knows them.
@@ -148,6 +152,8 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
     except TorchTransientError as error:
         raise type(error)(f"{_location(error.__cause__) or description.name}: {error}") from error
     except (RuntimeError, ValueError, TypeError) as error:
+        if options.merge and _CANNOT_MERGE in str(error):
+            return build(description, variant, replace(options, merge=False))
         text = str(error).replace("While loading string", f"While loading {description.name}")
         raise SceneError(f"{description.name}: Mitsuba could not build the scene. {text}") from error
     return BuiltScene(scene, params, transforms, plugin, placed)

@@ -32,7 +32,7 @@ def named_errors() -> Iterator[None]:
 
 
 def _named(reason: BaseException) -> TorchTransientError:
-    words = str(reason).strip().rstrip("!.")
+    words = " ".join(str(reason).split()).rstrip("!.")
     if _ACROSS in words:
         return GradientError(
             "forward mode: Dr.Jit cannot push the tangent of a value into the calls that read it (known of attributes "
