@@ -72,3 +72,34 @@ def test_a_merged_scene_renders_as_one_that_is_not(room):
     with torch.no_grad():
         found = with_key(seed=0)
     torch.testing.assert_close(found.steady, expected.steady, rtol=0.2, atol=0.02)
+
+
+SHARED = {
+    "bitmap": ({"type": "bitmap", "data": np.full((2, 2, 3), 0.4, np.float32), "raw": True}, "data"),
+    "d65": ({"type": "d65", "scale": 0.4}, "value"),
+}
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("kind", SHARED)
+def test_shared_textures_that_become_other_objects(kind, named):
+    """Their keys are no addresses, and the derivative is that of both places together."""
+    texture, key = SHARED[kind]
+    ref = {"type": "ref", "id": "ours"}
+
+    def room(*surfaces, **more):
+        scene = make_room()
+        for name, reflectance in zip(("wall", "box"), surfaces, strict=True):
+            scene[name] = scene[name] | {"bsdf": {"type": "diffuse", "reflectance": reflectance}}
+        return tt.load({**more, **scene}, variant=VARIANT)
+
+    def slopes(scene, *keys):
+        renderer = tt.TransientRenderer(scene, parameters=list(keys), spp=64, grad_seed="same")
+        renderer(seed=0).steady.sum().backward()
+        return sum(renderer.values[k].grad for k in keys)
+
+    first = {"type": "uniform", "value": 0.2}
+    shared = room(ref, ref, first=first, ours=texture | ({"id": "ours"} if named else {}))
+    apart = room(texture, texture)
+    keys = [f"{name}.bsdf.reflectance.{key}" for name in ("wall", "box")]
+    torch.testing.assert_close(slopes(shared, f"ours.{key}"), slopes(apart, *keys), rtol=1e-4, atol=1e-5)

@@ -29,7 +29,13 @@ from torchtransient.pulses import Pulse
 from torchtransient.render.description import Description
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import all_films, of_plugin, plugins_in_words
-from torchtransient.render.node_names import name_nested, name_nodes, take_merged_apart
+from torchtransient.render.node_names import (
+    name_instantiated,
+    name_nested,
+    name_nodes,
+    names_of_textures,
+    take_merged_apart,
+)
 from torchtransient.render.nodes import (
     check_finite,
     children,
@@ -143,10 +149,12 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
             plugin = "" if integrator is None else state.nodes[integrator].props.plugin_name()
             check_finite(state)
             _forget_queries(state)
+            textures = names_of_textures(state)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
             if not isinstance(scene, mi.Scene):
                 raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
+            name_instantiated(scene, textures)
             params = mi.traverse(scene)
             check_scene(scene, params)
     except TorchTransientError as error:

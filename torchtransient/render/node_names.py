@@ -68,6 +68,31 @@ def name_nodes(state: Any) -> None:
         node.props.set_id(name)
 
 
+def names_of_textures(state: Any) -> list[str]:
+    """Of the textures and volumes that the scene itself holds, for others to refer to, in order."""
+    import mitsuba as mi
+
+    direct = [state.nodes[index] for _, index in children(state, state.root)]
+    return [n.props.id() for n in direct if n.type in (mi.ObjectType.Texture, mi.ObjectType.Volume)]
+
+
+def name_instantiated(scene: Any, names: list[str]) -> None:
+    """Give such textures their names where Mitsuba has made other objects of them (a ``bitmap``, for one): they have
+    lost them, and would be called after their addresses.
+    """
+    import mitsuba as mi
+
+    from torchtransient.plugins.node_walk import objects_of
+
+    held = [value for _, value in objects_of(scene)]
+    taken = {value.id() for value in held}
+    lost = [name for name in names if name not in taken]
+    nameless = [value for value in held if not value.id() and isinstance(value, mi.Texture | mi.Volume)]
+    if len(lost) == len(nameless):
+        for name, value in zip(lost, nameless, strict=True):
+            value.set_id(name)
+
+
 def name_nested(state: Any) -> None:
     """Unique names for materials inside shapes and other materials, so that one of them can be substituted, and for
     nameless shapes inside groups, so that the transform of each is known.
