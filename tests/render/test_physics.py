@@ -117,6 +117,12 @@ def test_ranges_of_what_is_given(room, key, bad, good):
         assert len(messages) == 1 and repr(key) in messages[0] and f"reaches {value:g}:" in messages[0]
 
 
+@pytest.mark.parametrize("metal", ["conductor", "roughconductor", "diff_conductor", "diff_rough_conductor"])
+def test_a_mirror_has_an_index_of_zero(room, metal):
+    room["wall"]["bsdf"] = {"type": metal, "material": "none"} if "diff" not in metal else {"type": metal, "eta": 0.0}
+    assert said(tt.TransientRenderer, loaded(room), spp=1)[1] == []
+
+
 def _filled(scene, key, value):
     return torch.full(scene.parameters()[key].shape, value)
 

@@ -376,7 +376,7 @@ def read_as(node: Any, slot: str) -> str:
     if isinstance(node, mi.BSDF) and normal_texture(node) == slot:
         return "eval_1" if is_bump_map(node) else "eval_3"
     if slot == "eta":
-        return "eval_1" if "Principled" in node.class_name() else "eval"
+        return "eval_1" if "Principled" in node.class_name() + type(node).__name__ else "eval"
     return "eval_1" if slot in _SINGLE else "eval" if slot in _SPECTRA else ""
 
 

@@ -91,7 +91,8 @@ def physical_range(params: Any, key: str) -> PhysicalRange | None:
 
 def _range_in(node: Any, name: str) -> PhysicalRange | None:
     if isinstance(node, mi.BSDF):
-        return OPTICAL if name == "eta" and "Conductor" in node.class_name() else _OF_BSDFS.get(name)
+        is_metal = "Conductor" in node.class_name() + type(node).__name__
+        return OPTICAL if name == "eta" and is_metal else _OF_BSDFS.get(name)
     if isinstance(node, mi.PhaseFunction):
         return {"g": ANISOTROPY, "weight": SHARE}.get(name)
     for kind, ranges in ((mi.Medium, _OF_MEDIA), (mi.Emitter, _OF_EMITTERS), (mi.Sensor, _OF_SENSORS)):
