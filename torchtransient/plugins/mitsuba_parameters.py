@@ -63,6 +63,12 @@ INDEX = ParameterEffect(
     reason="biased where light is refracted: the path length does not follow this index",
     trusted=True,
 )
+# Outside of its first and last wavelength such a spectrum is zero.
+WAVELENGTHS = ParameterEffect(
+    biased=True,
+    reason="biased where the values at the first and last wavelength are not zero: the cut there does not follow",
+    trusted=True,
+)
 # Directions are held fixed while the index moves, so what is seen through the surface stays where it is.
 PRINCIPLED_INDEX = ParameterEffect(moves_length=True, role="index", trusted=True)
 EXCHANGED_INDEX = replace(
@@ -319,6 +325,7 @@ declare_effects("SmoothPlastic", {"eta": VARNISH})
 declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
 declare_effects("Texture", {ANY_KEY: OF_NUMBERS})
+declare_effects("IrregularSpectrum", {"wavelengths": WAVELENGTHS})
 declare_effects("Volume", {ANY_KEY: OF_NUMBERS})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -9,7 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,7 +110,11 @@ class Subject:
     def tangents(self) -> list[Tangent]:
         """The directions that are tried."""
         turns = not self.info.place or self.info.place[0] not in _FIXED_AXES
-        return tangents_of(self.key, self.kind, self.value, turns, self.info.moves_path_length)
+        found = tangents_of(self.key, self.kind, self.value, turns, self.info.moves_path_length)
+        if "spectral" in self.scene.variant and self.key.endswith(".value") and tuple(self.value.shape) == (3,):
+            # Coefficients of a spectral model are of very different sizes: each changes by its own.
+            return [replace(t, direction=t.direction.sign() * self.value.abs()) for t in found]
+        return found
 
 
 def weights_of(film: Any) -> torch.Tensor:
@@ -171,6 +175,10 @@ def tangents_of(key: str, kind: str, value: torch.Tensor, turns: bool = True, mo
         ]
     if name in _SIZES:
         direction = rng.normal(size=shape) * _SIZES[name]
+        if name == "vertex_positions" and len(shape) == 2:
+            # Faces must not come apart: vertices at one place move together.
+            _, first, same = np.unique(value.numpy(), axis=0, return_index=True, return_inverse=True)
+            direction = direction[first[same.reshape(-1)]]
         return [Tangent("random", _tensor(direction), _LENGTH_STEP)]
     size = float(value.double().square().mean().sqrt()) or 1.0
     step = _LENGTH_STEP if moves else _VALUE_STEP
