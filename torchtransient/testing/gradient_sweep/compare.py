@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.errors import GradientError
 from torchtransient.testing.gradient_sweep.measure import Array, Subject, Tangent
 
 # The scale beside which an error is small: a part of the loss with absolute weights, for a change of the parameter by
@@ -207,8 +208,12 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort, both_modes: bool =
     note = ""
     if runs.contradicts and not subject.info.biased:
         runs, note = confirmed_runs(subject, tangent, spp, effort.confirming)
-    reverse = float(runs.reverse[0])
-    forward = subject.forward(tangent.direction, runs.first_seed, spp) if both_modes else reverse
+    reverse = forward = float(runs.reverse[0])
+    if both_modes:
+        try:
+            forward = subject.forward(tangent.direction, runs.first_seed, spp)
+        except GradientError:
+            both_modes, note = False, f"{note}; forward mode is refused".lstrip("; ")
     return Result(
         setting="",
         key=subject.key,

@@ -46,7 +46,8 @@ differences, in scenes in which no silhouette moves. Written by `make sweep`
   is proven.
 - *Contradict*: differs, seed by seed, by more than {SIGMAS} standard errors and more than {TOLERANCE:.0%} of the larger
   of |finite difference| and scale, with fresh seeds again and extrapolated to a step of zero.
-- Forward mode uses the paths of reverse mode; *modes differ* when they disagree by more than rounding.
+- Forward mode uses the paths of reverse mode; *modes differ* when they disagree by more than rounding. A dash: asking
+  for it is an error.
 - *Refused*: the table of parameters says that there is no derivative, and asking for it is an error.
 """
 
