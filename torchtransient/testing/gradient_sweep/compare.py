@@ -206,7 +206,7 @@ def judge(subject: Subject, tangent: Tangent, effort: Effort, both_modes: bool =
     started = time.process_time()
     runs, spp, tangent = resolved_runs(subject, tangent, effort)
     note = ""
-    if runs.contradicts and not subject.info.biased:
+    if runs.contradicts:
         runs, note = confirmed_runs(subject, tangent, spp, effort.confirming)
     reverse = forward = float(runs.reverse[0])
     if both_modes:
