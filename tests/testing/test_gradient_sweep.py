@@ -26,6 +26,7 @@ from torchtransient.testing.gradient_sweep.page import PAGE, page, read_rows, sw
 from torchtransient.testing.gradient_sweep.runner import ResultFile
 from torchtransient.testing.gradient_sweep.settings import all_settings
 from torchtransient.testing.gradient_sweep.stages import between_lights, matte
+from torchtransient.testing.gradient_sweep.worker import for_setting
 
 DOCS = Path(__file__).parents[2] / "docs"
 SETTINGS = {setting.name: setting for setting in all_settings()}
@@ -103,11 +104,17 @@ def listed(rows):
     return keys
 
 
-def test_keys_listed_are_keys_offered(rows, folder):
-    """Of some scenes that have been measured."""
+@pytest.mark.parametrize("name", random.Random(11).sample(sorted(SETTINGS), 12))
+def test_keys_listed_are_keys_offered(rows, folder, name):
+    assert listed(rows).get(name, set()) == offered(SETTINGS[name], folder)
+
+
+@pytest.mark.slow
+def test_all_keys_listed_are_keys_offered(rows, folder):
     found = listed(rows)
-    for name in random.Random(11).sample(sorted(set(found) & set(SETTINGS)), 12):
-        assert found[name] == offered(SETTINGS[name], folder), name
+    for name, setting in SETTINGS.items():
+        assert found.get(name, set()) == offered(setting, folder), name
+    assert set(found) <= set(SETTINGS)
 
 
 # ------------------------------------------------------------------------------------------------- what the page says
@@ -120,6 +127,16 @@ def test_page_and_table_are_those_of_the_data(rows):
 
 def test_nothing_called_correct_contradicts(rows):
     assert [row for row in rows if row["verdict"] in WRONG and not row["biased"]] == []
+
+
+def test_hardly_anything_is_unresolved(rows):
+    """Of the parameters, each of which is decided when it is along one direction."""
+    verdicts = {}
+    for row in rows:
+        if row["verdict"] != "refused":
+            verdicts.setdefault((row["setting"], row["key"]), set()).add(row["verdict"])
+    undecided = [key for key, found in verdicts.items() if found <= {"unresolved", "no effect"}]
+    assert len(undecided) <= 0.05 * len(verdicts), undecided
 
 
 def test_what_is_not_checked_is_said():
@@ -190,6 +207,16 @@ def test_some_parameters_are_differentiated_in_forward_mode_too():
     names = [f"{name}: plate.to_world" for name in SETTINGS]
     assert 0.2 * len(names) < sum(QUICK.in_both_modes(name) for name in names) < 0.5 * len(names)
     assert all(compare.Effort().in_both_modes(name) for name in names)
+
+
+def test_inside_others_poses_have_one_direction():
+    tangents = tangents_of("a.to_world", "transform", torch.eye(4))
+    efforts = {name: for_setting(compare.Effort(), setting) for name, setting in SETTINGS.items()}
+    found = {name: [t.name for t in effort.chosen(tangents)] for name, effort in efforts.items()}
+    assert all((len(names) == 2) == SETTINGS[name].is_bare for name, names in found.items())
+    nested = [names[0] for names in found.values() if len(names) == 1]
+    assert 0.4 < nested.count("translation") / len(nested) < 0.6
+    assert all(len(effort.chosen(tangents[:1])) == 1 for effort in efforts.values())
 
 
 @pytest.mark.parametrize(("value", "sign"), [(0.0, 1), (1.0, -1)])

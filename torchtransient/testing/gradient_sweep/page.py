@@ -97,7 +97,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     measured, settings = {row["setting"] for row in rows}, all_settings()
     if missing := [setting.name for setting in settings if setting.name not in measured]:
         # What they alone hold counts as unchecked.
-        lines += [f"Not measured yet, {len(missing)} of {len(settings)} scenes: {'; '.join(missing)}.", ""]
+        words = f"Without a comparison (no parameters, or not measured yet), {len(missing)} of {len(settings)} scenes"
+        lines += [f"{words}: {'; '.join(missing)}.", ""]
     for kind, title in TITLES.items():
         chosen = [row for row in rows if row["setting"].split(" ")[0] == kind]
         if chosen:
