@@ -39,9 +39,10 @@ def _named(reason: BaseException) -> TorchTransientError:
             "of shapes with one number at each place, read as a roughness or the weight of a lobe). Use reverse mode, "
             "or a 'bitmap' in the surface itself."
         )
+    hint = " A texture or volume may have another number of channels than the place that it stands in."
     return SceneError(
-        f"the scene cannot be rendered, {type(reason).__name__} while its kernel was built: {words}. A texture or "
-        "volume may have another number of channels than the place that it stands in."
+        f"the scene cannot be rendered, {type(reason).__name__} while its kernel was built: {words}."
+        + (hint if isinstance(reason, RuntimeError) else "")
     )
 
 
