@@ -20,7 +20,7 @@ SIGMAS = 3.0
 # sqrt(n) ulp.
 ROUNDING = 2e-3
 # So many cases of each row of the support table are in the default set; the set of slow tests runs the others.
-FIRST = 3
+FIRST = 1
 # So does it run cases of more than a second that need many samples.
 LONG = {
     "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",

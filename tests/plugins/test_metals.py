@@ -66,7 +66,10 @@ ROUGH_METALS = [
 ]
 
 
-@pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, "llvm_ad_spectral_polarized"])
+LONG = pytest.param("llvm_ad_spectral_polarized", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, LONG])
 def test_rough_metal_equals_mitsubas(variant):
     activate(variant)
     si, wo = interaction(directions(1)), directions(2)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
 import torch
 
 import torchtransient as tt
@@ -79,6 +80,7 @@ def test_spawned_data_loader(tmp_path):
     assert result.stdout.strip() == "[(2, 3, 24, 3, 4), (2, 3, 24, 3, 4)] True"
 
 
+@pytest.mark.slow
 def test_distributed_data_parallel_on_two_ranks(tmp_path):
     script = tmp_path / "ddp.py"
     script.write_text(
