@@ -243,7 +243,9 @@ def test_the_plan_of_the_bottle_sees_its_milk(tmp_path):
     torch.testing.assert_close(plan.renderer()(seed=3).transient, plain(seed=3).transient, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if n > 2 else []) for n, name in enumerate(SCENES)]
+)
 def test_a_plan_renders_what_the_plain_integrator_renders(name):
     """Same depth and window, other variant and integrator: the same image mean."""
     description = getattr(tt.scenes, name)(**SCENES[name])

@@ -44,6 +44,7 @@ def test_pickle_travels_to_a_fresh_process(tmp_path, room_scene):
     assert printed == "True 1"
 
 
+@pytest.mark.slow
 def test_spawned_data_loader(tmp_path):
     # A script of its own: spawned workers import the main module anew.
     script = tmp_path / "loader.py"

@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[2] / "training_examples" / "fit_glass_index.py"
 
 
+@pytest.mark.slow
 def test_runs_and_moves_towards_the_truth(tmp_path):
     picture = tmp_path / "curves.png"
     options = {"--steps": 6, "--spp": 1024, "--resolution": 4, "--repetitions": 6, "--output": picture}
