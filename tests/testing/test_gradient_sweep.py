@@ -185,7 +185,8 @@ class Doubled(Subject):
         return 2 * super().reverse(seed, spp)
 
 
-def test_a_wrong_derivative_is_found():
+@pytest.mark.slow
+def test_a_wrong_derivative_is_found(no_leftovers):
     scene = tt.load(between_lights(matte(0.3)), variant="llvm_ad_rgb")
     key = "plate.bsdf.reflectance.value"
     (tangent,) = tangents_of(key, "number", torch.tensor(0.3))
