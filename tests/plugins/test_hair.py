@@ -12,6 +12,7 @@ from scipy import special, stats
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from support.hair_model import scattered
+from support.surface_samples import activate
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.plugins.bsdfs.bessel import scaled_i0
@@ -26,13 +27,6 @@ FIBRES = [
     ((0.05, 0.1), -3.0, 1.8, 1.0),
 ]
 COUNT = 50000
-
-
-def activate(variant):
-    if variant not in mi.variants():
-        pytest.skip(f"{variant} is not installed")
-    mi.set_variant(variant)
-    plugins.sync()
 
 
 @pytest.fixture(autouse=True)

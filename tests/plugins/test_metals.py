@@ -13,7 +13,7 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.cases_metals import slanted
 from support.gradient_cases.scenes import mirror_room, room
-from torchtransient import plugins
+from support.surface_samples import activate, directions, interaction
 from torchtransient.errors import GradientError
 from torchtransient.plugins.mitsuba_compat import METALS, loses_slope_of_metal
 
@@ -21,31 +21,8 @@ MONO, POLARIZED = "llvm_ad_mono", "llvm_ad_mono_polarized"
 LANES = 1000
 
 
-def activate(variant):
-    mi.set_variant(variant)
-    plugins.sync()
-
-
 def number(value):
     return {"type": "uniform", "value": value}
-
-
-def directions(seed):
-    """Directions above and somewhat below the surface, along the normal and next to the surface among them."""
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(-0.2, 1, LANES)
-    z[:3] = 1, 0.999999, 1e-3
-    phi = rng.uniform(0, 2 * np.pi, LANES)
-    s = np.sqrt(1 - z * z)
-    return mi.Vector3f(*np.array([s * np.cos(phi), s * np.sin(phi), z], dtype=np.float32))
-
-
-def interaction(wi):
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
-    si.wi, si.sh_frame, si.uv = wi, mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Point2f(0.5)
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 500, 550, 600)
-    return si
 
 
 def entries(value):
@@ -72,7 +49,7 @@ LONG = pytest.param("llvm_ad_spectral_polarized", marks=pytest.mark.slow)
 @pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, LONG])
 def test_rough_metal_equals_mitsubas(variant):
     activate(variant)
-    si, wo = interaction(directions(1)), directions(2)
+    si, wo = interaction(directions(1, LANES, -0.2)), directions(2, LANES, -0.2)
     u = mi.Point2f(*np.random.default_rng(3).random((2, LANES)).astype(np.float32))
     for metal in ROUGH_METALS[1:4] if mi.is_polarized else ROUGH_METALS:
         ours, theirs = (mi.load_dict({"type": name, **metal}) for name in ("diff_rough_conductor", "roughconductor"))

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
-from torchtransient import plugins
+from support.surface_samples import activate
 from torchtransient.errors import GradientError
 
 CASES = [
@@ -21,13 +21,6 @@ CASES = [
 ]
 LOBES = ("diffuse_reflectance", "specular_reflectance")
 VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized")
-
-
-def activate(variant):
-    if variant not in mi.variants():
-        pytest.skip(f"{variant} is not installed")
-    mi.set_variant(variant)
-    plugins.sync()
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ import pytest
 
 import torchtransient as tt
 from support.gradient_cases.scenes import mirror_room
-from torchtransient import plugins
+from support.surface_samples import activate, directions, interaction
 from torchtransient.errors import GradientError
 from torchtransient.plugins import mitsuba_compat as compat
 
@@ -20,32 +20,9 @@ MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
 LANES = 500
 
 
-def activate(variant):
-    mi.set_variant(variant)
-    plugins.sync()
-
-
 def number(value):
     """A texture of one number; spectral variants take a bare number for a colour."""
     return {"type": "uniform", "value": value} if mi.is_spectral else value
-
-
-def directions(seed, lowest=-1.0):
-    """Directions above ``lowest``, the normal and both sides of it among them."""
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(lowest, 1, LANES)
-    z[:3] = 1, 0.999999, 1e-3
-    phi = rng.uniform(0, 2 * np.pi, LANES)
-    s = np.sqrt(1 - z * z)
-    return mi.Vector3f(*np.array([s * np.cos(phi), s * np.sin(phi), z], dtype=np.float32))
-
-
-def interaction(wi):
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
-    si.wi, si.sh_frame, si.uv = wi, mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Point2f(0.5)
-    if mi.is_spectral:
-        si.wavelengths = mi.UnpolarizedSpectrum(450, 500, 550, 600)
-    return si
 
 
 def entries(value):
@@ -73,7 +50,7 @@ def test_metal_equals_mitsubas(variant):
         ours, theirs = (mi.load_dict({"type": name, **metal}) for name in ("diff_conductor", "conductor"))
         assert list(mi.traverse(ours).keys()) == list(mi.traverse(theirs).keys())
         for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
-            (_, got), (_, expected) = (sampled(bsdf, directions(1), mode) for bsdf in (ours, theirs))
+            (_, got), (_, expected) = (sampled(bsdf, directions(1, LANES), mode) for bsdf in (ours, theirs))
             assert expected.max() > 0.04
             np.testing.assert_allclose(got, expected, atol=5e-6)
 
@@ -88,7 +65,7 @@ def test_thin_element_equals_mitsubas(variant, name):
         "circular": [{}, {"left_handed": True}],
     }[name]
     # Mitsuba's wave plate is right where the axes of its frames lie across the light.
-    wi = mi.Vector3f(0, 0, mi.Float(np.repeat([1.0, -1.0], LANES // 2))) if name == "retarder" else directions(2)
+    wi = mi.Vector3f(0, 0, mi.Float(np.repeat([1.0, -1.0], LANES // 2))) if name == "retarder" else directions(2, LANES)
     for setting in settings:
         pair = [mi.load_dict({"type": plugin, **setting}) for plugin in (f"diff_{name}", name)]
         assert list(mi.traverse(pair[0]).keys()) == list(mi.traverse(pair[1]).keys())
@@ -125,7 +102,7 @@ def test_tilted_half_wave_plate():
 def test_rough_glass_reflects_as_a_rough_metal_without_absorption():
     """Mitsuba's ``roughconductor`` with a real index has the reflected lobe of rough glass, matrices included."""
     activate(MONO)
-    wi, wo = directions(3, 0.0), directions(4, 0.0)
+    wi, wo = directions(3, LANES, 0.0), directions(4, LANES, 0.0)
     for shape in ({"alpha": 0.3, "distribution": "ggx"}, {"alpha_u": 0.1, "alpha_v": 0.5}):
         glass = mi.load_dict({"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, **shape})
         metal = mi.load_dict({"type": "roughconductor", "eta": 1.5, "k": 0.0, **shape})
@@ -259,7 +236,7 @@ ROUGH = [
 def test_rough_metal_equals_mitsubas(variant):
     activate(variant)
     metals = [{"material": "Au", "alpha": 0.3, "distribution": "ggx"}, *([] if mi.is_spectral else ROUGH)]
-    wi, wo = directions(3), directions(4, 0.0)
+    wi, wo = directions(3, LANES), directions(4, LANES, 0.0)
     for metal in metals:
         theirs, ours = (mi.load_dict({"type": name, **metal}) for name in ("roughconductor", "diff_rough_conductor"))
         one, other = mi.traverse(theirs), mi.traverse(ours)

@@ -47,24 +47,29 @@ def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
 
 def check_textures(params: Any) -> None:
     """Raise ``SceneError`` where a built scene (``mi.traverse``) has a texture in a place where it cannot be read."""
+    somewhere = dr.zeros(mi.SurfaceInteraction3f)
     for node in params.hierarchy:
         if isinstance(node, mi.BSDF) and is_bump_map(node):
-            _check_heights(node)
+            _check_heights(node, somewhere)
         elif isinstance(node, mi.Emitter) and not is_dark(node):
             _check_radiance(node)
         if isinstance(node, mi.BSDF | mi.Emitter):
-            _check_channels(node)
+            _check_channels(node, somewhere)
+    shown = {node.ptr for node in params.hierarchy}
+    has_readers = any(isinstance(node, mi.Texture) and attribute_name(node) is not None for node in params.hierarchy)
     read: dict[int, list[Read]] = {}
     for node in params.hierarchy:
-        if isinstance(node, mi.Shape) and has_surface(node):
-            _check_attributes(node, read)
+        surface = node.bsdf() if isinstance(node, mi.Shape) and has_surface(node) else None
+        # Some shapes (ellipsoids) do not show their surface.
+        if surface is not None and (has_readers or surface.ptr not in shown):
+            _check_attributes(node, surface, read)
 
 
-def _check_channels(node: Any) -> None:
+def _check_channels(node: Any, somewhere: Any) -> None:
     """A texture that cannot be read ends the kernels of all scenes that are alive with it."""
     for slot, texture in objects_of(node):
         how = read_as(node, slot) if isinstance(texture, mi.Texture) else ""
-        reason = _refusal(texture, how) if how else ""
+        reason = _refusal(texture, how, somewhere) if how else ""
         if reason:
             raise SceneError(
                 f"{node.id()!r}: expected a texture for {slot!r} that can be read as "
@@ -76,11 +81,11 @@ def _check_channels(node: Any) -> None:
 _READ = {"eval_1": "one number", "eval_3": "three numbers", "eval": "a colour"}
 
 
-def _refusal(texture: Any, how: str) -> str:
+def _refusal(texture: Any, how: str, somewhere: Any) -> str:
     """Why a method of a texture fails, in Mitsuba's words without its pictures of objects; empty where it does not."""
     try:
         with dr.suspend_grad():
-            getattr(texture, how)(dr.zeros(mi.SurfaceInteraction3f))
+            getattr(texture, how)(somewhere)
     except (RuntimeError, TypeError, AttributeError) as error:
         words = re.sub(r"\w+\[\n.*\n\]", "", str(error), flags=re.DOTALL)
         return " ".join(words.split()).rstrip("!.")
@@ -96,11 +101,8 @@ class Read(NamedTuple):
     sizes: tuple[int, ...]
 
 
-def _check_attributes(shape: Any, known: dict[int, list[Read]]) -> None:
+def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) -> None:
     """``known``: what is read by surfaces that were looked at before, by their address."""
-    surface = shape.bsdf()
-    if surface is None:
-        return
     if surface.ptr not in known:
         known[surface.ptr] = list(_attributes_of(surface))
     for read in known[surface.ptr]:
@@ -140,9 +142,9 @@ def attributes_of(shape: Any) -> dict[str, float | None]:
     return found
 
 
-def _check_heights(bump_map: Any) -> None:
+def _check_heights(bump_map: Any, somewhere: Any) -> None:
     texture = dict(objects_of(bump_map))[normal_texture(bump_map)]
-    reason = _refusal(texture, "eval_1_grad")
+    reason = _refusal(texture, "eval_1_grad", somewhere)
     if reason:
         raise SceneError(
             f"{bump_map.id()!r}: expected a texture of heights with a slope in a bumpmap, got {_named(texture)}, of "
