@@ -102,7 +102,7 @@ class AreaOfShape(Guide):
     def draw(self, world, vertex, sampler):
         return self.shape.sample_position(0.0, sampler.next_2d()).p
 
-    def density(self, world, p, q, n, shape, active):
+    def density(self, world, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))
         per_area = solid_angle_over_area(p, q, n, on_it)
         return dr.select(on_it & (per_area > 0), self.per_area / per_area, 0)

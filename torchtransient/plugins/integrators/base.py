@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
@@ -12,7 +13,7 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
-from torchtransient.plugins.integrators.launch import Pass, passes_of
+from torchtransient.plugins.integrators.launch import Pass, laser_count, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
@@ -66,6 +67,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
+    # Whether the laser of a scan lights one position after the other.
+    scans_exhaustively = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -91,7 +94,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
                 f"sensor has {film.class_name()}; change the film's type in the scene."
             )
-        if film.exhaustive_scan:
+        if film.exhaustive_scan and not self.scans_exhaustively:
             raise SceneError(
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
@@ -148,15 +151,17 @@ class TransientIntegrator(mi.CppADIntegrator):
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
-        width = int(film.crop_size()[0])
-        lanes = width * job.rows * job.spp
+        width, lasers = int(film.crop_size()[0]), laser_count(film)
+        lanes = width * job.rows * job.spp * lasers
         sampler.seed(job.seed, lanes)
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp)
+        index, laser = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp), None
+        if film.exhaustive_scan:
+            laser, index = index % lasers, index // lasers
         row = index // width
         column = dr.fma(mi.UInt32(mi.Int32(-width)), row, index)
         row += dr.opaque(mi.UInt32, job.first_row)
 
-        offset, weight = film.sample_offset(sampler.next_2d())
+        offset, weight = self.offset_in_pixel(film, sensor, sampler)
         position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
         # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
         position = position / mi.ScalarVector2f(film.crop_size())
@@ -174,7 +179,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η)
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser)
+
+    def offset_in_pixel(self, film, sensor, sampler):
+        """(offset of a sample from its pixel's centre, weight or None for one)."""
+        return film.sample_offset(sampler.next_2d())
 
     def channel_match(self, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
@@ -188,7 +197,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         first = film.band_layout()[job.band][0]
         pixel = dr.fma(rays.row, width, rays.column)
         in_band = pixel - dr.opaque(mi.UInt32, first * width)
-        return in_band * film.entries_per_pixel(), pixel
+        base = in_band * film.entries_per_pixel()
+        return base if rays.laser is None else film.pixel_base(base, rays.laser), pixel
 
     def first_opl(self, film, rays):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
@@ -199,7 +209,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _walk(self, world, film, rays, sink):
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
-        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η)
+        world.start(rays)
+        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η, rays.leg)
 
     # ----------------------------------------------------------------------------------- entry points
 
@@ -305,7 +316,10 @@ class TransientIntegrator(mi.CppADIntegrator):
         if g_transient is not None:
             flat, offset, strides = self._adjoint_layout(film, g_transient)
             base = rays.row * strides[0] + rays.column * strides[1] + offset
-            transient = (flat, strides[2], strides[3])
+            if rays.laser is not None:
+                row = rays.laser // film.laser_scan_width
+                base += row * strides[2] + (rays.laser - row * film.laser_scan_width) * strides[3]
+            transient = (flat, *strides[-2:])
         block = film.create_adjoint_block(transient, base, steady, match)
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         with dr.resume_grad():
@@ -383,8 +397,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             raise GradientError(
                 f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}."
             )
-        _, w, t, c = expected
-        return g_transient.array, 0, (w * t * c, t * c, c, 1)
+        strides = np.cumprod((1, *expected[:0:-1]))[::-1]
+        return g_transient.array, 0, tuple(int(stride) for stride in strides)
 
     def to_string(self):
         return (

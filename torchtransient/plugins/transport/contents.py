@@ -32,7 +32,7 @@ DAMPING = 0.005
 class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
-    ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
+    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
     shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
     (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
     transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around the sensor
@@ -52,6 +52,7 @@ class SceneContents:
     """
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
+        self.sensor = sensor
         outermost = bsdfs_of_scene(scene)
         met, self.delays = delays_of(outermost)
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))

@@ -53,7 +53,8 @@ class Proposal(Local):
 class Answer(Local):
     """Scattering towards a proposal: ``value`` (what it makes of unpolarized light, in the frame of the segment towards
     the sensor), ``pdf`` (per solid angle, with which the walk would have gone there), ``eta`` (relative index on that
-    side). Not defined where the proposal is not active.
+    side). ``matrix``: that value between the frames of the segment and of the connection, for light that may be
+    polarized. Not defined where the proposal is not active.
     """
 
 
@@ -89,6 +90,9 @@ class Strategy:
 
     def prepare(self, world: Any) -> None:
         """Once a job, outside of traced code, with gradients enabled: what all lanes share."""
+
+    def start(self, world: Any, rays: Any) -> None:
+        """Before every launch, outside of traced code: what is told by the lane (``rays``: its primary rays)."""
 
     def tables(self) -> list[Any]:
         """What ``prepare`` has computed of parameters: attached where they are."""
@@ -176,6 +180,8 @@ class Connection(Strategy):
 
     # Whether all of its light is that of the scene's emitters, so that their box bounds where it can come from.
     light_of_scene_alone = False
+    # Whether it may have an event at the last vertex of a path, from where nothing is connected any more.
+    finds_light = True
 
     def events(self, wanted: Any) -> int:
         """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
@@ -234,12 +240,20 @@ class Guide(Strategy):
 
     share = 0.5
 
+    def share_at(self, depth: Any) -> Any:
+        """Its share of the samples at the vertices number ``depth`` of their paths (UInt32). All shares of a vertex may
+        sum to one only where the guides reach all that the scattering does, and it has no delta lobe.
+        """
+        return self.share
+
     def draw(self, world: Any, vertex: Vertex, sampler: Any) -> Any:
         """A Point3f on a surface."""
         raise NotImplementedError
 
-    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any) -> Any:
-        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``."""
+    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
+        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``.
+        ``primitive``: the number of the shape's triangle, None where it is not known: then it is that of any.
+        """
         raise NotImplementedError
 
 

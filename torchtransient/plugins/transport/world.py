@@ -43,6 +43,7 @@ class World:
         # Only where path lengths change is it asked how surfaces move.
         self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
+        self.finds_light = any(connection.finds_light for connection in self.connections)
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
@@ -64,6 +65,11 @@ class World:
             raise SceneError(
                 f"strategies of an integrator: expected a name of its own for each, not 'walk', got {', '.join(names)}."
             )
+
+    def start(self, rays: Any) -> None:
+        """Tell all strategies of the primary rays of a launch."""
+        for strategy in self.strategies():
+            strategy.start(self, rays)
 
     def strategies(self) -> list[Any]:
         """All strategies, each once."""

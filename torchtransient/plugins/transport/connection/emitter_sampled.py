@@ -22,6 +22,7 @@ class EmitterSampled(Connection):
 
     name = "emitter_sampled"
     light_of_scene_alone = True
+    finds_light = False
 
     def prepare(self, world):
         lights = world.contents.sphere_lights

@@ -1,0 +1,202 @@
+"""``transient_nlos_path``: light around the corner, from a laser spot on a relay wall back to points of the wall."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import SceneError
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.scan_table import (
+    LaserSpots,
+    laser_of,
+    reference_points,
+    targets_of,
+)
+from torchtransient.plugins.integrators import base
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
+from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
+from torchtransient.plugins.transport.scattering.guides.hidden_geometry import HiddenGeometry
+from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
+from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.segment.media import Media
+from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.world import PathSettings
+
+# Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
+AT_WALL, BEYOND = 0.9, 0.25
+
+
+class TransientNLOSPath(base.TransientIntegrator):
+    r"""Time-resolved path tracer for non-line-of-sight scenes (:monosp:`transient_nlos_path`).
+
+    Parameters beside those of :class:`TransientIntegrator`:
+
+    ``capture_type`` (``single`` | ``confocal`` | ``exhaustive``, or 1, 2, 3; single)
+        One laser spot for all scanned points; the spot follows the scanned point; every laser position for every
+        scanned point (the film needs ``exhaustive_scan``).
+    ``account_first_and_last_bounces`` (bool, false)
+        Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
+    ``filter_bounces`` (int, -1)
+        Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
+        corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+    ``filter_depth`` (int, -1)
+        The same, counted as ``max_depth`` is: ``filter_bounces + 1``.
+    ``discard_direct_paths`` (bool, false): leave out light of one bounce.
+    ``nlos_laser_sampling`` (bool, false)
+        Connect every vertex to the laser's spot. Without it lights are sampled as in ``transient_path``, and a laser's
+        spot is found by paths that hit it.
+    ``nlos_hidden_geometry_sampling`` (bool, false)
+        Draw next vertices over the area of the hidden surfaces, weighed against the BSDF's own samples by their
+        densities; points that something hides do not count.
+    ``nlos_hidden_geometry_sampling_do_rroulette`` (bool, false)
+        Share the samples equally between the two everywhere, instead of mostly hidden area at the wall.
+    ``nlos_hidden_geometry_sampling_includes_relay_wall`` (bool, false): draw points of the relay wall, too.
+    ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
+        Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
+        horizontal field of view around the laser's axis.
+
+    ``max_depth`` counts the laser's own way as the last segment, as for lights: 4 for light of three bounces.
+
+    Sensors: ``nlos_capture_meter``, whose samples of a pixel look all at one point, and any other (single captures, and
+    confocal ones, whose spots lie at pixel centres).
+
+    Gradients in both modes as in :class:`TransientIntegrator`.
+    """
+
+    walks_through_media = True
+    scans_exhaustively = True
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        if self.camera_unwarp:
+            raise SceneError(
+                "transient_nlos_path: camera_unwarp is account_first_and_last_bounces here; set that to false instead."
+            )
+        self.capture = capture_type(props.get("capture_type", "single"))
+        self.legs = bool(props.get("account_first_and_last_bounces", False))
+        self.laser_sampling = bool(props.get("nlos_laser_sampling", False))
+        self.hidden_sampling = bool(props.get("nlos_hidden_geometry_sampling", False))
+        self.equal_shares = bool(props.get("nlos_hidden_geometry_sampling_do_rroulette", False))
+        self.samples_wall = bool(props.get("nlos_hidden_geometry_sampling_includes_relay_wall", False))
+        self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
+        self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
+        self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
+        props.get("block_size", 0)
+        self.only_bounces = self._bounces_of(props)
+
+    def _bounces_of(self, props: Any) -> int | None:
+        depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
+        if depth != -1 and bounces != -1:
+            raise SceneError(
+                "transient_nlos_path: filter_depth and filter_bounces say the same; give one of them, got both."
+            )
+        bounces = depth - 1 if depth != -1 else bounces
+        if bounces == -1:
+            return None
+        if bounces < 1:
+            raise SceneError(
+                "transient_nlos_path: filter_bounces: expected -1 or a number >= 1 (filter_depth: >= 2), got "
+                f"{bounces} bounces."
+            )
+        if bounces + 1 > self.max_depth:
+            raise SceneError(
+                f"transient_nlos_path: light of {bounces} bounces has depth {bounces + 1}, which max_depth "
+                f"{self.max_depth} leaves out: the picture would be black. Set max_depth to at least {bounces + 1}."
+            )
+        return bounces
+
+    # ----------------------------------------------------------------------------------- preparation
+
+    def resolve(self, scene: Any, sensor: Any) -> Any:
+        sensor, film = super().resolve(scene, sensor)
+        exhaustive = self.capture is CaptureType.EXHAUSTIVE
+        if exhaustive != film.exhaustive_scan:
+            raise SceneError(
+                f"transient_nlos_path: expected a film with exhaustive_scan = {str(exhaustive).lower()} for capture "
+                f"type {self.capture.name.lower()}, got {str(film.exhaustive_scan).lower()}."
+            )
+        if exhaustive and not self.laser_sampling:
+            raise SceneError("transient_nlos_path: exhaustive captures need nlos_laser_sampling; set it to true.")
+        if self.laser_sampling:
+            laser_of(scene)
+        return sensor, film
+
+    def settings(self) -> PathSettings:
+        # The laser's segment belongs to no vertex of the path where the spot is connected to.
+        most = self.max_depth if self.only_bounces is None else min(self.max_depth, self.only_bounces + 1)
+        if self.laser_sampling and most != base.UNLIMITED:
+            most = max(most - 1, 0)
+        return PathSettings(most, self.rr_depth, bool(self.hide_emitters), self.discards_direct(), not self.legs)
+
+    def discards_direct(self) -> bool:
+        """Whether emission that the sensor sees itself is left out."""
+        return bool(self.discard_direct_light)
+
+    def strategies(self, contents: Any) -> Any:
+        guides = self._guides(contents)
+        in_media = contents.media is not None
+        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (Vacuum(), Surface(guides))
+        return segment, scattering, self._connections(contents)
+
+    def _connections(self, contents: Any) -> list[Any]:
+        if not self.laser_sampling:
+            return [EmitterFound(), EmitterSampled()]
+        sensor, capture = contents.sensor, self.capture
+        fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
+
+        def read_spots(scene: Any) -> LaserSpots:
+            return LaserSpots(scene, laser_of(scene), targets_of(scene, sensor, capture, fov))
+
+        return [LaserSpot(read_spots, self.counts, capture is CaptureType.CONFOCAL, self.legs)]
+
+    def _guides(self, contents: Any) -> list[HiddenGeometry]:
+        if not self.hidden_sampling:
+            return []
+        wall = None if self.samples_wall else contents.sensor.get_shape()
+
+        def read_elements(scene: Any) -> HiddenElements:
+            hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
+            return HiddenElements(hidden, *reference_points(scene, contents.sensor))
+
+        shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
+        return [HiddenGeometry(read_elements, *shares)]
+
+    def counts(self, bounces: Any) -> Any:
+        """Whether light of so many bounces (UInt32) is kept."""
+        kept = mi.Bool(True) if self.only_bounces is None else bounces == self.only_bounces
+        return kept & (bounces > 1) if self.discard_direct_paths else kept
+
+    # ----------------------------------------------------------------------------------- primary rays
+
+    def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
+        if hasattr(sensor, "targets"):  # a scan looks at points
+            return mi.Point2f(0), None
+        return super().offset_in_pixel(film, sensor, sampler)
+
+    def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
+        rays = super().start(scene, contents, sensor, film, job)
+        pixel = rays.row * int(film.crop_size()[0]) + rays.column
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
+        return rays
+
+
+def capture_type(given: Any) -> CaptureType:
+    """A capture type by its number or name. Raises SceneError."""
+    if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
+        names = {c.name.lower(): c for c in CaptureType}
+        if given.lower() in names:
+            return names[given.lower()]
+    elif int(given) in (c.value for c in CaptureType):
+        return CaptureType(int(given))
+    raise SceneError(
+        f"transient_nlos_path: capture_type: expected single, confocal or exhaustive (or 1, 2, 3), got {given!r}."
+    )
+
+
+register("integrator", "transient_nlos_path", TransientNLOSPath)

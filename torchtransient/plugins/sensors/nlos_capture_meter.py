@@ -1,0 +1,129 @@
+"""``nlos_capture_meter``: a sensor that scans points of a relay wall, one for each pixel of its film."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
+
+
+class NLOSCaptureMeter(mi.Sensor):
+    r"""Scans a relay wall (:monosp:`nlos_capture_meter`): a child of the wall's shape, or with ``points`` anywhere.
+
+    ``sensor_origin`` (point, (0, 0, 0))
+        Where the sensor stands, metres.
+    ``points`` (array (N, 3) or (H, W, 3); none)
+        The scanned points, in the order of the film's pixels. Without them pixel (i, j) of a film of W x H scans the
+        point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H), so that no two pixels share one.
+    ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
+        Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
+        ``transient_nlos_path`` says.
+    ``original_film_width``, ``original_film_height`` (int; none)
+        Read for scenes of mitransient 1.x that scan confocally one point at a time: the size of the whole scan, of
+        which a film of one pixel is the point ``laser_lookat_pixel``.
+    ``film`` (``transient_hdr_film`` or another film of this library)
+
+    Every sample of a pixel looks along the same ray, so spatial filters do not spread it. A pixel measures the radiance
+    that leaves its point towards the sensor.
+
+    Differentiable: ``sensor_origin``, ``points`` and ``laser_points`` (the rays follow; what they meet decides where
+    the points are).
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.origin = mi.Point3f(mi.ScalarPoint3f(props.get("sensor_origin", mi.ScalarPoint3f(0))))
+        self.points = _points_of(props, "points")
+        self.laser_points = _points_of(props, "laser_points")
+        for old in _IGNORED:
+            props.get(old, None)
+        self._check()
+        dr.make_opaque(self.origin)
+
+    def _check(self) -> None:
+        size = self.film().size()
+        if self.points is not None and dr.width(self.points) != size[0] * size[1]:
+            raise SceneError(
+                f"nlos_capture_meter: expected one of 'points' for each of the film's {size[0]} x {size[1]} pixels, "
+                f"got {dr.width(self.points)}. Set the film's width and height to the scan's."
+            )
+
+    def traverse(self, cb: Any) -> None:
+        super().traverse(cb)
+        cb.put("sensor_origin", self.origin, mi.ParamFlags.Differentiable)
+        for name in ("points", "laser_points"):
+            if getattr(self, name) is not None:
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+    def world_transform(self) -> Any:
+        """The sensor's place, for the frame that polarization is told in: upright, as the world is."""
+        return mi.Transform4f().translate(self.origin)
+
+    def targets(self, pixel: Any) -> Any:
+        """The scanned points (Point3f) of pixels, given by their index in the film."""
+        if self.points is not None:
+            return dr.gather(mi.Point3f, self.points, pixel)
+        shape = self.get_shape()
+        if shape is None:
+            raise SceneError(
+                "nlos_capture_meter: expected a shape to scan or 'points', got neither. Put the sensor into the relay "
+                "wall's shape, or give the points."
+            )
+        size = self.film().size()
+        row = pixel // int(size[0])
+        column = pixel - row * int(size[0])
+        place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
+        return shape.sample_position(0.0, place).p
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        film = self.film()
+        size, crop = film.size(), film.crop_size()
+        cell = mi.Vector2u(dr.clip(mi.Vector2i(dr.floor(sample2 * mi.ScalarVector2f(crop))), 0, mi.Vector2i(crop) - 1))
+        cell += mi.Vector2u(film.crop_offset())
+        target = self.targets(cell.y * int(size[0]) + cell.x)
+        wavelengths, weight = [], mi.Spectrum(1)
+        if mi.is_spectral:
+            wavelengths, weight = mi.sample_rgb_spectrum(mi.sample_shifted(sample1))
+            weight = mi.unpolarized_spectrum(weight)
+        ray = mi.RayDifferential3f(mi.Ray3f(self.origin, dr.normalize(target - self.origin), time, wavelengths))
+        return ray, weight
+
+    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        return self.sample_ray(time, sample1, sample2, sample3, active)
+
+    def bbox(self) -> Any:
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self) -> str:
+        return f"NLOSCaptureMeter[\n  sensor_origin = {self.origin},\n  film = {self.film()}\n]"
+
+
+# What scenes for mitransient 1.x may hold beside: the clock's first and last leg are the integrator's affair there,
+# too, and its laser is the scene's emitter.
+_IGNORED = ("account_first_and_last_bounces", "confocal", "laser_origin", "laser_lookat_pixel")
+
+
+def _points_of(props: Any, name: str) -> Any:
+    """An array of points of a sensor's properties as a Point3f in memory, None where there is none."""
+    if name not in props:
+        return None
+    values = np.asarray(props[name], dtype=np.float32)
+    if values.size == 0 or values.shape[-1] != 3 or not np.isfinite(values).all():
+        raise SceneError(
+            f"nlos_capture_meter: expected {name} as finite points of shape (N, 3) or (H, W, 3) in metres, got shape "
+            f"{values.shape}."
+        )
+    points = mi.Point3f(np.ascontiguousarray(values.reshape(-1, 3).T))
+    dr.make_opaque(points)
+    return points
+
+
+register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
+_PLACE = ParameterEffect(moves_length=True, role="sensor")
+declare_effects(NLOSCaptureMeter, dict.fromkeys(("sensor_origin", "points", "laser_points"), _PLACE))
