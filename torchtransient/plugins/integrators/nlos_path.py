@@ -14,6 +14,7 @@ from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
     reference_points,
+    sensor_targets,
     targets_of,
 )
 from torchtransient.plugins.integrators import base
@@ -46,7 +47,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
         corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
     ``filter_depth`` (int, -1)
-        The same, counted as ``max_depth`` is: ``filter_bounces + 1``.
+        ``filter_bounces + 1``, as in mitransient.
     ``discard_direct_paths`` (bool, false): leave out light of one bounce.
     ``nlos_laser_sampling`` (bool, false)
         Connect every vertex to the laser's spot. Without it lights are sampled as in ``transient_path``, and a laser's
@@ -61,7 +62,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
 
-    ``max_depth`` counts the laser's own way as the last segment, as for lights: 4 for light of three bounces.
+    ``max_depth`` is the largest number of bounces with ``nlos_laser_sampling``: 3 for light around one corner, as in
+    mitransient. Without it the light's own way is a segment more, as in ``transient_path``.
 
     Sensors: ``nlos_capture_meter``, whose samples of a pixel look all at one point, and any other (single captures, and
     confocal ones, whose spots lie at pixel centres).
@@ -104,10 +106,11 @@ class TransientNLOSPath(base.TransientIntegrator):
                 "transient_nlos_path: filter_bounces: expected -1 or a number >= 1 (filter_depth: >= 2), got "
                 f"{bounces} bounces."
             )
-        if bounces + 1 > self.max_depth:
+        depth = bounces if self.laser_sampling else bounces + 1
+        if depth > self.max_depth:
             raise SceneError(
-                f"transient_nlos_path: light of {bounces} bounces has depth {bounces + 1}, which max_depth "
-                f"{self.max_depth} leaves out: the picture would be black. Set max_depth to at least {bounces + 1}."
+                f"transient_nlos_path: light of {bounces} bounces has depth {depth}, which max_depth {self.max_depth} "
+                f"leaves out: the picture would be black. Set max_depth to at least {depth}."
             )
         return bounces
 
@@ -128,15 +131,16 @@ class TransientNLOSPath(base.TransientIntegrator):
         return sensor, film
 
     def settings(self) -> PathSettings:
-        # The laser's segment belongs to no vertex of the path where the spot is connected to.
-        most = self.max_depth if self.only_bounces is None else min(self.max_depth, self.only_bounces + 1)
-        if self.laser_sampling and most != base.UNLIMITED:
-            most = max(most - 1, 0)
-        return PathSettings(most, self.rr_depth, bool(self.hide_emitters), self.discards_direct(), not self.legs)
-
-    def discards_direct(self) -> bool:
-        """Whether emission that the sensor sees itself is left out."""
-        return bool(self.discard_direct_light)
+        # The light's own way is a segment where lights are sampled, and none where its spot is.
+        light = 0 if self.laser_sampling else 1
+        first, last = 2 if self.discard_direct_paths else 0, None
+        if self.only_bounces is not None:
+            first = last = self.only_bounces
+        most = self.max_depth if last is None else last + light
+        least = first + light if first else 0
+        return PathSettings(
+            most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
+        )
 
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
@@ -153,7 +157,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         def read_spots(scene: Any) -> LaserSpots:
             return LaserSpots(scene, laser_of(scene), targets_of(scene, sensor, capture, fov))
 
-        return [LaserSpot(read_spots, self.counts, capture is CaptureType.CONFOCAL, self.legs)]
+        return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
     def _guides(self, contents: Any) -> list[HiddenGeometry]:
         if not self.hidden_sampling:
@@ -167,11 +171,6 @@ class TransientNLOSPath(base.TransientIntegrator):
         shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
         return [HiddenGeometry(read_elements, *shares)]
 
-    def counts(self, bounces: Any) -> Any:
-        """Whether light of so many bounces (UInt32) is kept."""
-        kept = mi.Bool(True) if self.only_bounces is None else bounces == self.only_bounces
-        return kept & (bounces > 1) if self.discard_direct_paths else kept
-
     # ----------------------------------------------------------------------------------- primary rays
 
     def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
@@ -182,8 +181,19 @@ class TransientNLOSPath(base.TransientIntegrator):
     def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
         rays = super().start(scene, contents, sensor, film, job)
         pixel = rays.row * int(film.crop_size()[0]) + rays.column
+        if hasattr(sensor, "targets") and contents.media is None:
+            rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
         rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
         return rays
+
+
+def _scanned(scene: Any, sensor: Any) -> Any:
+    """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
+    origin = mi.Point3f(dr.detach(sensor.origin))
+    targets = dr.detach(sensor_targets(sensor))
+    found = scene.ray_intersect_preliminary(mi.Ray3f(origin, dr.normalize(targets - origin)), coherent=True)
+    dr.eval(found)
+    return found
 
 
 def capture_type(given: Any) -> CaptureType:

@@ -173,8 +173,8 @@ class Segment(Strategy):
 class Connection(Strategy):
     """Light that is found at a vertex, or that a vertex is connected to.
 
-    What a connection owes: it keeps to ``vertex.goes_on`` and ``vertex.connectable``, asks ``world.counted`` before it
-    traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
+    What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``world.deep_enough``, asks
+    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
     ``vertex.η * answer.eta``.
     """
 

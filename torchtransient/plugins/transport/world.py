@@ -15,13 +15,16 @@ from torchtransient.plugins.transport.instances import AttachedSurfaces
 
 @dataclass(frozen=True)
 class PathSettings:
-    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`."""
+    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
+    of smaller depths do not count.
+    """
 
     max_depth: int
     rr_depth: int
     hide_emitters: bool
     discard_direct_light: bool
     camera_unwarp: bool
+    min_depth: int = 0
 
 
 class World:
@@ -35,7 +38,7 @@ class World:
 
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
         self.scene, self.contents, self.wanted = scene, contents, wanted
-        self.max_depth, self.rr_depth = settings.max_depth, settings.rr_depth
+        self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
@@ -88,6 +91,10 @@ class World:
     def index_changes(self) -> bool:
         """Whether paths can run in media of different indices of refraction, or through delta lobes."""
         return self.contents.delta or self.contents.refraction is not None
+
+    def deep_enough(self, active: Any, depth: Any) -> Any:
+        """Which events of depth ``depth`` (UInt32) count."""
+        return active if self.min_depth == 0 else active & (depth >= self.min_depth)
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
         """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""

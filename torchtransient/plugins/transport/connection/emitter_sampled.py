@@ -52,7 +52,7 @@ class EmitterSampled(Connection):
     # ------------------------------------------------------------------------------------------------- primal
 
     def propose(self, world, path, vertex, sampler):
-        active = vertex.goes_on & vertex.connectable
+        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         u = sampler.next_2d()
         ds, weight = self.sample(world, vertex.at, u, active)
         active &= ds.pdf != 0

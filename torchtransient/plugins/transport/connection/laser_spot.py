@@ -26,16 +26,16 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 class LaserSpot(Connection):
     """Light that was scattered once by a laser spot.
 
-    ``read_spots()``: the :class:`~torchtransient.plugins.around_corner.scan_table.LaserSpots` of the job. ``counts``:
-    whether events of so many bounces are wanted (a function of UInt32, the spot counted as the first). ``confocal``:
-    each path ends at the spot that it started from. ``legs``: the way from the laser to the spot counts.
+    ``read_spots(scene)``: the :class:`~torchtransient.plugins.around_corner.scan_table.LaserSpots` of the job.
+    ``confocal``: each path ends at the spot that it started from. ``legs``: the way from the laser to the spot counts.
+    An event's depth is its number of bounces: the laser's own way is no segment of the path.
     """
 
     name = "laser_spot"
     finds_light = False
 
-    def __init__(self, read_spots, counts, confocal, legs):
-        self.read_spots, self.counts, self.confocal, self.legs = read_spots, counts, confocal, legs
+    def __init__(self, read_spots, confocal, legs):
+        self.read_spots, self.confocal, self.legs = read_spots, confocal, legs
         self.spots, self.index = None, None
 
     def prepare(self, world):
@@ -73,7 +73,7 @@ class LaserSpot(Connection):
     # ------------------------------------------------------------------------------------------------- primal
 
     def propose(self, world, path, vertex, sampler):
-        active = vertex.goes_on & vertex.connectable & self.counts(path.depth + 2)
+        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         spot = self.spot(vertex.at.wavelengths, active)
         to = spot.p - vertex.at.p
         dist = dr.norm(to)
@@ -97,7 +97,7 @@ class LaserSpot(Connection):
             test = active & (path.depth != 1)
         seen, T = world.segment.transmittance(world, vertex, ds, proposal.u, sampler=proposal.sampler, active=test)
         active = (active & ~test) | seen
-        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 3, T=T)
+        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
 
     def leg(self, active):
         """Length from the laser to the spot, where it counts."""
