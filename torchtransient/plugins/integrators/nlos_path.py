@@ -23,6 +23,7 @@ from torchtransient.plugins.transport.connection.emitter_found import EmitterFou
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
 from torchtransient.plugins.transport.scattering.guides.hidden_geometry import HiddenGeometry
+from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
 from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.media import Media
@@ -145,7 +146,8 @@ class TransientNLOSPath(base.TransientIntegrator):
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
         in_media = contents.media is not None
-        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (Vacuum(), Surface(guides))
+        surface = Lambertian if Lambertian.fits(contents) else Surface
+        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (Vacuum(), surface(guides))
         return segment, scattering, self._connections(contents)
 
     def _connections(self, contents: Any) -> list[Any]:

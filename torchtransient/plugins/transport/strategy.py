@@ -246,8 +246,8 @@ class Guide(Strategy):
         """
         return self.share
 
-    def draw(self, world: Any, vertex: Vertex, sampler: Any) -> Any:
-        """A Point3f on a surface."""
+    def draw(self, world: Any, vertex: Vertex, u: Any) -> Any:
+        """A Point3f on a surface for two uniform numbers (Point2f)."""
         raise NotImplementedError
 
     def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:

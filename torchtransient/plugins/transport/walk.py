@@ -104,6 +104,8 @@ def roulette(world, path, vertex, step, sampler, goes_on, zeros):
         β_max = dr.select(β_max == 0, 1, β_max)
     else:
         goes_on &= β_max != 0
+    if not world.plays_roulette:
+        return β, goes_on, mi.Float(1)
     chance = dr.minimum(β_max * dr.square(path.η * step.eta), 0.95)
     plays = path.depth >= world.rr_depth
     rr = dr.select(plays, dr.rcp(chance), 1)

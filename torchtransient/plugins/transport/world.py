@@ -47,6 +47,8 @@ class World:
         self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self.finds_light = any(connection.finds_light for connection in self.connections)
+        # Where paths end before they would be thinned out, no number is drawn for it.
+        self.plays_roulette = self.finds_light or self.max_depth > self.rr_depth + 2
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)

@@ -127,11 +127,13 @@ class Surface(Scattering):
     # ------------------------------------------------------------------------------------------------- guides
 
     def _follow_guides(self, world, path, vertex, step, sampler):
-        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``."""
+        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``. Of the scattering's own sample
+        and those of the guides one is used: they share the numbers of the direction.
+        """
         u, below, own = sampler.next_1d(), 0.0, self.own_share(path.depth)
         step.guided, step.point = u < 1 - own, mi.Point3f(vertex.at.p)
         for guide in self.guides:
-            point, share = guide.draw(world, vertex, sampler), guide.share_at(path.depth)
+            point, share = guide.draw(world, vertex, step.u_dir), guide.share_at(path.depth)
             chosen = (u >= below) & (u < below + share)
             step.point = dr.select(chosen, point, step.point)
             below += share

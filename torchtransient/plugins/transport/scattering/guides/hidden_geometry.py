@@ -30,8 +30,8 @@ class HiddenGeometry(Guide):
     def share_at(self, depth):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
 
-    def draw(self, world, vertex, sampler):
-        point, _ = self.elements.draw(sampler.next_2d(), vertex.goes_on)
+    def draw(self, world, vertex, u):
+        point, _ = self.elements.draw(u, vertex.goes_on)
         return point
 
     def density(self, world, p, q, n, shape, active, primitive=None):
