@@ -1,0 +1,211 @@
+"""Points drawn on hidden geometry: where they lie, how often, and with which density."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.hidden_shapes import join, mannequin, mesh, plate, scene_of, wall_grid
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+
+VARIANT = "llvm_ad_rgb"
+COUNT = 1 << 14
+
+
+def turned(*scale):
+    return mi.ScalarTransform4f().translate([0.1, -0.2, 1.3]).rotate([1 / 3, 2 / 3, 2 / 3], 200).scale(list(scale))
+
+
+# Shape, its area. Spheres and cylinders take no other transforms.
+SHAPES = {
+    "rectangle": ({"type": "rectangle", "to_world": (0.5, 1.5, 2.0)}, 4 * 0.75),
+    "mirrored rectangle": ({"type": "rectangle", "to_world": (-0.5, 1.5, 2.0)}, 4 * 0.75),
+    "flipped rectangle": ({"type": "rectangle", "to_world": (0.5, 1.5, 1.0), "flip_normals": True}, 4 * 0.75),
+    "disk": ({"type": "disk", "to_world": (0.5, 1.5, 2.0)}, np.pi * 0.75),
+    "mirrored disk": ({"type": "disk", "to_world": (0.5, -1.5, 1.0)}, np.pi * 0.75),
+    "flipped disk": ({"type": "disk", "to_world": (0.5, 0.5, 1.0), "flip_normals": True}, np.pi * 0.25),
+    "sphere": ({"type": "sphere", "to_world": (0.5, 0.5, 0.5)}, np.pi),
+    "flipped sphere": ({"type": "sphere", "to_world": (0.5, 0.5, 0.5), "flip_normals": True}, np.pi),
+    "mirrored sphere": ({"type": "sphere", "to_world": (-0.5, -0.5, -0.5)}, np.pi),
+    "cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, 2.0)}, 2 * np.pi),
+    "flipped cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, 2.0), "flip_normals": True}, 2 * np.pi),
+    "mirrored cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, -2.0)}, 2 * np.pi),
+    "cube": ({"type": "cube", "to_world": (0.5, 1.0, 2.0)}, 8 * (0.5 + 1 + 2)),
+}  # fmt: skip
+
+
+def random_points(count, seed=3):
+    return mi.Point2f(np.random.default_rng(seed).random((2, count)).astype(np.float32))
+
+
+def shape_of(name):
+    description, area = SHAPES[name]
+    return mi.load_dict(description | {"to_world": turned(*description["to_world"])}), area
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_draws_lie_on_the_shape_with_its_normals(name):
+    shape, area = shape_of(name)
+    scene = scene_of(shape)
+    table = HiddenElements([shape], *wall_grid(3))
+    p, n = table.draw(random_points(COUNT))
+    length = 1e-2
+    ray = dr.zeros(mi.Ray3f, COUNT)
+    ray.o, ray.d = mi.Point3f(p + length * mi.Vector3f(n)), -mi.Vector3f(n)
+    ray.maxt = mi.Float(1)
+    si = scene.ray_intersect(ray)
+    # A ray along a rim may pass by it.
+    hit = np.array(si.is_valid())
+    assert hit.mean() > 0.999
+    assert np.abs(np.array(si.t)[hit] - length).max() < 2e-6
+    assert np.abs(np.array(dr.dot(si.n, n))[hit] - 1).max() < 1e-5
+    density = table.per_area(si.shape, si.prim_index)
+    # The mean of one over the density is the area, without noise where there is one element.
+    inverse = 1 / np.array(density, dtype=float)[hit]
+    assert abs(inverse.mean() - area) < 4 * inverse.std() / COUNT**0.5 + 2e-3 * area * (hit.mean() < 1) + 1e-5 * area
+
+
+@pytest.mark.parametrize("name", ["disk", "sphere", "cylinder", "rectangle"])
+def test_draws_are_uniform_over_an_element(name):
+    """Mean and second moments of a uniform density, by Mitsuba's own points (which are right in place)."""
+    shape, _ = shape_of(name)
+    table = HiddenElements([shape], *wall_grid(3), defensive=1.0)
+    u = random_points(1 << 16)
+    ours = np.array(table.draw(u)[0], dtype=float)
+    theirs = np.array(shape.sample_position(0.0, u).p, dtype=float)
+    error = np.sqrt((ours.var(1) + theirs.var(1)) / ours.shape[1])
+    assert np.all(np.abs(ours.mean(1) - theirs.mean(1)) < 4 * error)
+    spread = [(x - x.mean(1, keepdims=True)) ** 2 for x in (ours, theirs)]
+    error = np.sqrt(sum(s.var(1) for s in spread) / ours.shape[1])
+    assert np.all(np.abs(spread[0].mean(1) - spread[1].mean(1)) < 4 * error)
+
+
+def scene_with_many():
+    shapes = [
+        mesh("body", mannequin(1)), mesh("plate", plate(0.5, 0.5, (0, 0, 2.0), 3), two_sided=True),
+        mi.load_dict({"type": "sphere", "center": [0.4, 0.4, 0.7], "radius": 0.1}),
+        mi.load_dict({"type": "disk", "to_world": turned(0.3, 0.2, 1)}),
+    ]  # fmt: skip
+    return shapes, scene_of(*shapes)
+
+
+def test_frequencies_are_the_densities_and_densities_integrate_to_one():
+    shapes, _ = scene_with_many()
+    points, normals = wall_grid(5)
+    tiles = np.stack([points, points + np.array([2.0, 0, 0])])
+    table = HiddenElements(shapes, tiles, np.stack([normals] * 2))
+    elements = len(table.elements)
+    for tile in (0, 1):
+        lane = mi.UInt32(tile)
+        number = dr.arange(mi.UInt32, elements)
+        shape, primitive = table.surface(number)
+        density = np.array(table.per_area(shape, primitive, True, lane), dtype=float)
+        assert density == pytest.approx(np.array(table.density_of(number, True, lane)), rel=1e-4)
+        p = density * table.elements.area
+        assert p.sum() == pytest.approx(1, rel=1e-6)
+        x = (mi.Float64(dr.arange(mi.UInt32, 1 << 18)) + 0.5) / 2**18
+        found, rest = table.select_element(x, True, lane)
+        count = np.bincount(np.array(found), minlength=elements)
+        # Equidistant points: every interval has its share of them, to one.
+        assert np.abs(count - p * 2**18).max() < 2
+        assert dr.min(rest)[0] >= 0 and dr.max(rest)[0] < 1
+    assert not np.allclose(table._probabilities(tiles[:1], normals[None], 0.1), p)
+
+
+def test_probabilities_are_those_of_the_formula():
+    """One by one, of triangles whose centre is all that counts."""
+    front, back = plate(0.2, 0.2, (0.1, 0, 1.0), 2), plate(0.2, 0.2, (0.1, 0, 1.5), 2)
+    back = back[0], back[1][:, ::-1]
+    shapes = [mesh("front", front), mesh("back", back), mesh("both", (back[0] + [0, 0, 1], back[1]), two_sided=True)]
+    points, normals = wall_grid(2)
+    table = HiddenElements(shapes, points, normals)
+    expected, area = [], []
+    for shape, primitive in zip(table.elements.shape, table.elements.primitive, strict=True):
+        v = np.array(shapes[shape].vertex_positions_buffer(), dtype=float).reshape(-1, 3)
+        a, b, c = v[np.array(shapes[shape].faces_buffer()).reshape(-1, 3)[primitive]]
+        n = np.cross(b - a, c - a) / 2
+        area.append(np.linalg.norm(n))
+        d = points - (a + b + c) / 3
+        r = np.linalg.norm(d, axis=1)
+        cos = d @ n / area[-1] / r
+        cos = np.abs(cos) if shape == 2 else np.maximum(cos, 0)
+        expected.append(area[-1] * np.sqrt(np.mean((cos**2 * (d[:, 2] / r) ** 2 / r**4) ** 2)))
+    expected, area = np.array(expected), np.array(area)
+    expected = 0.9 * expected / expected.sum() + 0.1 * area / area.sum()
+    x = np.array(table.density_of(dr.arange(mi.UInt32, len(area))), dtype=float) * area
+    assert x == pytest.approx(expected, rel=1e-5)
+    turned_away = table.elements.shape == 1
+    assert x[turned_away] == pytest.approx(0.1 * area[turned_away] / area.sum(), rel=1e-5)
+
+
+def test_what_is_not_in_the_table_has_no_density():
+    shapes, _ = scene_with_many()
+    wall = mi.load_dict({"type": "rectangle"})
+    table = HiddenElements(shapes[:1], *wall_grid(3))
+    for other in (wall, *shapes[1:]):
+        assert dr.all(table.per_area(mi.ShapePtr(other), mi.UInt32(0)) == 0)
+    assert dr.all(table.per_area(dr.zeros(mi.ShapePtr, 2), mi.UInt32(0)) == 0)
+    assert dr.all(table.per_area(mi.ShapePtr(shapes[0]), mi.UInt32(0), mi.Mask(False)) == 0)
+
+
+def test_copies_of_groups_are_named():
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "group": {"type": "shapegroup", "inner": {"type": "sphere"}},
+            "copy": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
+            "plate": {"type": "rectangle"},
+        }
+    )
+    shapes = scene.shapes()
+    table = HiddenElements(shapes, *wall_grid(3))
+    assert table.left_out == ["copy"] and len(table.elements) == 2
+    with pytest.raises(SceneError, match="copy"):
+        HiddenElements([s for s in shapes if s.id() == "copy"], *wall_grid(3))
+
+
+def test_triangles_without_area_are_dropped():
+    v, f = plate(1, 1, (0, 0, 1))
+    flat = mesh("m", (v, np.concatenate([[[0, 0, 1]], f])))
+    table = HiddenElements([flat], *wall_grid(3))
+    assert len(table.elements) == 2
+    density = np.array(table.per_area(mi.ShapePtr(flat), mi.UInt32([0, 1, 2])))
+    assert density[0] == 0 and density[1] == pytest.approx(1, rel=1e-5)
+    with pytest.raises(SceneError):
+        HiddenElements([mesh("n", (v, f[:, [0, 0, 1]]))], *wall_grid(3))
+
+
+def test_elements_that_face_no_wall_point_are_drawn_by_area():
+    v, f = join(plate(1, 1, (0, 0, 1)), plate(1, 3, (0, 0, 2)))
+    table = HiddenElements([mesh("m", (v, f[:, ::-1]))], *wall_grid(3))
+    assert np.array(table.density_of(dr.arange(mi.UInt32, 4))) == pytest.approx(1 / 4, rel=1e-6)
+
+
+def test_kernels_do_not_depend_on_values_and_sizes():
+    """One kernel for tables of other shapes: sizes and probabilities are arrays in memory."""
+    u = random_points(64)
+    dr.eval(u)
+    kernels = []
+    for level in (0, 1, 2):
+        table = HiddenElements([mesh("m", mannequin(level))], *wall_grid(3))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(table.draw(u))
+            kernels += [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(set(kernels)) == 1
+
+
+def test_arguments_are_checked():
+    shape = mesh("m", plate(1, 1, (0, 0, 1)))
+    points, normals = wall_grid(2)
+    with pytest.raises(ShapeError, match="match"):
+        HiddenElements([shape], points, normals[:1])
+    with pytest.raises(ShapeError, match="finite"):
+        HiddenElements([shape], points * np.nan, normals)
+    with pytest.raises(UnitError, match="defensive"):
+        HiddenElements([shape], points, normals, defensive=0)
+    as_mitsuba = HiddenElements([shape], mi.Point3f(points.T), mi.Normal3f(normals.T))
+    assert (
+        as_mitsuba.density_of(mi.UInt32(0))[0] == HiddenElements([shape], points, normals).density_of(mi.UInt32(0))[0]
+    )

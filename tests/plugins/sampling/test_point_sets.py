@@ -1,0 +1,42 @@
+"""Scrambled points: a net for powers of two, unbiased for all numbers."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from torchtransient.plugins.sampling.point_sets import plane_points
+
+VARIANT = "llvm_ad_mono"
+
+
+def points(count, seed):
+    x, y = plane_points(count, dr.opaque(mi.UInt32, seed))
+    return np.array(x), np.array(y, dtype=float)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345])
+def test_a_power_of_two_is_a_net(seed):
+    """Every box of area 1 / 256 with edges of powers of two holds one of 256 points."""
+    x, y = points(256, seed)
+    for bits in range(9):
+        box = np.floor(x * 2**bits) * 2 ** (8 - bits) + np.floor(y * 2 ** (8 - bits))
+        assert sorted(box) == list(range(256))
+    assert np.all(np.diff(x) > 0) and x.min() > 0 and x.max() < 1 and y.min() > 0 and y.max() < 1
+
+
+@pytest.mark.parametrize("count", [1, 7, 64])
+def test_every_point_is_uniform_and_means_are_unbiased(count):
+    """Over seeds: the mean of a function that no grid gets right."""
+    values = []
+    for seed in range(400):
+        x, y = points(count, seed)
+        values.append(np.mean(np.sqrt(x) * y**3 + (x > 0.3) * (y < 0.7)))
+    error = np.std(values, ddof=1) / 20
+    assert abs(np.mean(values) - (2 / 3 / 4 + 0.7 * 0.7)) < 4 * error
+
+
+def test_other_seeds_are_other_points():
+    a, b = points(64, 1), points(64, 2)
+    # The strata stay where they are; what is random lies within them, and in the order of the second coordinate.
+    assert np.abs(np.corrcoef(a[0] * 64 % 1, b[0] * 64 % 1)[0, 1]) < 0.4 and not np.array_equal(a[1], b[1])

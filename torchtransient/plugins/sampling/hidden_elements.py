@@ -1,0 +1,204 @@
+"""Points on hidden geometry, drawn by what single-corner light makes of it: the density and the shared samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.plugins.pointer_table import PointerTable, registry_number
+from torchtransient.plugins.sampling.area_elements import (
+    CYLINDER,
+    TRIANGLE,
+    AreaElements,
+    facing_weight,
+    has_shading_normals,
+    local_point,
+    morton_order,
+)
+from torchtransient.plugins.sampling.packed import packed
+
+# Share of the draws that goes by plain area: what the weight gives too little (light that arrives after further
+# bounces, a wall point near an element) is found all the same.
+DEFENSIVE = 0.1
+
+
+class HiddenElements:
+    """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`.
+
+    The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
+    (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
+    ``(P, 3)``: wall points, some 5 x 5 over the scan; ``(tiles, P, 3)`` gives each tile of a scan a density of its own,
+    which pays where geometry is nearer than half the scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
+
+    The albedo does not enter. ``left_out`` names the shapes that are not in the table (copies of shape groups, curves,
+    signed distances, ellipsoids): nothing is ever drawn on them, so that whoever samples this density alone has to
+    refuse them. Elements without area are dropped. ``smooth``: whether some shape has normals that are interpolated.
+
+    A plain class: its arrays are constants of kernels, which do not depend on their values and sizes. It describes the
+    shapes as they are when it is built. Raises SceneError where nothing has an area, ShapeError, UnitError.
+    """
+
+    def __init__(self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE) -> None:
+        if not 0 < defensive <= 1:
+            raise UnitError(f"HiddenElements: defensive is a share in (0, 1], got {defensive!r}.")
+        points, normals = _tiles_of(points, "points"), _tiles_of(normals, "normals")
+        if points.shape != normals.shape:
+            raise ShapeError(
+                f"HiddenElements: points and normals of the wall have to match, got {points.shape} and {normals.shape}."
+            )
+        every = AreaElements.of(shapes)
+        self.left_out = every.left_out
+        some = np.flatnonzero(every.area > 0)
+        if not len(some):
+            raise SceneError(
+                "HiddenElements: expected shapes with a surface to draw points on, got "
+                f"{len(shapes)} without any; left out: {', '.join(self.left_out) or 'none'}."
+            )
+        order = some[morton_order(every.centers()[some])]
+        self.shapes, self.elements = list(shapes), every.take(order)
+        self.tile_count = len(points)
+        self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
+        p = self._probabilities(points, normals, defensive)
+        self._lay_out(p)
+        self._by_primitive(every, order, p)
+
+    # ----------------------------------------------------------------------------------------- tables
+
+    def _probabilities(self, points: np.ndarray, normals: np.ndarray, defensive: float) -> np.ndarray:
+        """(tiles, elements)"""
+        area = self.elements.area / self.elements.area.sum()
+        p = []
+        for q, n in zip(points, normals, strict=True):
+            w = facing_weight(self.elements, q, n)
+            total = w.sum()
+            # What faces no wall point at all is drawn by its area.
+            p.append((1 - defensive) * w / total + defensive * area if total > 0 else area)
+        return np.array(p)
+
+    def _lay_out(self, p: np.ndarray) -> None:
+        e = self.elements
+        self.kinds = tuple(int(k) for k in np.unique(e.kind))
+        cdf = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
+        self._cdf = mi.Float64((cdf / cdf[:, -1:]).ravel())
+        # [origin, n.x][axis, n.y][axis, n.z][axis, kind]: loaded four numbers at a time.
+        rows = np.concatenate([e.axes, np.concatenate([e.normal, e.kind[:, None]], 1)[:, :, None]], axis=2)
+        self._rows = packed(rows)
+        self._area = mi.Float(e.area.astype(np.float32))
+        self._shape, self._primitive = mi.UInt32(e.shape.astype(np.uint32)), mi.UInt32(e.primitive.astype(np.uint32))
+        self._count = mi.UInt32(len(e))
+        self._pointers = mi.UInt32([registry_number(shape) for shape in self.shapes])
+        dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count, self._pointers)
+
+    def _by_primitive(self, every: AreaElements, order: np.ndarray, p: np.ndarray) -> None:
+        """The density by shape and primitive."""
+        density = np.zeros((len(p), len(every)), dtype=np.float32)
+        density[:, order] = p / every.area[order]
+        self._density = mi.Float(density.ravel())
+        self._stride = mi.UInt32(len(every))
+        dr.make_opaque(self._density, self._stride)
+        listed, first = np.unique(every.shape.astype(int), return_index=True)
+        # One more than the place of the shape's first element: zero is what is not in the table.
+        self._first = PointerTable([self.shapes[s] for s in listed], [1 + int(f) for f in first])
+
+    # ---------------------------------------------------------------------------------------- in kernels
+
+    def draw(self, u: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
+        """A point and the geometric normal there (``Point3f``, ``Normal3f``) for two random numbers (``Point2f``) of
+        each lane; ``tile`` (``UInt32``): of which tile's density, the first where None.
+        """
+        element, a = self.select_element(mi.Float64(u.x), active, tile)
+        return self.point(element, a, u.y, active)
+
+    def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
+        """An element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number: uniform in
+        [0, 1) again.
+        """
+        row = mi.UInt32(0) if tile is None else tile * (self._count + 1)
+        element = _search(self._cdf, row, self._count, x, active)
+        low = dr.gather(mi.Float64, self._cdf, row + element, active)
+        high = dr.gather(mi.Float64, self._cdf, row + element + 1, active)
+        rest = mi.Float((x - low) / (high - low))
+        return element, dr.clip(rest, 0, 1 - dr.epsilon(mi.Float))
+
+    def point(self, element: Any, a: Any, y: Any, active: Any = True) -> tuple[Any, Any]:
+        """The point of an element for two numbers in [0, 1), and the geometric normal there."""
+        first, axes = self._row(element, 0, active), [self._row(element, i, active) for i in (1, 2)]
+        n = mi.Vector3f(first.w, axes[0].w, axes[1].w)
+        p = mi.Vector3f(first.x, first.y, first.z)
+        curved = self.kinds != (TRIANGLE,)
+        kind = None
+        if curved:
+            axes.append(self._row(element, 3, active))
+            kind = mi.UInt32(axes[2].w)
+        x = local_point(kind, a, y, dr, self.kinds)
+        offset = mi.Vector3f(0)
+        for weight, axis in zip(x, axes, strict=False):
+            offset = dr.fma(mi.Vector3f(axis.x, axis.y, axis.z), weight, offset)
+        if curved:
+            along = dr.select(kind == CYLINDER, x[2], 0) * mi.Vector3f(axes[2].x, axes[2].y, axes[2].z)
+            n = dr.select(kind < 2, n, (offset - along) * n.x)
+        return mi.Point3f(p + offset), mi.Normal3f(n)
+
+    def per_area(self, shape: Any, prim_index: Any, active: Any = True, tile: Any = None) -> Any:
+        """Density per unit area (``Float``) at a point of a shape (``ShapePtr``) and primitive (``UInt32``); 0 for what
+        is not in the table.
+        """
+        first = self._first.look_up(shape, active)
+        listed = mi.Mask(active) & (first > 0)
+        index = first - 1 + prim_index
+        if tile is not None:
+            index += tile * self._stride
+        return dr.gather(mi.Float, self._density, index, listed)
+
+    def coordinates(self, element: Any, a: Any, y: Any, active: Any = True) -> Any:
+        """Where Mitsuba's interactions place the point of two numbers on an element: barycentrics of triangles, the
+        point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
+        """
+        kind = None if self.kinds == (TRIANGLE,) else mi.UInt32(self._row(element, 3, active).w)
+        x = local_point(kind, a, y, dr, self.kinds)
+        return mi.Point2f(x[0], x[1])
+
+    def density_of(self, element: Any, active: Any = True, tile: Any = None) -> Any:
+        """Density per unit area of an element of the table, ``Float``."""
+        row = mi.UInt32(0) if tile is None else tile * (self._count + 1)
+        low = dr.gather(mi.Float64, self._cdf, row + element, active)
+        high = dr.gather(mi.Float64, self._cdf, row + element + 1, active)
+        return mi.Float(high - low) / dr.gather(mi.Float, self._area, element, active)
+
+    def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:
+        """Shape (``ShapePtr``) and primitive (``UInt32``) of an element of the table."""
+        number = dr.gather(mi.UInt32, self._pointers, dr.gather(mi.UInt32, self._shape, element, active), active)
+        return dr.reinterpret_array(mi.ShapePtr, number), dr.gather(mi.UInt32, self._primitive, element, active)
+
+    def _row(self, element: Any, number: int, active: Any) -> Any:
+        return dr.gather(mi.Vector4f, self._rows, element * 4 + number, active)
+
+
+@dr.syntax
+def _search(cdf, row, count, x, active):
+    """Number of the interval of a cumulative distribution that ``x`` falls into."""
+    low, high = mi.UInt32(0), mi.UInt32(count - 1)
+    while dr.hint(mi.Mask(active) & (low < high), label="element search"):
+        middle = (low + high) >> 1
+        above = dr.gather(mi.Float64, cdf, row + middle + 1) <= x
+        low = dr.select(above, middle + 1, low)
+        high = dr.select(above, high, middle)
+    return low
+
+
+def _tiles_of(values: Any, name: str) -> np.ndarray:
+    """An array ``(tiles, P, 3)``, float64."""
+    array = np.array(values, dtype=np.float64)
+    if dr.is_array_v(values) and not dr.is_tensor_v(values):
+        array = array.T
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape or not np.isfinite(array).all():
+        raise ShapeError(
+            f"HiddenElements: expected finite {name} of the wall, (P, 3) or (tiles, P, 3), got {array.shape}."
+        )
+    return array

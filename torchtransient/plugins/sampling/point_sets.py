@@ -1,0 +1,39 @@
+"""Scrambled low-discrepancy points in the plane, in integer arithmetic of kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+def scrambled(x: Any, seed: Any) -> Any:
+    """Owen's nested uniform scrambling of 32-bit fractions by a hash: every bit is flipped by a function of the bits
+    above it (Laine and Karras 2011, Burley 2020; constants of Vegdahl 2021).
+    """
+    x = dr.brev(x)
+    x ^= x * mi.UInt32(0x3D20ADEA)
+    x += seed
+    x *= (seed >> 16) | 1
+    x ^= x * mi.UInt32(0x05526C56)
+    x ^= x * mi.UInt32(0x53A22864)
+    return dr.brev(x)
+
+
+def plane_points(count: int, seed: Any) -> tuple[Any, Any]:
+    """``count`` points of the unit square, (``Float64``, ``Float``), in ascending order of the first coordinate.
+
+    Hammersley's set, the first coordinate shifted at random within ``1 / count``, the second one scrambled: every point
+    is uniform by itself, so that means are unbiased, and with a power of two the points are a (0, m, 2)-net as those of
+    Sobol's sequence are. What is sorted by the first coordinate needs no sorting afterwards. ``seed``: UInt32 of width
+    one, in memory.
+    """
+    j = dr.arange(mi.UInt32, count)
+    shift, key = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0x9E3779B9))
+    jitter, _ = mi.sample_tea_32(j, shift)
+    total = dr.opaque(mi.Float64, float(count))
+    # The middle of the last bit keeps both coordinates inside of (0, 1).
+    x = (mi.Float64(j) + (mi.Float64(jitter) + 0.5) * 2.0**-32) / total
+    y = mi.Float(scrambled(dr.brev(j), key) >> 8) * 2.0**-24 + 2.0**-25
+    return x, y

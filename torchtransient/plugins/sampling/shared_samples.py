@@ -1,0 +1,115 @@
+"""Points on hidden geometry that all scan points share, with what a diffuse surface scatters there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import SceneError, UnitError, VariantError
+from torchtransient.plugins.node_walk import objects_of
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.sampling.point_sets import plane_points
+
+# A launch has a lane per sample, and chunks of it are numbered in 32 bits.
+MAX_SAMPLES = 2**26
+
+
+@dataclass
+class SharedSamples:
+    """``count`` points, in the order of the elements of ``HiddenElements`` (neighbours stand together).
+
+    ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
+    false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
+    and of the other one; ``weight`` (``Float``): one over ``count`` times the density per area, so that a mean over the
+    area is a sum over samples; ``element`` (``UInt32``): number in the table; ``shape``, ``primitive``, ``u``
+    (``Point2f``): the material point, the same for other positions of the shape.
+    """
+
+    count: int
+    p: Any
+    n: Any
+    geometric_n: Any
+    front: Any
+    back: Any
+    weight: Any
+    element: Any
+    shape: Any
+    primitive: Any
+    u: Any
+    smooth: bool
+
+
+def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = None) -> SharedSamples:
+    """``count`` samples of the hidden geometry's density; ``seed``: UInt32 of width one, in memory, or a whole number.
+    ``tile``: number of the tile whose density is drawn from.
+
+    Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
+    and VariantError in spectral and polarized variants, where a sample has no colour of its own.
+    """
+    if not 1 <= count <= MAX_SAMPLES:
+        raise UnitError(f"draw_samples: expected 1 to {MAX_SAMPLES} samples, got {count!r}.")
+    if mi.is_spectral or mi.is_polarized:
+        raise VariantError(
+            f"draw_samples: shared samples hold a colour, which variant {mi.variant()} has not; expected a mono or RGB "
+            "variant without polarization. Use the general path integrator."
+        )
+    others = not_diffuse([elements.shapes[s] for s in set(elements.elements.shape.astype(int))])
+    if others:
+        raise SceneError(
+            "draw_samples: expected surfaces of 'diffuse', or of 'twosided' around it, got "
+            f"{'; '.join(others)}. Use the general path integrator."
+        )
+    tile = None if tile is None else mi.UInt32(tile)
+    seed = mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed) % 2**32)
+    x, y = plane_points(count, seed)
+    element, a = elements.select_element(x, tile=tile)
+    p, n = elements.point(element, a, y)
+    shape, primitive = elements.surface(element)
+    si = _interaction(elements, element, p, n, a, y)
+    weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
+    smooth = elements.smooth
+    samples = SharedSamples(
+        count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
+        front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
+        element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
+    )  # fmt: skip
+    dr.eval(samples)
+    return samples
+
+
+def not_diffuse(shapes: list[Any]) -> list[str]:
+    """Names of the shapes, with their BSDFs, that scatter light in another way than a Lambertian surface."""
+    found = {}
+    for shape in shapes:
+        bsdf = shape.bsdf()
+        # Mixtures and normal maps, too, report diffuse lobes only.
+        name = bsdf.class_name()
+        nested = [bsdf] if name == "SmoothDiffuse" else _held(bsdf) if name == "TwoSidedBRDF" else []
+        if not nested or any(part.class_name() != "SmoothDiffuse" for part in nested):
+            found[shape.id()] = f"{shape.id() or shape.class_name()} ({name})"
+    return list(found.values())
+
+
+def _held(bsdf: Any) -> list[Any]:
+    return [value for _, value in objects_of(bsdf) if isinstance(value, mi.BSDF)]
+
+
+def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
+    """What Mitsuba says of the points: shading frame, texture coordinates."""
+    pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
+    pi.shape, pi.prim_index = elements.surface(element)
+    pi.valid, pi.t = mi.Mask(True), mi.Float(1)
+    pi.prim_uv = elements.coordinates(element, a, y)
+    ray = dr.zeros(mi.Ray3f, dr.width(p))
+    ray.o, ray.d = mi.Point3f(p + mi.Vector3f(n)), -mi.Vector3f(n)
+    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def _scattered(si: Any, side: float) -> Any:
+    """Albedo over pi of one side."""
+    si = mi.SurfaceInteraction3f(si)
+    si.wi = mi.Vector3f(0, 0, side)
+    return mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, side)))
