@@ -26,6 +26,7 @@ from torchtransient.plugins.transport.scattering.guides.hidden_geometry import H
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
 from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.segment.material import MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.world import PathSettings
@@ -147,7 +148,10 @@ class TransientNLOSPath(base.TransientIntegrator):
         guides = self._guides(contents)
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
-        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (Vacuum(), surface(guides))
+        # Instances, and what Mitsuba leaves detached, are attached along rays alone.
+        along_rays = contents.instances is not None or contents.detached_hits is not None
+        vacuum = Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
+        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (vacuum(), surface(guides))
         return segment, scattering, self._connections(contents)
 
     def _connections(self, contents: Any) -> list[Any]:

@@ -41,7 +41,7 @@ class SceneContents:
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own;
-    ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
+    ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
     instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
@@ -69,6 +69,7 @@ class SceneContents:
         self.sphere_lights = SphereLights.of(scene)
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
+        self.meshes = PointerTable.marking([s for s in scene.shapes() if has_vertices(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())

@@ -163,6 +163,13 @@ class Segment(Strategy):
         """
         raise NotImplementedError
 
+    def motion(self, world: Any, vertex: Any, following: Any, ahead: Any) -> Any:
+        """How the segment from an attached ``vertex`` to the one that is ``following`` it moves where that one lies
+        ``ahead`` (mask): attached ``d``, ``J``, ``drag`` and ``longer()`` as a
+        :class:`.scattering.geometry_terms.DampedMotion` has them.
+        """
+        raise NotImplementedError
+
     def attached_transmittance(self, world: Any, vertex: Any, connected: Any, active: Any) -> Any:
         """One with the derivative of the logarithm of the transmittance towards ``connected``: Local with attached
         ``p``, detached ``d``, ``far``, and ``ahead`` (whether the segment is the one to the next vertex).

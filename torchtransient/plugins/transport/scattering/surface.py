@@ -16,7 +16,6 @@ from torchtransient.plugins.polarized import (
     scatter_unpolarized,
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
 
@@ -254,9 +253,7 @@ class Surface(Scattering):
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            volume, δ = world.segment.has_no_normal(following), displacement(si.p, smooth)
-            radius = vertex.damping_radius
-            motion = damped_motion(δ, out, following.t, following.n, ahead, radius, volume=volume)
+            motion = world.segment.motion(world, vertex, following, ahead)
             out, J, drag = motion.d, motion.J, motion.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
