@@ -16,6 +16,7 @@ from torchtransient.interfaces import CaptureType
 SAME_PLACE = 1e-3
 # Wall points along each side of a scan that stand for all of it in densities.
 ACROSS = 5
+_FIELDS = ("p", "n", "sh_frame", "uv", "dp_du", "dp_dv")
 
 
 class LaserSpots:
@@ -36,14 +37,18 @@ class LaserSpots:
             dr.eval(pi)
         si = pi.compute_surface_interaction(self.ray, mi.RayFlags.All)
         _check_hit(np.array(pi.t), "laser")
-        self.si, self.length = si, dr.norm(si.p - self.origin)
+        self.length = dr.norm(si.p - self.origin)
+        # What lanes read of it and may be attached, see :meth:`arrays`; its other fields are told by the lanes.
+        self.si = dr.detach(si)
+        for name in _FIELDS:
+            setattr(self.si, name, getattr(si, name))
         dr.eval(self.si, self.length, self.ray, self.origin)
 
     def arrays(self) -> list[Any]:
         """What is attached where the scene's parameters are."""
-        si = self.si
-        return [si.p, si.n, si.sh_frame.n, si.sh_frame.s, si.sh_frame.t, si.uv, si.dp_du, si.dp_dv, self.length,
-                self.ray.d]  # fmt: skip
+        frame = self.si.sh_frame
+        fields = [getattr(self.si, name) for name in _FIELDS if name != "sh_frame"]
+        return [*fields, frame.s, frame.t, frame.n, self.length, self.ray.d]
 
     def energy(self, wavelengths: Any, index: Any, cos: Any, active: Any) -> Any:
         """What falls on a spot, per colour, and per cosine ``cos`` of the beam there (UnpolarizedSpectrum).
