@@ -185,7 +185,7 @@ def points(given=LIST, **changes):
         (lambda: scan("single", sensor_origin="left"), ShapeError, "three numbers"),
         (lambda: Scan.grid(WALL, 0, kind="single"), ShapeError, "at least 1"),
         (lambda: Scan.grid(WALL, 1, kind="exhaustive"), SceneError, "grid of one point"),
-        (lambda: points(LIST + [0, 0, 0.1], wall=WALL), SceneError, "3 of 3"),
+        (lambda: points(LIST + np.array([0, 0, 0.1]), wall=WALL), SceneError, "3 of 3"),
         (lambda: points(laser_points=LIST), SceneError, "laser_points has no meaning"),
         (lambda: points(kind="single"), SceneError, "expected laser_points"),
         (lambda: points(kind="single", laser_points=LIST), ShapeError, r"\(3,\), the one spot"),

@@ -115,7 +115,7 @@ def test_no_ray_slips_between_triangles():
 
 def test_the_first_triangle_counts():
     plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]])
-    corners = np.stack([plate, plate + [0, 0, 0.5], plate - [0, 0, 1.0]])
+    corners = np.stack([plate, plate + np.array([0, 0, 0.5]), plate - np.array([0, 0, 1.0])])
     distance, index = first_hits(np.array([[0.5, -0.5, 2.0], [-0.5, 0.5, 2.0]]), np.array([0.0, 0, -1]), corners)
     assert index.tolist() == [1, -1]
     assert distance.tolist() == [1.5, np.inf]

@@ -75,6 +75,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
         "torchtransient.plugins.integrators.volpath",
         (("integrator", "transient_prbvolpath"), ("integrator", "transient_volpath")),
     ),
+    PluginModule("torchtransient.plugins.shapes.mesh_arrays", (("shape", "mesh_arrays"),)),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.emitters.directional_area", (("emitter", "diff_directionalarea"),)),
     PluginModule("torchtransient.plugins.bsdfs.dielectric", (("bsdf", "diff_dielectric"),)),
