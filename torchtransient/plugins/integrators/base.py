@@ -67,8 +67,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
-    # Whether the laser of a scan lights one position after the other.
+    # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
     scans_exhaustively = False
+    aims_lasers = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -104,6 +105,12 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
                 "media of the scene's shapes and sensors."
+            )
+        beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
+        if beams and not self.aims_lasers:
+            raise SceneError(
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film

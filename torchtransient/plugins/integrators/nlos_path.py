@@ -48,6 +48,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
         corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+    ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
         ``filter_bounces + 1``, as in mitransient.
     ``discard_direct_paths`` (bool, false): leave out light of one bounce.
@@ -92,7 +93,13 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
         self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
         props.get("block_size", 0)
+        self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
+        if self.min_bounces > (self.max_depth if self.only_bounces is None else self.only_bounces):
+            raise SceneError(
+                f"transient_nlos_path: min_bounces {self.min_bounces} leaves out everything up to max_depth "
+                f"{self.max_depth} or filter_bounces; the picture would be black."
+            )
 
     def _bounces_of(self, props: Any) -> int | None:
         depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
@@ -132,10 +139,15 @@ class TransientNLOSPath(base.TransientIntegrator):
             laser_of(scene)
         return sensor, film
 
+    @property
+    def aims_lasers(self) -> bool:
+        """Whether beams without width are seen."""
+        return self.laser_sampling
+
     def settings(self) -> PathSettings:
         # The light's own way is a segment where lights are sampled, and none where its spot is.
         light = 0 if self.laser_sampling else 1
-        first, last = 2 if self.discard_direct_paths else 0, None
+        first, last = max(2 if self.discard_direct_paths else 0, self.min_bounces), None
         if self.only_bounces is not None:
             first = last = self.only_bounces
         most = self.max_depth if last is None else last + light
