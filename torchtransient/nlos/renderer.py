@@ -10,14 +10,15 @@ from torch import nn
 
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
-from torchtransient.nlos.scene import LASER, SENSOR, WALL, capture_scene, film_size, laser_size
+from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import load
 
 # Where the points of a scan stand in the scene.
-POINTS, SPOTS, ORIGIN = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points", f"{WALL}.{SENSOR}.sensor_origin"
+POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
+ORIGIN, LASER_ORIGIN = f"{WALL}.{SENSOR}.sensor_origin", f"{WALL}.{SENSOR}.laser_origin"
 
 
 class CaptureRenderer(nn.Module):
@@ -81,13 +82,9 @@ class CaptureRenderer(nn.Module):
 
 def _attached(scan: Scan) -> dict[str, torch.Tensor]:
     """The points of a scan that require gradients, by their keys in the scene."""
-    points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin}
+    points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin, LASER_ORIGIN: scan.laser_origin}
     if scan.kind != "confocal":
         points[SPOTS] = scan.laser_points
-    if scan.laser_origin.requires_grad:
-        raise SceneError(
-            f"scan: gradients in laser_origin are not supported; give the parameter '{LASER}.to_world' instead."
-        )
     listed = {key: value if value.ndim == 1 else value.reshape(-1, 3) for key, value in points.items()}
     return {key: value for key, value in listed.items() if value.requires_grad}
 

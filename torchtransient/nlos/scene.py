@@ -49,6 +49,7 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy
     sensor: dict[str, Any] = {
         "type": "nlos_capture_meter",
         "sensor_origin": _numbers(scan.sensor_origin).tolist(),
+        "laser_origin": _numbers(scan.laser_origin).tolist(),
         "points": _numbers(scan.sensor_points).reshape(-1, 3),
         "sampler": {"type": "independent"},
         "film": film,
@@ -71,7 +72,7 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy
     return {
         "type": "scene",
         _INTEGRATOR: integrator,
-        LASER: {"type": "laser_beam", "to_world": _at(_numbers(scan.laser_origin)), "energy": energy},
+        LASER: {"type": "laser_beam", "energy": energy},
         WALL: dict(scan.wall) | {SENSOR: sensor},
         **shapes,
     }
@@ -148,12 +149,6 @@ def _numbers(values: Any) -> np.ndarray:
     if isinstance(values, torch.Tensor):
         values = values.detach().cpu().numpy()
     return np.asarray(values, dtype=np.float64)
-
-
-def _at(origin: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = origin
-    return matrix
 
 
 def hidden_bounds(hidden: Any) -> np.ndarray:

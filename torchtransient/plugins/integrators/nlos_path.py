@@ -13,6 +13,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
+    origin_of,
     reference_points,
     sensor_targets,
     targets_of,
@@ -85,6 +86,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             )
         self.capture = capture_type(props.get("capture_type", "single"))
         self.legs = bool(props.get("account_first_and_last_bounces", False))
+        self.camera_unwarp = not self.legs
         self.laser_sampling = bool(props.get("nlos_laser_sampling", False))
         self.hidden_sampling = bool(props.get("nlos_hidden_geometry_sampling", False))
         self.equal_shares = bool(props.get("nlos_hidden_geometry_sampling_do_rroulette", False))
@@ -173,7 +175,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
 
         def read_spots(scene: Any) -> LaserSpots:
-            return LaserSpots(scene, laser_of(scene), targets_of(scene, sensor, capture, fov))
+            targets = targets_of(scene, sensor, capture, fov)
+            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
 
         return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
