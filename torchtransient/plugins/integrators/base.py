@@ -13,7 +13,7 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
-from torchtransient.plugins.integrators.launch import Pass, laser_count, passes_of
+from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
@@ -236,15 +236,19 @@ class TransientIntegrator(mi.CppADIntegrator):
             world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
-            for i, job in enumerate(jobs):
-                self._render_pass(world, sensor, film, job)
-                if evaluate or len(jobs) > 1:
-                    dr.eval(film.bands[job.band][2], film.steady, film.outside)
-                if progress_callback:
-                    dr.sync_thread()
-                    progress_callback((i + 1) / len(jobs))
+            self.add_light(world, sensor, film, Job(jobs, seed, samples, evaluate, progress_callback))
             film.finish_render()
             return film.develop() if develop else None
+
+    def add_light(self, world, sensor, film, job):
+        """Bring all light to a film that is prepared; ``job``: a :class:`.launch.Job`."""
+        for i, launch in enumerate(job.passes):
+            self._render_pass(world, sensor, film, launch)
+            if job.evaluate or len(job.passes) > 1:
+                dr.eval(film.bands[launch.band][2], film.steady, film.outside)
+            if job.progress:
+                dr.sync_thread()
+                job.progress((i + 1) / len(job.passes))
 
     def _render_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, world.contents, sensor, film, job)

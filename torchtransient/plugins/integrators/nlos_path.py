@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -14,9 +15,16 @@ from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
     origin_of,
-    reference_points,
     sensor_targets,
     targets_of,
+)
+from torchtransient.plugins.around_corner.shared_light import (
+    BOUNCES,
+    add_third_bounce,
+    elements_of,
+    scan_light,
+    wall_lights_itself,
+    why_not,
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
@@ -30,6 +38,7 @@ from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.world import PathSettings
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
@@ -62,6 +71,12 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``nlos_hidden_geometry_sampling_do_rroulette`` (bool, false)
         Share the samples equally between the two everywhere, instead of mostly hidden area at the wall.
     ``nlos_hidden_geometry_sampling_includes_relay_wall`` (bool, false): draw points of the relay wall, too.
+    ``third_bounce`` (``auto`` | ``shared`` | ``paths``; auto)
+        Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
+        which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
+        and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
+        can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
+        polarization. Both have the same mean.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -94,6 +109,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
         self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
+        self.third_bounce = str(props.get("third_bounce", "auto"))
+        if self.third_bounce not in ("auto", "shared", "paths"):
+            raise SceneError(
+                f"transient_nlos_path: third_bounce: expected auto, shared or paths, got {self.third_bounce!r}."
+            )
         props.get("block_size", 0)
         self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
@@ -158,6 +178,44 @@ class TransientNLOSPath(base.TransientIntegrator):
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
 
+    def shares(self, scene: Any, contents: Any) -> bool:
+        """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
+        if self.third_bounce == "paths" or not self._wants(BOUNCES):
+            return False
+        if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
+            reason = why_not(scene, contents.sensor, contents)
+        else:
+            reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+        if reason and self.third_bounce == "shared":
+            raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
+        return reason is None
+
+    def _wants(self, bounces: int) -> bool:
+        settings = self.settings()
+        return settings.min_depth <= bounces <= settings.max_depth
+
+    def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+        if settings is None and wanted is None and self.shares(scene, contents):
+            settings = replace(self.settings(), left_out=BOUNCES)
+        return super().world(scene, contents, wanted, window, settings)
+
+    def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
+        if world.left_out != BOUNCES:
+            super().add_light(world, sensor, film, job)
+            return
+        others = self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(sensor))
+        share = 0.5 if others else 1.0
+        told = job.progress and (lambda done: job.progress(share * done))
+        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+        third = Local(
+            light=scan_light(world.scene, sensor, spots, self.capture, self.legs), capture=self.capture,
+            elements=elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor)),
+        )  # fmt: skip
+        add_third_bounce(third, world.scene, film, job.seed, job.samples, told)
+        if others:
+            told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
+            super().add_light(world, sensor, film, replace(job, progress=told))
+
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
         in_media = contents.media is not None
@@ -183,11 +241,9 @@ class TransientNLOSPath(base.TransientIntegrator):
     def _guides(self, contents: Any) -> list[HiddenGeometry]:
         if not self.hidden_sampling:
             return []
-        wall = None if self.samples_wall else contents.sensor.get_shape()
 
         def read_elements(scene: Any) -> HiddenElements:
-            hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-            return HiddenElements(hidden, *reference_points(scene, contents.sensor))
+            return elements_of(scene, contents.sensor, self.samples_wall)
 
         shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
         return [HiddenGeometry(read_elements, *shares)]
