@@ -177,10 +177,10 @@ def lit_by(scene: Any, samples: SharedSamples, spot: WallPoints) -> SampleTable:
     p, n, _, _ = spot.take(mi.UInt32(0))
     line = span(sample, p, mi.Vector3f(n))
     arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
-    scattered = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
-    active = (arrives > 0) & (dr.max(scattered) > 0)
+    reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
+    active = (arrives > 0) & (dr.max(reflected) > 0)
     active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), active)
-    front = dr.select(active, scattered * arrives, 0)
+    front = dr.select(active, reflected * arrives, 0)
     return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
 
 
