@@ -1,8 +1,8 @@
-"""Exhaustive captures: the laser falls on every spot while every scan point is looked at.
+"""Exhaustive captures: the laser falls on every one of its spots while every scan point is looked at.
 
 How samples are seen, ``cos cos / r^2`` where nothing stands in between and the distance, is found once for each pair
 of a sample and a point of the wall, one ray each, and kept in pairs of numbers. Every lane is a pair of a scan point
-and a spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many samples
+and a laser spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many samples
 are in a block as memory allows, however many points there are.
 """
 
@@ -20,18 +20,18 @@ from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.sampling.packed import packed_columns
 from torchtransient.plugins.transport.strategy import Local
 
-# Bytes of the pairs of numbers that are kept at a time, for scan points and spots together.
+# Bytes of the pairs of numbers that are kept at a time, for scan points and laser spots together.
 MOST_BYTES = 2**28
 # Samples that one turn of the loop takes; blocks are filled up with samples that nothing reaches.
 UNROLLED = 4
 
 
-def add_exhaustive(job: ThirdBounce, spots: WallPoints, reciprocal: bool | None = None) -> None:
+def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None = None) -> None:
     """Light of all pairs, onto a film for exhaustive scans whose laser grid has a position for every spot, row by row.
 
     ``reciprocal``: use that light goes either way, so that half of the pairs need no work. None: where that is exact
-    to the last digit, that is where spots and scan points are one object (legs too), normals are not interpolated and
-    the film is stored in one band. Raises SceneError, ShapeError.
+    to the last digit, which it is where ``lasers`` and scan points are one object (legs too), normals are not
+    interpolated and the film is stored in one band. Raises SceneError, ShapeError.
     """
     film = job.film
     if not film.exhaustive_scan:
@@ -39,38 +39,39 @@ def add_exhaustive(job: ThirdBounce, spots: WallPoints, reciprocal: bool | None 
             "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
             "exhaustive_scan, laser_scan_width and laser_scan_height."
         )
-    if spots.width != film.laser_count():
+    if lasers.width != film.laser_count():
         raise ShapeError(
             f"add_exhaustive: expected a laser position of the film for every spot, got {film.laser_count()} and "
-            f"{spots.width}."
+            f"{lasers.width}."
         )
-    possible = spots is job.sensors and not job.samples.smooth and len(film.band_layout()) == 1
+    possible = lasers is job.sensors and not job.samples.smooth and len(film.band_layout()) == 1
     if reciprocal and not possible:
         raise SceneError(
-            "add_exhaustive: reciprocity needs the scan points themselves as spots, normals that are not interpolated, "
-            "and a film of less than 2^32 values; leave reciprocal out."
+            "add_exhaustive: reciprocity needs the scan points themselves as laser spots, normals that are not "
+            "interpolated, and a film of less than 2^32 values; leave reciprocal out."
         )
     mirrored = possible if reciprocal is None else reciprocal
-    points = job.sensors.width + (0 if spots is job.sensors else spots.width)
+    points = job.sensors.width + (0 if lasers is job.sensors else lasers.width)
     size = max(UNROLLED, MOST_BYTES // (8 * points) // UNROLLED * UNROLLED)
     blocks = [(k, min(k + size, job.samples.count)) for k in range(0, job.samples.count, size)]
     for number, (first, last) in enumerate(blocks):
-        block = SampleBlock(job, spots, first, last)
+        block = SampleBlock(job, lasers, first, last)
         for band, (row, rows) in enumerate(film.band_layout()):
-            _launch(job, block, spots, band, row, rows, mirrored)
+            _launch(job, block, lasers, band, row, rows, mirrored)
             job.done((number + (band + 1) / len(film.band_layout())) / len(blocks), band)
     if mirrored:
         _mirror(film)
 
 
 class SampleBlock:
-    """Samples ``first`` to ``last`` (exclusive): how scan points and spots see them, and their colours. A plain object.
+    """Samples ``first`` to ``last`` (exclusive): how scan points and laser spots see them, and their colours. A plain
+    class.
 
     ``seen``, ``lit``: ``[g, r]`` for each sample and point, sample by sample, ``g`` negative where the back of the
     sample is seen. One colour is split evenly among both ``g``, as a square root, so that it needs no load of its own.
     """
 
-    def __init__(self, job: ThirdBounce, spots: WallPoints, first: int, last: int) -> None:
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, first: int, last: int) -> None:
         self.colours = len(job.energy)
         self.first, self.count = first, last - first
         # Filled up, with rows of zeros.
@@ -85,8 +86,8 @@ class SampleBlock:
             ]
             self.values = packed_columns([[*side, mi.Float(0)] for side in sides], self.rows)
         self.seen = self._visibility(job, job.sensors, from_laser=False)
-        same = spots is job.sensors and not job.samples.smooth
-        self.lit = self.seen if same else self._visibility(job, spots, from_laser=True)
+        same = lasers is job.sensors and not job.samples.smooth
+        self.lit = self.seen if same else self._visibility(job, lasers, from_laser=True)
 
     def _visibility(self, job: ThirdBounce, points: WallPoints, from_laser: bool) -> Any:
         samples, width = job.samples, dr.opaque(mi.UInt32, points.width)
@@ -119,35 +120,35 @@ class SampleBlock:
 class Pairs:
     """What the lanes of a launch know of their pairs: constants of the loop, a plain object."""
 
-    def __init__(self, job: ThirdBounce, spots: WallPoints, pixel: Any, spot: Any) -> None:
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, laser: Any) -> None:
         _, _, value, leg = job.sensors.take(pixel)
-        _, _, spot_value, spot_leg = spots.take(spot)
+        _, _, spot_value, spot_leg = lasers.take(laser)
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
-        self.pixel, self.spot = pixel, spot
+        self.pixel, self.laser = pixel, laser
         self.sensor_count = dr.opaque(mi.UInt32, job.sensors.width)
-        self.spot_count = dr.opaque(mi.UInt32, spots.width)
-        dr.eval(self.factor, self.opl, self.pixel, self.spot)
+        self.spot_count = dr.opaque(mi.UInt32, lasers.width)
+        dr.eval(self.factor, self.opl, self.pixel, self.laser)
 
 
 def _launch(
-    job: ThirdBounce, block: SampleBlock, spots: WallPoints, band: int, row: int, rows: int, mirrored: bool
+    job: ThirdBounce, block: SampleBlock, lasers: WallPoints, band: int, row: int, rows: int, mirrored: bool
 ) -> None:
     film = job.film
     width = int(film.crop_size()[0])
-    lane = dr.arange(mi.UInt32, width * rows * spots.width)
-    local = lane // dr.opaque(mi.UInt32, spots.width)
-    spot = lane - local * dr.opaque(mi.UInt32, spots.width)
+    lane = dr.arange(mi.UInt32, width * rows * lasers.width)
+    local = lane // dr.opaque(mi.UInt32, lasers.width)
+    laser = lane - local * dr.opaque(mi.UInt32, lasers.width)
     pixel = local + dr.opaque(mi.UInt32, row * width)
-    pairs = Pairs(job, spots, pixel, spot)
-    wanted = pixel <= spot if mirrored else mi.Mask(True)
-    base = film.pixel_base(local * film.entries_per_pixel(), spot)
+    pairs = Pairs(job, lasers, pixel, laser)
+    wanted = pixel <= laser if mirrored else mi.Mask(True)
+    base = film.pixel_base(local * film.entries_per_pixel(), laser)
     target = film.create_block(Local(band=band), base, job.match, 1, exclusive=True)
     kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
     kept = sum_over_block(job, block, pairs, target, kept, wanted)
     _count(film, job.match, pixel, kept, wanted)
     if mirrored:
-        _count(film, job.match, spot, kept, pixel < spot)
+        _count(film, job.match, laser, kept, pixel < laser)
     dr.eval(film.bands[band][2], film.steady, film.outside)
 
 
@@ -158,7 +159,7 @@ def _count(film: Any, match: Any, pixel: Any, kept: dict[str, Any], active: Any)
 
 @dr.syntax
 def sum_over_block(job, block, pairs, target, kept, wanted):
-    """What the samples of a block send from each lane's spot to its scan point, into the film's block."""
+    """What the samples of a block send from each lane's laser spot to its scan point, into the film's block."""
     k = mi.UInt32(0)
     going = mi.Mask(wanted)
     while dr.hint(going, label="pairs of points"):
@@ -172,7 +173,7 @@ def sum_over_block(job, block, pairs, target, kept, wanted):
 def deposit(job, block, pairs, target, kept, k):
     """One sample's light."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
-    lit = dr.gather(mi.Vector2f, block.lit, k * pairs.spot_count + pairs.spot)
+    lit = dr.gather(mi.Vector2f, block.lit, k * pairs.spot_count + pairs.laser)
     g = seen.x * lit.x
     active = g > 0
     opl = pairs.opl + mi.Float64(seen.y + lit.y)
@@ -189,7 +190,7 @@ def deposit(job, block, pairs, target, kept, k):
 
 
 def _mirror(film: Any) -> None:
-    """Histograms of (scan point, spot) with the numbers in descending order, from those in ascending order."""
+    """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
     cube = film.band_array(0)
     points, size = film.laser_count(), film.temporal_bins * film.channel_count()
     # Row by row of scan points: what is in flight stays small.
@@ -200,9 +201,9 @@ def _mirror(film: Any) -> None:
         entry = i % dr.opaque(mi.UInt32, size)
         pair = i // dr.opaque(mi.UInt32, size)
         point = pair // dr.opaque(mi.UInt32, points)
-        spot, point = pair - point * dr.opaque(mi.UInt32, points), point + dr.opaque(mi.UInt32, first)
-        below = spot < point
-        other = (spot * points + point) * size + entry
+        laser, point = pair - point * dr.opaque(mi.UInt32, points), point + dr.opaque(mi.UInt32, first)
+        below = laser < point
+        other = (laser * points + point) * size + entry
         value = dr.gather(type(cube), cube, other, below)
-        dr.scatter(cube, value, (point * points + spot) * size + entry, below)
+        dr.scatter(cube, value, (point * points + laser) * size + entry, below)
         dr.eval(cube)
