@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import ball, folded_plates, mannequin, mesh, plate, scene_of, wall_grid
+from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import WALL_ALBEDO, BruteForce, confocal, film_of, single, table_of
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -115,6 +115,50 @@ def test_curved_walls_and_bodies_have_no_acne():
         unhidden = unoccluded(shapes[0], points * scale, normals)
         assert np.all(np.abs(steady / unhidden - 1) < 1e-3), scale
         assert np.all(np.abs(bare / unhidden - 1) < 1e-3), scale
+
+
+def test_a_curved_wall_that_hides():
+    """A wall with a ridge in it, as brute force sees it; normals are those of its triangles."""
+    v, f = plate(2, 2, (0, 0, 0), 24)
+    v[:, 2] = 0.7 * np.exp(-((v[:, 0] / 0.2) ** 2)) + 0.1 * v[:, 1] ** 2
+    wall, body = mesh("wall", (v, f[:, ::-1]), 0.9), mesh("body", join(mannequin(1), plate(0.8, 0.8, (-0.6, 0, 0.5))))
+    corners = v[f[:, ::-1]]
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    places = np.array([(0.4, 0.0), (-0.5, 0.2), (0.8, -0.3)])
+    chosen = [np.linalg.norm(corners.mean(1)[:, :2] - place, axis=1).argmin() for place in places]
+    points, normals = corners[chosen].mean(1), n[chosen] / np.linalg.norm(n[chosen], axis=1, keepdims=True)
+    film = film_of(3, 1, bins=1, bin_width=10)
+    scene = scene_of(body, wall)
+    runs = [confocal([body], points, normals, film, 1 << 10, seed, scene)[0] for seed in range(12)]
+    runs = np.array(runs)[:, 0, :, 0]
+    brute, free = BruteForce([body], 1 << 18, others=[wall]), BruteForce([body], 1 << 12)
+    hidden = []
+    for i, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        value, _, error = brute.events((point, normal), (point, normal))
+        error = np.hypot(error, runs[:, i].std(ddof=1) / 12**0.5)
+        assert abs(runs[:, i].mean() - value.sum()) < 3 * error
+        hidden.append(1 - value.sum() / free.events((point, normal), (point, normal))[0].sum())
+    assert max(hidden) > 0.1
+
+
+def test_interpolated_normals_are_those_of_a_path_from_the_sensor():
+    """Towards the laser by the shading normal, towards the scan point by that of the triangle."""
+    shape = mesh("a", ball((0, 0, 1), (0.4, 0.3, 0.2), 1), vertex_normals=True)
+    p, spot = np.array([0.3, 0.1, 0]), np.array([-0.4, 0.2, 0])
+    film = film_of(1, 1, bins=1, bin_width=10)
+    steady, _ = single([shape], [p], [UP], ([spot], [UP]), film, 1 << 12)
+    s = draw_samples(table_of([shape]), 1 << 12, 0)
+    x, n, flat = (np.array(a, float).T for a in (s.p, s.n, s.geometric_n))
+    f = np.array(s.front, float).ravel() * np.array(s.weight, float)
+    total = 0
+    for end, normal in ((spot, n), (p, flat)):
+        d = end - x
+        r2 = (d * d).sum(1)
+        # In front by both normals, nothing of a convex body is hidden.
+        seen = ((n * d).sum(1) > 0) & ((flat * d).sum(1) > 0)
+        f = f * seen * (normal * d).sum(1) * -d[:, 2] / r2**2
+    total = f.sum() * (WALL_ALBEDO / np.pi) ** 2
+    assert steady[0, 0, 0] == pytest.approx(total, rel=1e-4)
 
 
 def confocal_of_first(shapes, points, normals, film):

@@ -57,9 +57,9 @@ class BruteForce:
     points and rays, geometry in double precision.
     """
 
-    def __init__(self, shapes, count, seed=1):
-        """``count`` points for each shape."""
-        self.scene, self.count = scene_of(*shapes), count
+    def __init__(self, shapes, count, seed=1, others=()):
+        """``count`` points for each shape; ``others`` only stand in the way."""
+        self.scene, self.count = scene_of(*shapes, *others), count
         rng = np.random.default_rng(seed)
         self.parts = []
         for shape in shapes:

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.sampling.packed import packed_columns
 from torchtransient.plugins.sampling.shared_samples import SharedSamples
 from torchtransient.plugins.transport.strategy import Local
 
@@ -32,11 +33,7 @@ class SampleTable:
         if samples.smooth:
             rows.append([*samples.geometric_n, mi.Float(0)])
         self.packets, self.channels = len(rows), len(f)
-        self.flat = dr.empty(mi.Float, 4 * self.packets * samples.count)
-        sample = dr.arange(mi.UInt32, samples.count)
-        for i, row in enumerate(rows):
-            dr.scatter(self.flat, mi.Vector4f(*row), sample * self.packets + i)
-        dr.eval(self.flat)
+        self.flat = packed_columns(rows, samples.count)
 
     def load(self, k: Any, active: Any = True) -> Local:
         """``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples."""

@@ -69,25 +69,25 @@ class ThirdBounce:
         self.window = film.arrivals()
         self.progress = progress
 
-    def add_confocal(self, spots: WallPoints | None = None) -> None:
-        """The laser falls on each scan point while that one is looked at. ``spots``: the same points with the legs and
+    def add_confocal(self, lasers: WallPoints | None = None) -> None:
+        """The laser falls on each scan point while that one is looked at. ``lasers``: the same points with the legs and
         albedo of the laser's side, where those differ.
         """
-        spots = self.sensors if spots is None else spots
-        if spots.width != self.sensors.width:
+        lasers = self.sensors if lasers is None else lasers
+        if lasers.width != self.sensors.width:
             raise ShapeError(
                 "add_confocal: expected a laser spot for every scan point, got "
-                f"{spots.width} spots and {self.sensors.width} points."
+                f"{lasers.width} spots and {self.sensors.width} points."
             )
         self._check_not_exhaustive("add_confocal")
-        self._run(SampleTable(self.samples), spots)
+        self._run(SampleTable(self.samples), lasers)
 
-    def add_single(self, spot: WallPoints) -> None:
+    def add_single(self, laser: WallPoints) -> None:
         """The laser falls on one spot all the time."""
-        if spot.width != 1:
-            raise ShapeError(f"add_single: expected one laser spot, got {spot.width}.")
+        if laser.width != 1:
+            raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
         self._check_not_exhaustive("add_single")
-        self._run(lit_by(self.scene, self.samples, spot), spot)
+        self._run(lit_by(self.scene, self.samples, laser), laser)
 
     def _check_not_exhaustive(self, name: str) -> None:
         if self.film.exhaustive_scan:
@@ -96,16 +96,16 @@ class ThirdBounce:
                 "exhaustive.add_exhaustive, or set exhaustive_scan to false."
             )
 
-    def _run(self, table: SampleTable, spots: WallPoints) -> None:
+    def _run(self, table: SampleTable, lasers: WallPoints) -> None:
         launches = launches_of(self.film, self.sensors.width, table.count)
         for i, launch in enumerate(launches):
-            self._launch(table, spots, launch)
+            self._launch(table, lasers, launch)
             self.done((i + 1) / len(launches), launch.band)
 
-    def _launch(self, table: SampleTable, spots: WallPoints, launch: Launch) -> None:
+    def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch) -> None:
         film = self.film
         pixel, first, last = launch.lanes()
-        lane = Lane(self, spots, pixel, table.lit)
+        lane = ScanLanes(self, lasers, pixel, table.lit)
         block = film.create_block(
             launch, launch.base(film, pixel), self.match, launch.most_events, exclusive=launch.chunks == 1
         )
@@ -124,14 +124,14 @@ class ThirdBounce:
             self.progress(fraction)
 
 
-class Lane:
+class ScanLanes:
     """What the lanes of a launch know of their scan points and laser spots: constants of the loop, a plain object."""
 
-    def __init__(self, job: ThirdBounce, spots: WallPoints, pixel: Any, lit: bool) -> None:
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool) -> None:
         self.p, n, value, leg = job.sensors.take(pixel)
         self.n = mi.Vector3f(n)
-        _, _, spot_value, spot_leg = spots.take(mi.UInt32(0) if lit else pixel)
-        # What arrives at the samples of one spot holds the spot's value and the energy already.
+        _, _, spot_value, spot_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        # What arrives at the samples of one spot holds neither the spot's albedo nor the energy.
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
         dr.eval(self.p, self.n, self.factor, self.opl)
@@ -171,16 +171,16 @@ def deposit(job, table, lane, block, kept, k):
     kept["after"] = kept["after"] + after
 
 
-def lit_by(scene: Any, samples: SharedSamples, spot: WallPoints) -> SampleTable:
+def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable:
     """The samples with what reaches them from one laser spot, one ray for each."""
     sample = _as_lines(samples)
-    p, n, _, _ = spot.take(mi.UInt32(0))
+    p, n, _, _ = laser.take(mi.UInt32(0))
     line = span(sample, p, mi.Vector3f(n))
     arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
-    scattered = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
-    active = (arrives > 0) & (dr.max(scattered) > 0)
+    reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
+    active = (arrives > 0) & (dr.max(reflected) > 0)
     active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), active)
-    front = dr.select(active, scattered * arrives, 0)
+    front = dr.select(active, reflected * arrives, 0)
     return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
 
 
