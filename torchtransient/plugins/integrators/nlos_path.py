@@ -10,6 +10,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.outlines import mutual_occlusion
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
@@ -192,12 +193,25 @@ class TransientNLOSPath(base.TransientIntegrator):
         rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
         return rays
 
+    # ----------------------------------------------------------------------------------- derivatives
+
+    def boundary(self, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> Any:
+        if not self.laser_sampling:
+            return None
+        ray = _scan_rays(sensor)
+        scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        return mutual_occlusion(self, world, sensor, film, seed, spp, scanned)
+
+
+def _scan_rays(sensor: Any) -> Any:
+    """One ray for each pixel of a sensor's film, detached."""
+    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    return mi.Ray3f(origin, dr.normalize(dr.detach(sensor_targets(sensor)) - origin))
+
 
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    origin = mi.Point3f(dr.detach(sensor.origin))
-    targets = dr.detach(sensor_targets(sensor))
-    found = scene.ray_intersect_preliminary(mi.Ray3f(origin, dr.normalize(targets - origin)), coherent=True)
+    found = scene.ray_intersect_preliminary(_scan_rays(sensor), coherent=True)
     dr.eval(found)
     return found
 

@@ -29,7 +29,13 @@ def plane_points(count: int, seed: Any) -> tuple[Any, Any]:
     Sobol's sequence are. What is sorted by the first coordinate needs no sorting afterwards. ``seed``: UInt32 of width
     one, in memory.
     """
-    j = dr.arange(mi.UInt32, count)
+    return plane_point(dr.arange(mi.UInt32, count), count, seed)
+
+
+def plane_point(j: Any, count: int, seed: Any) -> tuple[Any, Any]:
+    """Point number ``j`` (UInt32) of the set of :func:`plane_points`; ``seed`` (UInt32) may be another one in each
+    lane, which then has a set of its own.
+    """
     shift, key = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0x9E3779B9))
     jitter, _ = mi.sample_tea_32(j, shift)
     total = dr.opaque(mi.Float64, float(count))
