@@ -9,9 +9,11 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.attached import Ends
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, sensor_targets
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
@@ -124,15 +126,44 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
-def add_third_bounce(job: Any, scene: Any, film: Any, seed: Any, count: int, progress: Any = None) -> None:
-    """Add the light of three bounces of ``count`` samples to a film; ``job``: ``light`` (:class:`ScanLight`),
-    ``elements`` and ``capture``.
+class SharedThirdBounce:
+    """Light of three bounces of one job: its render, and its derivatives beside those of paths (confocal and single).
+
+    ``light``: attached where the scene is; ``draw``: (seed, number of samples).
     """
-    samples = draw_samples(job.elements, count, seed)
-    third = ThirdBounce(scene, film, samples, job.light.sensors, job.light.energy, progress)
-    if job.capture is CaptureType.CONFOCAL:
-        third.add_confocal(job.light.spots)
-    elif job.capture is CaptureType.SINGLE:
-        third.add_single(job.light.spots)
-    else:
-        add_exhaustive(third, job.light.spots)
+
+    def __init__(
+        self, world: Any, film: Any, light: ScanLight, elements: HiddenElements, capture: CaptureType, draw: tuple[Any, int]
+    ) -> None:
+        self.world, self.film, self.light, self.capture = world, film, light, capture
+        self.samples = draw_samples(elements, draw[1], draw[0])
+        self.gradients = None
+        if world.wanted is not None:
+            with dr.resume_grad():
+                ends = Ends.of_samples(elements, self.samples, world.contents.meshes)
+            confocal = capture is CaptureType.CONFOCAL
+            self.gradients = ThirdBounceGradients(world.scene, film, light, ends, confocal)
+
+    def add(self, progress: Any = None) -> None:
+        """Add the light to the film."""
+        third = ThirdBounce(
+            self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress
+        )
+        if self.capture is CaptureType.CONFOCAL:
+            third.add_confocal(self.light.spots)
+        elif self.capture is CaptureType.SINGLE:
+            third.add_single(self.light.spots)
+        else:
+            add_exhaustive(third, self.light.spots)
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters."""
+        return self.gradients.tables()
+
+    def backward(self, incoming: Any) -> None:
+        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        self.gradients.backward(incoming)
+
+    def forward(self) -> None:
+        """Add to the film, along the tangents of the scene."""
+        self.gradients.forward()

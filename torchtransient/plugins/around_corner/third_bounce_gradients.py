@@ -70,14 +70,17 @@ class ThirdBounceGradients:
 
     # ------------------------------------------------------------------------------------------------- reverse
 
-    def backward(self, adjoint: Any, steady: Any) -> None:
-        """Hand ``<adjoint, capture>`` on to the scene. ``adjoint``: (flat array, offset, strides by row, column, bin and
-        channel), or None; ``steady``: flat array by pixel and channel, or None.
-        """
-        read = AdjointReader(self.film, self.match, adjoint, steady)
-        at_sample = [("sample", name) for name in self.samples.attached]
-        at_point = [("point", name) for name in self.sensors.attached]
-        (at_point if self.confocal else at_sample).extend(("spot", name) for name in self.spots.attached)
+    def tables(self) -> list[Any]:
+        """The attached fields of samples, points and spots."""
+        with dr.resume_grad():
+            return [ends.fields[name] for ends in self._ends().values() for name in ends.attached]
+
+    def backward(self, incoming: Any) -> None:
+        """Hand ``<incoming adjoint, capture>`` on to the scene."""
+        read = AdjointReader(self.film, self.match, incoming)
+        with dr.resume_grad():  # the question whether a field is attached is answered no while suspended
+            at_sample, at_point, at_spot = ([(k, n) for n in ends.attached] for k, ends in self._ends().items())
+        (at_point if self.confocal else at_sample).extend(at_spot)
         found: dict[tuple[str, str], Any] = {}
         if at_sample:
             split = Split(self.samples.width, self.sensors.width)
@@ -176,24 +179,17 @@ class Split:
 
 
 class AdjointReader:
-    """The film's adjoint at scanned points."""
+    """The film's adjoint (:class:`~..integrators.incoming_adjoint.IncomingAdjoint`) at scanned points."""
 
-    def __init__(self, film: Any, match: Any, adjoint: Any, steady: Any) -> None:
-        self.film, self.match, self.adjoint, self.steady = film, match, adjoint, steady
+    def __init__(self, film: Any, match: Any, incoming: Any) -> None:
+        self.match, self.incoming = match, incoming
         self.width = dr.opaque(mi.UInt32, int(film.crop_size()[0]))
 
     def block(self, s: Any) -> Any:
         """That of each lane's point, as :class:`~..films.block.AdjointBlock`."""
-        channels = self.film.channel_count()
-        steady = [mi.Float(0)] * channels
-        if self.steady is not None:
-            steady = [dr.gather(mi.Float, self.steady, s * channels + c) for c in range(channels)]
-        if self.adjoint is None:
-            return self.film.create_adjoint_block(None, mi.UInt32(0), steady, self.match)
-        flat, offset, strides = self.adjoint
         row = s // self.width
-        base = row * strides[0] + (s - row * self.width) * strides[1] + offset
-        return self.film.create_adjoint_block((flat, *strides[-2:]), base, steady, self.match)
+        place = Local(row=row, column=s - row * self.width, laser=None)
+        return self.incoming.block(place, s, self.match)
 
 
 @dr.syntax

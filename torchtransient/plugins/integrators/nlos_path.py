@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.outlines import mutual_occlusion
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
@@ -20,7 +21,7 @@ from torchtransient.plugins.around_corner.scan_table import (
 )
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
-    add_third_bounce,
+    SharedThirdBounce,
     elements_of,
     scan_light,
     wall_lights_itself,
@@ -38,7 +39,6 @@ from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
-from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.world import PathSettings
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
@@ -195,7 +195,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         return settings.min_depth <= bounces <= settings.max_depth
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        if settings is None and wanted is None and self.shares(scene, contents):
+        # Exhaustive captures have their derivatives from paths.
+        derived = wanted is None or self.capture is not CaptureType.EXHAUSTIVE
+        if settings is None and derived and self.shares(scene, contents):
             settings = replace(self.settings(), left_out=BOUNCES)
         return super().world(scene, contents, wanted, window, settings)
 
@@ -203,16 +205,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         if world.left_out != BOUNCES:
             super().add_light(world, sensor, film, job)
             return
-        others = self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(sensor))
-        share = 0.5 if others else 1.0
+        walks = self.walks(world)
+        share = 0.5 if walks else 1.0
         told = job.progress and (lambda done: job.progress(share * done))
-        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
-        third = Local(
-            light=scan_light(world.scene, sensor, spots, self.capture, self.legs), capture=self.capture,
-            elements=elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor)),
-        )  # fmt: skip
-        add_third_bounce(third, world.scene, film, job.seed, job.samples, told)
-        if others:
+        self._shared(world, sensor, film, job.seed, job.samples).add(told)
+        if walks:
             told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
             super().add_light(world, sensor, film, replace(job, progress=told))
 
@@ -263,12 +260,39 @@ class TransientNLOSPath(base.TransientIntegrator):
         rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
         return rays
 
+    # ----------------------------------------------------------------------------------- derivatives
+
+    def walks(self, world: Any) -> bool:
+        if world.left_out != BOUNCES:
+            return True
+        return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
+
+    def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
+        if not self.laser_sampling:
+            return []
+        shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
+        ray = _scan_rays(sensor)
+        scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
+        return shared if edges is None else [*shared, edges]
+
+    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+        with dr.resume_grad():
+            light = scan_light(world.scene, sensor, spots, self.capture, self.legs)
+        elements = elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+        return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
+
+
+def _scan_rays(sensor: Any) -> Any:
+    """One ray for each pixel of a sensor's film, detached."""
+    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    return mi.Ray3f(origin, dr.normalize(dr.detach(sensor_targets(sensor)) - origin))
+
 
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    origin = mi.Point3f(dr.detach(sensor.origin))
-    targets = dr.detach(sensor_targets(sensor))
-    found = scene.ray_intersect_preliminary(mi.Ray3f(origin, dr.normalize(targets - origin)), coherent=True)
+    found = scene.ray_intersect_preliminary(_scan_rays(sensor), coherent=True)
     dr.eval(found)
     return found
 

@@ -30,8 +30,14 @@ def plane_points(count: int, seed: Any) -> tuple[Any, Any]:
     sorting afterwards. A common shift leaves half of the variance that shifts of their own would, where a bin of time
     is an interval of one coordinate. ``seed``: UInt32 of width one, in memory.
     """
+    return plane_point(dr.arange(mi.UInt32, count), count, seed)
+
+
+def plane_point(j: Any, count: int, seed: Any) -> tuple[Any, Any]:
+    """Point number ``j`` (UInt32) of the set of :func:`plane_points`; ``seed`` (UInt32) may be another one in each
+    lane, which then has a set of its own.
+    """
     bits = max(1, (count - 1).bit_length())
-    j = dr.arange(mi.UInt32, count)
     shift, key = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(0x9E3779B9))
     below = dr.opaque(mi.UInt32, 2 ** (32 - bits) - 1)
     # The middle of the last bit keeps both coordinates inside of (0, 1).
