@@ -1,4 +1,4 @@
-"""Meshes that stand in a scene dictionary: the same light as the same mesh in a file, and derivatives by its vertices."""
+"""Meshes that stand in a scene dictionary: the light of the same mesh in a file, and derivatives by vertices."""
 
 import pickle
 
@@ -146,5 +146,5 @@ def test_what_is_no_mesh(changes, message):
 
 def test_missing_arrays_are_named():
     without = {key: value for key, value in diffuse().items() if key != "faces"}
-    with pytest.raises(SceneError, match="faces.*nothing"):
+    with pytest.raises(SceneError, match=r"faces.*nothing"):
         tt.load(scene_with(without), variant=VARIANT).parameters()
