@@ -1,0 +1,5 @@
+"""Around the corner: `tt.nlos`."""
+
+from torchtransient.capture import Capture as Capture
+from torchtransient.capture import Scan as Scan
+from torchtransient.capture import Wall as Wall
