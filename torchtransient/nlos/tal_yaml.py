@@ -197,7 +197,7 @@ def _placed(part: Section) -> Any:
 def _scan(section: Section, wall: Wall) -> Scan:
     kind = section.choice("scan_type", KINDS, "single")
     size = section.whole("sensor_width", 256), section.whole("sensor_height", 256)
-    origins = {f"{who}_origin": _origin(section, who) for who in ("sensor", "laser")}
+    origins: dict[str, Any] = {f"{who}_origin": _origin(section, who) for who in ("sensor", "laser")}
     legs = section.flag("account_first_and_last_bounces", False)
     if kind == "single":
         laser = _looked_at(section, "x", size[0]), _looked_at(section, "y", size[1])

@@ -26,7 +26,7 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
     except ImportError as error:
         raise StorageError(f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'.") from error
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # the package has no types
         """Says so where a later entry would silently replace an earlier one."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
