@@ -77,6 +77,8 @@ def test_parameters_are_those_of_meshes():
     np.testing.assert_allclose(vertices.value, expected, atol=1e-6)
     np.testing.assert_allclose(table["body_0.to_world"].value, POSE, atol=1e-6)
     assert "body_0.bsdf.reflectance.value" in table
+    for name in ("vertex_normals", "vertex_texcoords"):
+        assert not table[f"body_0.{name}"].differentiable and table[f"body_0.{name}"].reason == "the mesh has none"
 
 
 def test_derivative_by_a_pose_is_the_slope_of_the_loss():
