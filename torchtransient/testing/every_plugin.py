@@ -60,7 +60,7 @@ def shapes(folder: Path) -> dict[str, dict[str, Any]]:
             "type": "mesh_arrays",
             "vertices": mi.TensorXd(np.ravel(np.eye(3))[None]),
             "faces": mi.TensorXd([[0, 1, 2]]),
-        },  # fmt: skip
+        },
         "sdfgrid": {"type": "sdfgrid", "grid": mi.TensorXf(ball.astype(np.float32))},
         **{name: {"type": name, **blobs} for name in ("ellipsoids", "ellipsoidsmesh")},
         "instance": {"type": "scene", "group": group, "copy": copy},
