@@ -179,6 +179,8 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     elif kind == "integer":
         reason = "a list of vertex numbers" if name == "faces" else "not a real number"
         effect = replace(effect, supported=False, reason=reason)
+    elif kind == "vertices" and shape is not None and shape[0] == 0:
+        effect = replace(effect, supported=False, reason="the mesh has none")
     return _info(key, kind, shape, value, effect)
 
 
