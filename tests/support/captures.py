@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
+from torchtransient.testing import closed_forms_nlos
 
 WALL = Wall.plane(2.0, 1.6, albedo=0.9)
 AXIS = TimeAxis(1.2, 0.02, 100)
 
 
 def confocal_plane(depth=0.8, size=(16, 12), wall_albedo=0.9, albedo=0.7):
-    """Confocal capture of an infinite plane `depth` metres before a wall and parallel to it: at every point the same.
-
-    With K = Q0 rw^2 rho / pi^3 the light of a bin [a, b) of path lengths is (pi K z^4 / 3) (r_a^-6 - r_b^-6), r half
-    of the length, at least z.
-    """
+    """Confocal capture of an infinite plane `depth` metres before a wall and parallel to it, the same everywhere."""
     scan = Scan.grid(WALL, size, kind="confocal")
-    r = (AXIS.edges_opl / 2).clamp(min=depth)
-    strength = math.pi * wall_albedo**2 * albedo / math.pi**3 * depth**4 / 3
-    bins = (strength * (r[:-1] ** -6 - r[1:] ** -6)).float()
+    bins = torch.from_numpy(closed_forms_nlos.confocal_plane(AXIS.edges_opl, depth, albedo, wall_albedo)).float()
     return Capture(bins[None, :, None, None].expand(1, -1, *scan.shape).clone(), AXIS, scan)
 
 
