@@ -55,7 +55,8 @@ def parts_of(shapes: list[Any]) -> list[Part]:
 
 
 def _of_bounds(number: int, shape: Any) -> Part:
-    low, high = (np.array(corner, dtype=np.float64).ravel() for corner in bounds_of(shape))
+    bounds = bounds_of(shape)
+    low, high = (np.array(corner, dtype=np.float64).ravel() for corner in (bounds.min, bounds.max))
     corners = np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
     # A tube shows its inside; spheres and disks cannot hide themselves.
     hides_itself = shape.class_name() not in ("Sphere", "Disk")
