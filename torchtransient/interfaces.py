@@ -114,10 +114,13 @@ class FilmInterface(abc.ABC):
         """Largest number of paths with up to ``most_events`` events in one kernel launch, None for no limit."""
 
     @abc.abstractmethod
-    def create_block(self, job: Any, base: Any, match: Any, most_events: int, tangents: bool = False) -> Any:
+    def create_block(
+        self, job: Any, base: Any, match: Any, most_events: int, tangents: bool = False, exclusive: bool = False
+    ) -> Any:
         """How the samples of one pass write (``FilmBlock``). ``job``: the pass, with the number of its band; ``base``:
         index of each sample's first entry in it; ``match``: from spectra to channels; ``most_events`` of
-        a path; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``).
+        a path; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``); ``exclusive``:
+        as in ``put``.
         """
 
     @abc.abstractmethod
@@ -128,9 +131,12 @@ class FilmInterface(abc.ABC):
         """
 
     @abc.abstractmethod
-    def put(self, band: int, base: Any, opl_from_start: Any, value: list[Any], active: Any) -> tuple[Any, Any]:
+    def put(
+        self, band: int, base: Any, opl_from_start: Any, value: list[Any], active: Any, exclusive: bool = False
+    ) -> tuple[Any, Any]:
         """Add ``value`` (by channel) that arrives at ``opl - start_opl`` to the array from ``base`` on. Returns the
-        fractions of it that fall before and after the window, which are not stored.
+        fractions of it that fall before and after the window, which are not stored. ``exclusive``: no two lanes of the
+        kernel have the same ``base``, so that sums need not be atomic.
         """
 
     @abc.abstractmethod

@@ -38,5 +38,5 @@ def test_every_point_is_uniform_and_means_are_unbiased(count):
 
 def test_other_seeds_are_other_points():
     a, b = points(64, 1), points(64, 2)
-    # The strata stay where they are; what is random lies within them, and in the order of the second coordinate.
-    assert np.abs(np.corrcoef(a[0] * 64 % 1, b[0] * 64 % 1)[0, 1]) < 0.4 and not np.array_equal(a[1], b[1])
+    # The strata stay where they are; what is random is where in them, and the order of the second coordinate.
+    assert not np.array_equal(a[0], b[0]) and not np.array_equal(a[1].argsort(), b[1].argsort())

@@ -25,9 +25,8 @@ class LaserSpots:
     ``si`` (SurfaceInteraction3f of all spots), ``length`` (Float, from the laser), ``origin`` (Point3f).
     """
 
-    def __init__(self, scene: Any, laser: Any, targets: Any) -> None:
-        self.emitter = laser
-        self.origin = mi.Point3f(laser.world_transform().translation())
+    def __init__(self, scene: Any, laser: Any, targets: Any, origin: Any) -> None:
+        self.emitter, self.origin = laser, origin
         d = targets - self.origin
         there = dr.norm(d)
         _check_not_at(dr.detach(there), "laser", "emitter's to_world")
@@ -61,7 +60,8 @@ class LaserSpots:
         it = dr.zeros(mi.Interaction3f)
         forward = self.emitter.world_transform() @ mi.Vector3f(0, 0, 1)
         length = dr.gather(mi.Float, self.length, index, active)
-        it.p, it.wavelengths = self.origin + forward * length, wavelengths
+        it.p = mi.Point3f(self.emitter.world_transform().translation()) + forward * length
+        it.wavelengths = wavelengths
         _, weight = self.emitter.sample_direction(it, mi.Point2f(0.5), active)
         return mi.unpolarized_spectrum(weight)
 
@@ -78,14 +78,20 @@ def laser_of(scene: Any) -> Any:
     return emitters[0]
 
 
+def origin_of(scene: Any, sensor: Any) -> Any:
+    """Where the laser stands (Point3f)."""
+    given = getattr(sensor, "laser_origin", None)
+    return mi.Point3f(laser_of(scene).world_transform().translation()) if given is None else given
+
+
 def targets_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) -> Any:
     """Where the laser points (Point3f): one target, or one for every pixel, or one for every laser position.
 
     ``fov``: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for those
     of the sensor.
     """
-    given = getattr(sensor, "laser_points", None)
     laser = laser_of(scene)
+    given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given
     if capture is CaptureType.SINGLE:

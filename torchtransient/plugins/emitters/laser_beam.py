@@ -17,10 +17,10 @@ class LaserBeam(mi.Emitter):
     ``to_world`` (transform): the laser stands at its origin and shines along its +z; scans that aim the laser
     themselves use the origin alone. ``energy`` (spectrum, 1): what falls on the spot, per colour.
 
-    Other integrators cannot see its light: nothing of it has an area or a solid angle.
+    Nothing of it has an area or a solid angle: integrators that do not aim at its spot refuse it.
     """
 
-    stays_dark = True
+    needs_aim = True
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)

@@ -13,14 +13,15 @@ from torchtransient.plugins.polarized import light_type
 
 
 class FilmBlock:
-    """The samples of one pass: which band of the film they write to, from which entry on, with which weight.
+    """The samples of one pass: which band of the film they write to, from which entry on, with which weight; whether
+    each of them has a ``base`` of its own (``exclusive``).
 
     A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
     one; whoever launched the loop calls ``finish`` when all of it is recorded. A histogram writes every event at once.
     """
 
-    def __init__(self, film, band: int, base, match):
-        self.film, self.band, self.base, self.match = film, band, base, match
+    def __init__(self, film, band: int, base, match, exclusive: bool = False):
+        self.film, self.band, self.base, self.match, self.exclusive = film, band, base, match, exclusive
 
     def begin(self):
         """What the film carries along a path: loop state, handed back at every event."""
@@ -29,7 +30,7 @@ class FilmBlock:
     def put(self, events, opl, value, active):
         """Write a contribution; returns what fell before and after the window (mean over channels)."""
         channels = self.match.to_channels(value)
-        before, after = self.film.put(self.band, self.base, opl, channels, active)
+        before, after = self.film.put(self.band, self.base, opl, channels, active, self.exclusive)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
 

@@ -82,7 +82,7 @@ def _scatter(layout, gate, weight, slope, value, slope_value, active):
         if slope_value is not None:
             v += slope_value[c] * slope
         index = dr.fma(gate, layout.bin_stride, layout.base) + c * layout.channel_stride
-        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index, active)
+        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index, active, layout.mode)
 
 
 @dr.syntax

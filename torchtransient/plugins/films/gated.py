@@ -98,8 +98,8 @@ class GatedHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def put(self, band, base, opl_from_start, value, active):
-        put_gates(self._layout(band, base), self.table, opl_from_start, value, None, active)
+    def put(self, band, base, opl_from_start, value, active, exclusive=False):
+        put_gates(self._layout(band, base, exclusive), self.table, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
@@ -111,9 +111,9 @@ class GatedHDRFilm(TimeResolvedFilm):
         layout = BinLayout(flat, base, gate_stride, channel_stride, self.gate_count(), channels)
         return read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
 
-    def _layout(self, band, base):
+    def _layout(self, band, base, exclusive=False):
         channels = self.channel_count()
-        return BinLayout(self.band_array(band), base, channels, 1, self.gate_count(), channels)
+        return BinLayout(self.band_array(band), base, channels, 1, self.gate_count(), channels, exclusive)
 
     def to_string(self):
         return (

@@ -8,7 +8,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
-from torchtransient.plugins.films.long_kernel import BinLayout
+from torchtransient.plugins.films.long_kernel import BinLayout, reduce_mode
 from torchtransient.plugins.films.long_kernel import put as put_long
 from torchtransient.plugins.films.long_kernel import read as read_long
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
@@ -192,7 +192,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Index of the histogram of one laser position, where ``base`` is that of a pixel's first one."""
         return base if laser is None else base + laser * (self.temporal_bins * self.channel_count())
 
-    def put(self, band, base, opl_from_start, value, active, laser=None):
+    def put(self, band, base, opl_from_start, value, active, exclusive=False, laser=None):
         """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
         otherwise.
         """
@@ -201,7 +201,8 @@ class TransientHDRFilm(TimeResolvedFilm):
         bins, channels = self.temporal_bins, self.channel_count()
         base = self.pixel_base(base, laser)
         if self._long:
-            return put_long(BinLayout(cube, base, channels, 1, bins, channels), self.filter, x, value, None, active)
+            layout = BinLayout(cube, base, channels, 1, bins, channels, exclusive)
+            return put_long(layout, self.filter, x, value, None, active)
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
         # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a
@@ -214,7 +215,7 @@ class TransientHDRFilm(TimeResolvedFilm):
             index = dr.fma(mi.UInt32(k), channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside)
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside, reduce_mode(exclusive))
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):

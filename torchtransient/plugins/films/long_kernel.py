@@ -13,10 +13,16 @@ import mitsuba as mi
 class BinLayout:
     """Where one event meets the film: arrays, index of the histogram's first value, strides, bins and channels."""
 
-    def __init__(self, flat, base, bin_stride, channel_stride, bins, channels):
+    def __init__(self, flat, base, bin_stride, channel_stride, bins, channels, exclusive=False):
         self.flat, self.base = flat, base
         self.bin_stride, self.channel_stride = bin_stride, channel_stride
         self.bins, self.channels = bins, channels
+        self.mode = reduce_mode(exclusive)
+
+
+def reduce_mode(exclusive):
+    """How lanes add that share their target with others (``Auto``: atomically), or that have one of their own."""
+    return dr.ReduceMode.NoConflicts if exclusive else dr.ReduceMode.Auto
 
 
 @dr.syntax
@@ -50,7 +56,8 @@ def scatter(layout, inside, k, weight, dweight, value, slope_value):
         v = 0 if value is None else value[c] * weight
         if slope_value is not None:
             v += slope_value[c] * dweight
-        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index + c * layout.channel_stride, inside)
+        index_c = index + c * layout.channel_stride
+        dr.scatter_reduce(dr.ReduceOp.Add, layout.flat, type(layout.flat)(v), index_c, inside, layout.mode)
 
 
 @dr.syntax

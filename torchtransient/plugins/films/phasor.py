@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
+from torchtransient.plugins.films.long_kernel import reduce_mode
 from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, rotation, slots_for
 from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 
@@ -19,12 +20,13 @@ MAX_EVENT_BYTES = 2**28
 class Table:
     """Phasors (or their adjoint) and their frequencies. A plain object: its arrays must not become loop state."""
 
-    def __init__(self, flat, frequencies, count, channels):
+    def __init__(self, flat, frequencies, count, channels, exclusive=False):
         self.flat, self.frequencies, self.count, self.channels = flat, frequencies, count, channels
+        self.mode = reduce_mode(exclusive)
 
     def add(self, value, index, active):
         """Add single-precision values, also to an array of doubles."""
-        dr.scatter_reduce(dr.ReduceOp.Add, self.flat, type(self.flat)(value), index, active)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.flat, type(self.flat)(value), index, active, self.mode)
 
 
 @dr.syntax
@@ -147,15 +149,15 @@ class PhasorHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def create_block(self, job, base, match, most_events, tangents=False):
+    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False):
         return EventBlock(self, job, base, match, most_events, tangents)
 
-    def _table(self, flat):
-        return Table(flat, self.frequency_array, self.frequency_total, self.channel_count())
+    def _table(self, flat, exclusive=False):
+        return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)
 
-    def put(self, band, base, opl_from_start, value, active):
+    def put(self, band, base, opl_from_start, value, active, exclusive=False):
         """One event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
-        add_event(self._table(self.band_array(band)), base, opl_from_start, value, None, active)
+        add_event(self._table(self.band_array(band), exclusive), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):

@@ -13,7 +13,7 @@ from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
-from torchtransient.plugins.integrators.launch import Pass, laser_count, passes_of
+from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
@@ -67,8 +67,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
-    # Whether the laser of a scan lights one position after the other.
+    # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
     scans_exhaustively = False
+    aims_lasers = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -104,6 +105,12 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
                 "media of the scene's shapes and sensors."
+            )
+        beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
+        if beams and not self.aims_lasers:
+            raise SceneError(
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
@@ -207,12 +214,15 @@ class TransientIntegrator(mi.CppADIntegrator):
             length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
 
-    def boundary(self, world, sensor, film, seed, spp):
-        """What moving edges of visibility add to the derivatives of a job, beside its paths: None for nothing, or an
-        object with ``tables()`` (attached to the parameters), ``backward(incoming)`` and ``forward()``. Raises
-        GradientError where it is needed and cannot be computed.
+    def walks(self, world):
+        """Whether paths bring some of a job's light."""
+        return True
+
+    def beside(self, world, sensor, film, seed, samples):
+        """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
+        ``backward(incoming)`` and ``forward()``. Raises GradientError where one is needed and cannot be computed.
         """
-        return None
+        return []
 
     def _walk(self, world, film, rays, sink):
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
@@ -236,15 +246,19 @@ class TransientIntegrator(mi.CppADIntegrator):
             world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
-            for i, job in enumerate(jobs):
-                self._render_pass(world, sensor, film, job)
-                if evaluate or len(jobs) > 1:
-                    dr.eval(film.bands[job.band][2], film.steady, film.outside)
-                if progress_callback:
-                    dr.sync_thread()
-                    progress_callback((i + 1) / len(jobs))
+            self.add_light(world, sensor, film, Job(jobs, seed, samples, evaluate, progress_callback))
             film.finish_render()
             return film.develop() if develop else None
+
+    def add_light(self, world, sensor, film, job):
+        """Bring all light to a film that is prepared; ``job``: a :class:`.launch.Job`."""
+        for i, launch in enumerate(job.passes):
+            self._render_pass(world, sensor, film, launch)
+            if job.evaluate or len(job.passes) > 1:
+                dr.eval(film.bands[launch.band][2], film.steady, film.outside)
+            if job.progress:
+                dr.sync_thread()
+                job.progress((i + 1) / len(job.passes))
 
     def _render_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, world.contents, sensor, film, job)
@@ -274,17 +288,17 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             world = self.world(scene, contents, wanted, film.arrivals())
-            jobs, _ = self.passes(world, sensor, film, seed, int(spp))
+            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             incoming = IncomingAdjoint(film, g_steady, g_transient)
-            boundary = self.boundary(world, sensor, film, seed, int(spp))
+            beside = self.beside(world, sensor, film, seed, samples)
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad(), contents.hidden_from_mitsuba():
-                for job in jobs:
+                for job in jobs if self.walks(world) else ():
                     self._backward_pass(world, sensor, film, job, incoming)
                     dr.eval()
-                if boundary is not None:
-                    boundary.backward(incoming)
+                for part in beside:
+                    part.backward(incoming)
 
     def _wanted(self, scene, sensor, film):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
@@ -348,18 +362,18 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             contents, wanted = self._wanted(scene, sensor, film)
             world = self.world(scene, contents, wanted, film.arrivals())
-            boundary = self.boundary(world, sensor, film, seed, int(spp))
-            with dr.resume_grad():
-                tables = world.tables() if boundary is None else world.tables() + boundary.tables()
-                propagate_tangents(self.parameters(scene), tables)
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
+            beside = self.beside(world, sensor, film, seed, samples)
+            with dr.resume_grad():
+                tables = [table for part in beside for table in part.tables()]
+                propagate_tangents(self.parameters(scene), world.tables() + tables)
             film.prepare(self.aov_names(), samples)
             with contents.hidden_from_mitsuba():
-                for job in jobs:
+                for job in jobs if self.walks(world) else ():
                     self._forward_pass(world, sensor, film, job)
                     dr.eval(film.bands[job.band][2], film.steady)
-                if boundary is not None:
-                    boundary.forward()
+                for part in beside:
+                    part.forward()
             film.finish_render()
             return film.develop() if develop else None
 

@@ -30,6 +30,19 @@ class Pass:
     seed: Any
 
 
+@dataclass
+class Job:
+    """A render: its launches, the seed and the largest number of samples of a pixel that they are made of, whether what
+    is recorded is run, and who is told of the progress (a function of the share that is done, or None).
+    """
+
+    passes: list[Pass]
+    seed: Any
+    samples: int
+    evaluate: bool
+    progress: Any
+
+
 def laser_count(film: Any) -> int:
     """How many laser positions every pixel of a film tells apart."""
     return film.laser_count() if film.exhaustive_scan else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -14,9 +15,17 @@ from torchtransient.plugins.around_corner.outlines import mutual_occlusion
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
-    reference_points,
+    origin_of,
     sensor_targets,
     targets_of,
+)
+from torchtransient.plugins.around_corner.shared_light import (
+    BOUNCES,
+    SharedThirdBounce,
+    elements_of,
+    scan_light,
+    wall_lights_itself,
+    why_not,
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
@@ -49,6 +58,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
         corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+    ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
         ``filter_bounces + 1``, as in mitransient.
     ``discard_direct_paths`` (bool, false): leave out light of one bounce.
@@ -61,6 +71,12 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``nlos_hidden_geometry_sampling_do_rroulette`` (bool, false)
         Share the samples equally between the two everywhere, instead of mostly hidden area at the wall.
     ``nlos_hidden_geometry_sampling_includes_relay_wall`` (bool, false): draw points of the relay wall, too.
+    ``third_bounce`` (``auto`` | ``shared`` | ``paths``; auto)
+        Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
+        which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
+        and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
+        can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
+        polarization. Both have the same mean.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -85,6 +101,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             )
         self.capture = capture_type(props.get("capture_type", "single"))
         self.legs = bool(props.get("account_first_and_last_bounces", False))
+        self.camera_unwarp = not self.legs
         self.laser_sampling = bool(props.get("nlos_laser_sampling", False))
         self.hidden_sampling = bool(props.get("nlos_hidden_geometry_sampling", False))
         self.equal_shares = bool(props.get("nlos_hidden_geometry_sampling_do_rroulette", False))
@@ -92,8 +109,19 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
         self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
+        self.third_bounce = str(props.get("third_bounce", "auto"))
+        if self.third_bounce not in ("auto", "shared", "paths"):
+            raise SceneError(
+                f"transient_nlos_path: third_bounce: expected auto, shared or paths, got {self.third_bounce!r}."
+            )
         props.get("block_size", 0)
+        self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
+        if self.min_bounces > (self.max_depth if self.only_bounces is None else self.only_bounces):
+            raise SceneError(
+                f"transient_nlos_path: min_bounces {self.min_bounces} leaves out everything up to max_depth "
+                f"{self.max_depth} or filter_bounces; the picture would be black."
+            )
 
     def _bounces_of(self, props: Any) -> int | None:
         depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
@@ -133,10 +161,15 @@ class TransientNLOSPath(base.TransientIntegrator):
             laser_of(scene)
         return sensor, film
 
+    @property
+    def aims_lasers(self) -> bool:
+        """Whether beams without width are seen."""
+        return self.laser_sampling
+
     def settings(self) -> PathSettings:
         # The light's own way is a segment where lights are sampled, and none where its spot is.
         light = 0 if self.laser_sampling else 1
-        first, last = 2 if self.discard_direct_paths else 0, None
+        first, last = max(2 if self.discard_direct_paths else 0, self.min_bounces), None
         if self.only_bounces is not None:
             first = last = self.only_bounces
         most = self.max_depth if last is None else last + light
@@ -144,6 +177,41 @@ class TransientNLOSPath(base.TransientIntegrator):
         return PathSettings(
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
+
+    def shares(self, scene: Any, contents: Any) -> bool:
+        """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
+        if self.third_bounce == "paths" or not self._wants(BOUNCES):
+            return False
+        if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
+            reason = why_not(scene, contents.sensor, contents)
+        else:
+            reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+        if reason and self.third_bounce == "shared":
+            raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
+        return reason is None
+
+    def _wants(self, bounces: int) -> bool:
+        settings = self.settings()
+        return settings.min_depth <= bounces <= settings.max_depth
+
+    def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+        # Exhaustive captures have their derivatives from paths.
+        derived = wanted is None or self.capture is not CaptureType.EXHAUSTIVE
+        if settings is None and derived and self.shares(scene, contents):
+            settings = replace(self.settings(), left_out=BOUNCES)
+        return super().world(scene, contents, wanted, window, settings)
+
+    def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
+        if world.left_out != BOUNCES:
+            super().add_light(world, sensor, film, job)
+            return
+        walks = self.walks(world)
+        share = 0.5 if walks else 1.0
+        told = job.progress and (lambda done: job.progress(share * done))
+        self._shared(world, sensor, film, job.seed, job.samples).add(told)
+        if walks:
+            told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
+            super().add_light(world, sensor, film, replace(job, progress=told))
 
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
@@ -162,18 +230,17 @@ class TransientNLOSPath(base.TransientIntegrator):
         fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
 
         def read_spots(scene: Any) -> LaserSpots:
-            return LaserSpots(scene, laser_of(scene), targets_of(scene, sensor, capture, fov))
+            targets = targets_of(scene, sensor, capture, fov)
+            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
 
         return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
     def _guides(self, contents: Any) -> list[HiddenGeometry]:
         if not self.hidden_sampling:
             return []
-        wall = None if self.samples_wall else contents.sensor.get_shape()
 
         def read_elements(scene: Any) -> HiddenElements:
-            hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-            return HiddenElements(hidden, *reference_points(scene, contents.sensor))
+            return elements_of(scene, contents.sensor, self.samples_wall)
 
         shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
         return [HiddenGeometry(read_elements, *shares)]
@@ -195,12 +262,26 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     # ----------------------------------------------------------------------------------- derivatives
 
-    def boundary(self, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> Any:
+    def walks(self, world: Any) -> bool:
+        if world.left_out != BOUNCES:
+            return True
+        return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
+
+    def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
-            return None
+            return []
+        shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
         ray = _scan_rays(sensor)
         scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        return mutual_occlusion(self, world, sensor, film, seed, spp, scanned)
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
+        return shared if edges is None else [*shared, edges]
+
+    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+        with dr.resume_grad():
+            light = scan_light(world.scene, sensor, spots, self.capture, self.legs)
+        elements = elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+        return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
 
 
 def _scan_rays(sensor: Any) -> Any:

@@ -7,11 +7,14 @@ the sampling of every shape there is. Laid out with numpy, outside of kernels.
 ======== ==================================== ==================================================
 kind     origin, axes                         point from ``(a, y)``, ``phi = 2 pi a``
 ======== ==================================== ==================================================
-triangle corner, two edges, unused            ``o + e1 s (1 - a) + e2 s a``, ``s = sqrt(y)``
+triangle corner, two edges, see below         ``o + e1 s (1 - a) + e2 s a``, ``s = sqrt(y)``
 disk     centre, two radii, unused            ``o + a1 s cos phi + a2 s sin phi``, ``s = sqrt(y)``
 sphere   centre, three axes of its radius     ``o + R (s cos phi, s sin phi, z)``, ``z = 1 - 2 y``
 cylinder centre of the foot, two radii, axis  ``o + a1 cos phi + a2 sin phi + a3 y``
 ======== ==================================== ==================================================
+
+The last axis of a triangle that is part of a larger one says which part: ``(b1, b2, scale)``, the barycentrics of its
+corner in the whole one, and what its edges are of that one's.
 """
 
 from __future__ import annotations
@@ -152,7 +155,8 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
     n /= np.where(twice > 0, twice, 1)[:, None]
     if mesh.has_flipped_normals():
         n = -n
-    return np.stack([o, e1, e2, np.zeros_like(o)], 1), TRIANGLE, twice / 2, n
+    uncut = np.broadcast_to([0.0, 0.0, 1.0], o.shape)
+    return np.stack([o, e1, e2, uncut], 1), TRIANGLE, twice / 2, n
 
 
 def has_shading_normals(shape: Any) -> bool:

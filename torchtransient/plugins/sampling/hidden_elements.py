@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.plugins.pointer_table import PointerTable, registry_number
+from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.sampling.area_elements import (
     CYLINDER,
     TRIANGLE,
@@ -20,6 +20,7 @@ from torchtransient.plugins.sampling.area_elements import (
     morton_order,
 )
 from torchtransient.plugins.sampling.packed import packed
+from torchtransient.plugins.sampling.split_triangles import PrimitiveDensity, cut, cuts_of
 
 # Share of the draws that goes by plain area: what the weight gives too little (light that arrives after further
 # bounces, a wall point near an element) is found all the same.
@@ -27,7 +28,8 @@ DEFENSIVE = 0.1
 
 
 class HiddenElements:
-    """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`.
+    """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
+    large beside their distance from the wall are several elements (:mod:`.split_triangles`).
 
     The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
     (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
@@ -52,19 +54,22 @@ class HiddenElements:
             )
         every = AreaElements.of(shapes)
         self.left_out = every.left_out
-        some = np.flatnonzero(every.area > 0)
-        if not len(some):
+        if not np.any(every.area > 0):
             raise SceneError(
                 "HiddenElements: expected shapes with a surface to draw points on, got "
                 f"{len(shapes)} without any; left out: {', '.join(self.left_out) or 'none'}."
             )
-        order = some[morton_order(every.centers()[some])]
-        self.shapes, self.elements = list(shapes), every.take(order)
+        cuts = cuts_of(every, points.reshape(-1, 3))
+        parts, uncut, cell = cut(every, cuts)
+        order = np.flatnonzero(parts.area > 0)
+        order = order[morton_order(parts.centers()[order])]
+        self.shapes, self.elements = list(shapes), parts.take(order)
         self.tile_count = len(points)
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
         p = self._probabilities(points, normals, defensive)
         self._lay_out(p)
-        self._by_primitive(every, order, p)
+        per_area = p / self.elements.area
+        self._by_primitive = PrimitiveDensity(self.shapes, every, cuts, uncut[order], cell[order], per_area)
 
     # ----------------------------------------------------------------------------------------- tables
 
@@ -92,17 +97,6 @@ class HiddenElements:
         self._count = mi.UInt32(len(e))
         self._pointers = mi.UInt32([registry_number(shape) for shape in self.shapes])
         dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count, self._pointers)
-
-    def _by_primitive(self, every: AreaElements, order: np.ndarray, p: np.ndarray) -> None:
-        """The density by shape and primitive."""
-        density = np.zeros((len(p), len(every)), dtype=np.float32)
-        density[:, order] = p / every.area[order]
-        self._density = mi.Float(density.ravel())
-        self._stride = mi.UInt32(len(every))
-        dr.make_opaque(self._density, self._stride)
-        listed, first = np.unique(every.shape.astype(int), return_index=True)
-        # One more than the place of the shape's first element: zero is what is not in the table.
-        self._first = PointerTable([self.shapes[s] for s in listed], [1 + int(f) for f in first])
 
     # ---------------------------------------------------------------------------------------- in kernels
 
@@ -143,24 +137,21 @@ class HiddenElements:
             n = dr.select(kind < 2, n, (offset - along) * n.x)
         return mi.Point3f(p + offset), mi.Normal3f(n)
 
-    def per_area(self, shape: Any, prim_index: Any, active: Any = True, tile: Any = None) -> Any:
-        """Density per unit area (``Float``) at a point of a shape (``ShapePtr``) and primitive (``UInt32``); 0 for what
-        is not in the table.
+    def per_area(self, shape: Any, prim_index: Any, p: Any, active: Any = True, tile: Any = None) -> Any:
+        """Density per unit area (``Float``) at a point ``p`` (``Point3f``) of a shape (``ShapePtr``) and primitive
+        (``UInt32``); 0 for what is not in the table.
         """
-        first = self._first.look_up(shape, active)
-        listed = mi.Mask(active) & (first > 0)
-        index = first - 1 + prim_index
-        if tile is not None:
-            index += tile * self._stride
-        return dr.gather(mi.Float, self._density, index, listed)
+        return self._by_primitive.look_up(shape, prim_index, p, active, tile)
 
     def coordinates(self, element: Any, a: Any, y: Any, active: Any = True) -> Any:
         """Where Mitsuba's interactions place the point of two numbers on an element: barycentrics of triangles, the
         point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
         """
-        kind = None if self.kinds == (TRIANGLE,) else mi.UInt32(self._row(element, 3, active).w)
-        x = local_point(kind, a, y, dr, self.kinds)
-        return mi.Point2f(x[0], x[1])
+        row = self._row(element, 3, active)
+        kind = mi.UInt32(row.w)
+        x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])
+        # Of a part of a triangle, those of the uncut one.
+        return dr.select(kind == TRIANGLE, mi.Point2f(row.x, row.y) + row.z * x, x)
 
     def density_of(self, element: Any, active: Any = True, tile: Any = None) -> Any:
         """Density per unit area of an element of the table, ``Float``."""

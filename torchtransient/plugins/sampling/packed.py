@@ -20,3 +20,16 @@ def packed(values: np.ndarray) -> Any:
     dr.scatter(target, source, dr.arange(mi.UInt32, dr.width(source)))
     dr.eval(target)
     return target
+
+
+def packed_columns(rows: list[list[Any]], count: int) -> Any:
+    """A flat ``Float`` with ``rows`` of four numbers (``Float`` arrays) for each lane, one lane after the other, filled
+    up with zeros to ``count`` lanes.
+    """
+    width = max(dr.width(column) for row in rows for column in row)
+    target = dr.zeros(mi.Float, 4 * len(rows) * count)
+    lane = dr.arange(mi.UInt32, width)
+    for i, row in enumerate(rows):
+        dr.scatter(target, mi.Vector4f(*row), lane * len(rows) + i)
+    dr.eval(target)
+    return target

@@ -24,15 +24,17 @@ class NLOSCaptureMeter(mi.Sensor):
     ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
         Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
         ``transient_nlos_path`` says.
-    ``original_film_width``, ``original_film_height`` (int; none)
-        Read for scenes of mitransient 1.x that scan confocally one point at a time: the size of the whole scan, of
-        which a film of one pixel is the point ``laser_lookat_pixel``.
+    ``laser_origin`` (point; that of the scene's emitter)
+        Where the laser stands.
+    ``laser_lookat_pixel`` (point; none)
+        Of scenes from before ``laser_points``: the laser points at the place of the shape with texture coordinates
+        (x / W, y / H).
     ``film`` (``transient_hdr_film`` or another film of this library)
 
     Every sample of a pixel looks along the same ray, so spatial filters do not spread it. A pixel measures the radiance
     that leaves its point towards the sensor.
 
-    Differentiable: ``sensor_origin``, ``points`` and ``laser_points`` (the rays follow; what they meet decides where
+    Differentiable: ``sensor_origin``, ``points``, ``laser_points`` and ``laser_origin`` (the rays follow; what they meet decides where
     the points are).
     """
 
@@ -41,10 +43,13 @@ class NLOSCaptureMeter(mi.Sensor):
         self.origin = mi.Point3f(mi.ScalarPoint3f(props.get("sensor_origin", mi.ScalarPoint3f(0))))
         self.points = _points_of(props, "points")
         self.laser_points = _points_of(props, "laser_points")
-        for old in _IGNORED:
-            props.get(old, None)
+        self.laser_origin = mi.Point3f(props["laser_origin"]) if "laser_origin" in props else None
+        self.lookat_pixel = list(props["laser_lookat_pixel"]) if "laser_lookat_pixel" in props else None
+        # Said once more in older scenes: the integrator knows them.
+        for name in ("account_first_and_last_bounces", "confocal"):
+            props.get(name, None)
         self._check()
-        dr.make_opaque(self.origin)
+        dr.make_opaque(self.origin, self.laser_origin)
 
     def _check(self) -> None:
         size = self.film().size()
@@ -53,11 +58,15 @@ class NLOSCaptureMeter(mi.Sensor):
                 f"nlos_capture_meter: expected one of 'points' for each of the film's {size[0]} x {size[1]} pixels, "
                 f"got {dr.width(self.points)}. Set the film's width and height to the scan's."
             )
+        if self.lookat_pixel is not None and self.laser_points is not None:
+            raise SceneError(
+                "nlos_capture_meter: laser_lookat_pixel and laser_points both say where the laser points; give one."
+            )
 
     def traverse(self, cb: Any) -> None:
         super().traverse(cb)
         cb.put("sensor_origin", self.origin, mi.ParamFlags.Differentiable)
-        for name in ("points", "laser_points"):
+        for name in ("points", "laser_points", "laser_origin"):
             if getattr(self, name) is not None:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
@@ -80,6 +89,14 @@ class NLOSCaptureMeter(mi.Sensor):
         column = pixel - row * int(size[0])
         place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
         return shape.sample_position(0.0, place).p
+
+    def spots(self) -> Any:
+        """Where the laser points (Point3f), None where nothing of the sensor says so."""
+        if self.lookat_pixel is None:
+            return self.laser_points
+        size = self.film().size()
+        place = mi.Point2f(self.lookat_pixel[0] / int(size[0]), self.lookat_pixel[1] / int(size[1]))
+        return self.get_shape().sample_position(0.0, place).p
 
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         film = self.film()
@@ -104,11 +121,6 @@ class NLOSCaptureMeter(mi.Sensor):
         return f"NLOSCaptureMeter[\n  sensor_origin = {self.origin},\n  film = {self.film()}\n]"
 
 
-# What scenes for mitransient 1.x may hold beside: the clock's first and last leg are the integrator's affair there,
-# too, and its laser is the scene's emitter.
-_IGNORED = ("account_first_and_last_bounces", "confocal", "laser_origin", "laser_lookat_pixel")
-
-
 def _points_of(props: Any, name: str) -> Any:
     """An array of points of a sensor's properties as a Point3f in memory, None where there is none."""
     if name not in props:
@@ -126,6 +138,8 @@ def _points_of(props: Any, name: str) -> Any:
 
 register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
 _PLACE = ParameterEffect(moves_length=True, role="sensor")
-# The rays of the sensor do not follow the laser's points.
+# The rays of the sensor do not follow the laser.
 _LASER = ParameterEffect(moves_length=True, role="emitter")
-declare_effects(NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER})
+declare_effects(
+    NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER, "laser_origin": _LASER}
+)

@@ -16,7 +16,7 @@ from torchtransient.plugins.transport.instances import AttachedSurfaces
 @dataclass(frozen=True)
 class PathSettings:
     """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
-    of smaller depths do not count.
+    of smaller depths do not count. ``left_out``: nor do those of this depth.
     """
 
     max_depth: int
@@ -25,6 +25,7 @@ class PathSettings:
     discard_direct_light: bool
     camera_unwarp: bool
     min_depth: int = 0
+    left_out: int | None = None
 
 
 class World:
@@ -39,6 +40,7 @@ class World:
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
         self.scene, self.contents, self.wanted = scene, contents, wanted
         self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
+        self.left_out = settings.left_out
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
@@ -96,7 +98,8 @@ class World:
 
     def deep_enough(self, active: Any, depth: Any) -> Any:
         """Which events of depth ``depth`` (UInt32) count."""
-        return active if self.min_depth == 0 else active & (depth >= self.min_depth)
+        active = active if self.min_depth == 0 else active & (depth >= self.min_depth)
+        return active if self.left_out is None else active & (depth != self.left_out)
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
         """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""

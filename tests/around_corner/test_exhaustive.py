@@ -1,0 +1,132 @@
+"""Exhaustive captures: diagonal, rows, reciprocity, colours, blocks, and what the film counts."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient.plugins.around_corner.exhaustive as exhaustive
+from support.hidden_shapes import ball, folded_plates, mannequin, mesh, scene_of, wall_grid
+from support.third_bounce_runs import captured, film_of, table_of, wall_of
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.sampling.shared_samples import draw_samples
+
+VARIANT = "llvm_ad_mono"
+SCENES = {
+    "body": lambda **a: [mesh("a", mannequin(1), **a)],
+    "V and plate": lambda **a: [mesh("a", folded_plates(), two_sided=True, **a)],
+    "smooth": lambda **a: [mesh("a", ball((0, 0, 1), (0.4, 0.3, 0.2), 1), vertex_normals=True, **a)],
+}
+GRID, COUNT = 3, 130
+
+
+def films(bins=60, start=1.0):
+    one = film_of(GRID, GRID, start=start, bins=bins, bin_width=0.05)
+    pairs = {"exhaustive_scan": True, "laser_scan_width": GRID, "laser_scan_height": GRID}
+    return one, film_of(GRID, GRID, start=start, bins=bins, bin_width=0.05, **pairs)
+
+
+class Runs:
+    def __init__(self, shapes, leg=0.0):
+        self.scene, self.samples = scene_of(*shapes), draw_samples(table_of(shapes), COUNT, 2)
+        points, normals = wall_grid(GRID, 0.4)
+        self.sensors = wall_of(points, normals, leg=np.linspace(0, leg, GRID**2))
+        self.spots = wall_of(points, normals, leg=np.linspace(leg, 0, GRID**2))
+        self.one, self.pairs = films()
+
+    def job(self, film):
+        return ThirdBounce(self.scene, film, self.samples, self.sensors, 2.5)
+
+    def exhaustive(self, spots=None, **arguments):
+        spots = self.sensors if spots is None else spots
+        run = lambda: exhaustive.add_exhaustive(self.job(self.pairs), spots, **arguments)  # noqa: E731
+        steady, cube = captured(self.pairs, run)
+        return steady, cube.reshape(GRID**2, GRID**2, *cube.shape[4:])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(name):
+    runs = Runs(SCENES[name](), leg=0.3)
+    steady, cube = runs.exhaustive(runs.spots)
+    confocal_steady, confocal = captured(runs.one, lambda: runs.job(runs.one).add_confocal(runs.spots))
+    confocal = confocal.reshape(GRID**2, *confocal.shape[2:])
+    moved = sum(differences(cube[i, i], confocal[i]) for i in range(GRID**2))
+    place, normal, _, leg = (np.array(a) for a in runs.spots.take(mi.UInt32(4)))
+    spot = wall_of(place.T, normal.T, leg=leg[0])
+    _, single = captured(runs.one, lambda: runs.job(runs.one).add_single(spot))
+    single = single.reshape(confocal.shape)
+    moved += sum(differences(cube[i, 4], single[i]) for i in range(GRID**2))
+    # Arrivals at the rim of a bin may be rounded into the other one.
+    assert moved <= 2
+    assert steady.sum() > confocal_steady.sum()
+
+
+def differences(a, b):
+    """Pairs of neighbouring bins between which an event has moved; all others are equal."""
+    wrong = np.flatnonzero(np.abs(a - b)[:, 0] > 2e-6 * b.max())
+    assert a.sum() == pytest.approx(b.sum(), rel=1e-5)
+    return len(wrong) // 2
+
+
+@pytest.mark.parametrize("name", ["body", "V and plate"])
+def test_reciprocity_is_exact(name):
+    runs = Runs(SCENES[name]())
+    steady, cube = runs.exhaustive()
+    assert np.array_equal(cube, cube.transpose(1, 0, 2, 3))
+    whole_steady, whole = runs.exhaustive(reciprocal=False)
+    assert np.array_equal(cube, whole)
+    assert steady == pytest.approx(whole_steady, rel=1e-6)
+
+
+def test_interpolated_normals_are_not_reciprocal():
+    runs = Runs(SCENES["smooth"]())
+    _, cube = runs.exhaustive()
+    assert not np.allclose(cube, cube.transpose(1, 0, 2, 3), rtol=1e-3)
+    with pytest.raises(SceneError, match="reciprocity"):
+        runs.exhaustive(reciprocal=True)
+
+
+def test_blocks_of_samples_add_up(monkeypatch):
+    runs = Runs(SCENES["body"]())
+    _, cube = runs.exhaustive()
+    monkeypatch.setattr(exhaustive, "MOST_BYTES", 8 * GRID**2 * 50)
+    _, parts = runs.exhaustive()
+    assert parts == pytest.approx(cube, rel=1e-5, abs=1e-7 * cube.max())
+
+
+@pytest.mark.parametrize("window", [(1.0, 60), (1.9, 6)])
+def test_bins_and_what_is_outside_are_the_steady_image(window):
+    runs = Runs(SCENES["body"]())
+    runs.pairs = films(window[1], window[0])[1]
+    steady, cube = runs.exhaustive()
+    outside = runs.pairs.energy_before + runs.pairs.energy_after
+    assert cube.sum() + outside == pytest.approx(steady.sum(), rel=1e-5)
+    assert (outside > 0.1 * steady.sum()) == (window[1] == 6)
+
+
+def test_colours():
+    """Each channel is a capture in its own albedo and energy."""
+    with mi.variant_context("llvm_ad_rgb"):
+        shapes = [mesh("a", folded_plates(), {"type": "rgb", "value": [0.2, 0.5, 0.8]}, two_sided=True)]
+        runs = Runs(shapes)
+        job = lambda film: ThirdBounce(runs.scene, film, runs.samples, runs.sensors, mi.Color3f(1, 2, 3))  # noqa: E731
+        steady, cube = captured(runs.pairs, lambda: exhaustive.add_exhaustive(job(runs.pairs), runs.sensors))
+        _, confocal = captured(runs.one, lambda: job(runs.one).add_confocal())
+    ratio = np.array([0.2, 1.0, 2.4])
+    for array in (steady, cube, confocal):
+        total = array.reshape(-1, 3).sum(0)
+        assert total / total[1] == pytest.approx(ratio, rel=1e-5)
+    mono = Runs([mesh("a", folded_plates(), 0.5, two_sided=True)])
+    _, one = mono.exhaustive()
+    assert cube[..., 1].sum() == pytest.approx(one.sum() * 2 / 2.5, rel=1e-5)
+
+
+def test_films_and_spots_are_checked():
+    runs = Runs(SCENES["body"]())
+    with pytest.raises(SceneError, match="exhaustive_scan"):
+        captured(runs.one, lambda: exhaustive.add_exhaustive(runs.job(runs.one), runs.sensors))
+    points, normals = wall_grid(2)
+    with pytest.raises(ShapeError, match="9 and 4"):
+        runs.exhaustive(wall_of(points, normals))
+    with pytest.raises(SceneError, match="exhaustive"):
+        captured(runs.pairs, lambda: runs.job(runs.pairs).add_confocal())

@@ -1,0 +1,142 @@
+"""Every film through its own interface: the same light as the histogram has, whatever the number of lanes a pixel."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient.plugins.around_corner.launches as launches
+from support.hidden_shapes import mannequin, mesh, scene_of, wall_grid
+from support.third_bounce_runs import captured, film_of, table_of, wall_of
+from torchtransient.errors import SceneError, ShapeError, VariantError
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.sampling.shared_samples import draw_samples
+
+VARIANT = "llvm_ad_mono"
+GRID, COUNT, START, WIDTH, BINS = 2, 500, 1.2, 0.05, 40
+
+
+@pytest.fixture(scope="module")
+def body():
+    shapes = [mesh("a", mannequin(1))]
+    return scene_of(*shapes), draw_samples(table_of(shapes), COUNT, 2)
+
+
+@pytest.fixture
+def run(body):
+    points, normals = wall_grid(GRID, 0.4)
+    sensors = wall_of(points, normals, leg=[0.1, 0.2, 0.0, 0.3])
+
+    def of(film, spot=False, **arguments):
+        def add():
+            job = ThirdBounce(body[0], film, body[1], sensors, 3.0, **arguments)
+            job.add_single(wall_of(points[:1], normals[:1], leg=0.05)) if spot else job.add_confocal()
+
+        return captured(film, add, COUNT)
+
+    return of
+
+
+def histogram(**arguments):
+    return film_of(GRID, GRID, START, BINS, WIDTH, **arguments)
+
+
+@pytest.mark.parametrize("spot", [False, True])
+@pytest.mark.parametrize("filter_name", ["box", "tent", "gaussian"])
+def test_bins_and_what_is_outside_are_the_steady_image(run, filter_name, spot):
+    film = film_of(
+        GRID,
+        GRID,
+        2.0,
+        12,
+        WIDTH,
+        temporal_filter=filter_name,
+        **({"gaussian_stddev": 2.0} if filter_name == "gaussian" else {}),
+    )
+    steady, cube = run(film, spot)
+    outside = film.energy_before + film.energy_after
+    assert cube.sum() + outside == pytest.approx(steady.sum(), rel=1e-5)
+    assert outside > 0.001 * steady.sum()
+
+
+def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(run):
+    _, cube = run(histogram())
+    steady, same = run(histogram(steady=False))
+    assert same == pytest.approx(cube, rel=1e-6) and steady.sum() == pytest.approx(cube.sum(), rel=1e-6)
+
+
+@pytest.mark.parametrize("spot", [False, True])
+def test_phasors_are_the_transform_of_fine_bins(run, spot):
+    frequencies = [0.0, 0.7, 2.5]
+    fine = film_of(GRID, GRID, 0.0, 4096, 0.001)
+    _, cube = run(fine, spot)
+    film = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0, 0.7, 2.5", start_opl=0.3)
+    steady, phasors = run(film, spot)
+    centers = 0.001 * (np.arange(4096) + 0.5) - 0.3
+    for f, frequency in enumerate(frequencies):
+        expected = (cube[..., 0] * np.exp(-2j * np.pi * frequency * centers)).sum(-1)
+        found = phasors[:, :, f, 0] + 1j * phasors[:, :, f, 1]
+        # Within a bin the phase changes by 2 pi nu 0.5 mm at most, at random.
+        assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
+    assert steady[..., 0] == pytest.approx(phasors[:, :, 0, 0], rel=1e-5)
+
+
+def test_phasors_in_several_launches(run, monkeypatch):
+    film = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0.7, 2.5")
+    _, whole = run(film)
+    for most in (24, 1):
+        monkeypatch.setattr(type(film), "lanes_at_most", lambda self, events, most=most: most)
+        assert len(launches.launches_of(film, GRID**2, COUNT)) > 4
+        _, parts = run(film)
+        assert parts == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
+
+
+def test_gates_are_sums_of_bins(run):
+    _, cube = run(histogram())
+    film = film_of(GRID, GRID, type="gated_hdr_film", gates="rectangular 1.2 2.2; rectangular 2.2 3.2")
+    _, gated = run(film)
+    expected = cube.reshape(GRID, GRID, 2, 20, 1).sum(3)
+    assert gated == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("busy", [1, 13, 4096])
+def test_lanes_of_a_pixel_add_up(run, monkeypatch, busy):
+    _, expected = run(histogram())
+    monkeypatch.setattr(launches, "_BUSY", dict.fromkeys(launches._BUSY, busy))
+    monkeypatch.setattr(launches, "_CONNECTIONS", 700)
+    fractions = []
+    _, cube = run(histogram(), progress=fractions.append)
+    assert cube == pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
+    assert fractions == pytest.approx([k / 3 for k in (1, 2, 3)])
+
+
+def test_legs_are_path_length(body):
+    points, normals = wall_grid(GRID, 0.4)
+    cubes = []
+    for leg in (0.0, 0.1):
+        film = histogram()
+        sensors = wall_of(points, normals, leg=leg)
+        cubes.append(captured(film, lambda s=sensors, f=film: ThirdBounce(body[0], f, body[1], s).add_confocal())[1])
+    # To the scan point and back: 0.2 m, four bins; what lies at the rim of a bin may be rounded to either side.
+    moved = np.abs(cubes[1][:, :, 4:] - cubes[0][:, :, :-4]).sum()
+    assert moved < 0.01 * cubes[0].sum()
+
+
+def test_arguments_are_checked(body):
+    points, normals = wall_grid(GRID, 0.4)
+    sensors = wall_of(points, normals)
+    film = histogram()
+    with pytest.raises(SceneError, match="prepare"):
+        ThirdBounce(*(body[0], film, body[1], sensors))
+    film.prepare()
+    with pytest.raises(ShapeError, match="2 x 2 pixels and 9"):
+        ThirdBounce(body[0], film, body[1], wall_of(*wall_grid(3)))
+    job = ThirdBounce(body[0], film, body[1], sensors)
+    with pytest.raises(ShapeError, match="one laser spot, got 4"):
+        job.add_single(sensors)
+    with pytest.raises(ShapeError, match="9 spots"):
+        job.add_confocal(wall_of(*wall_grid(3)))
+    with pytest.raises(ShapeError, match="leg"):
+        WallPoints(sensors.p, sensors.n, 0.3, mi.Float64([1, 2]))
+    with mi.variant_context("llvm_ad_spectral"), pytest.raises(VariantError, match="spectral"):
+        ThirdBounce(None, film, None, None)

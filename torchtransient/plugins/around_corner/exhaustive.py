@@ -1,0 +1,209 @@
+"""Exhaustive captures: the laser falls on every one of its spots while every scan point is looked at.
+
+How samples are seen, ``cos cos / r^2`` where nothing stands in between and the distance, is found once for each pair
+of a sample and a point of the wall, one ray each, and kept in pairs of numbers. Every lane is a pair of a scan point
+and a laser spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many samples
+are in a block as memory allows, however many points there are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.plugins.around_corner.geometry import occluded, span
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.sampling.packed import packed_columns
+from torchtransient.plugins.transport.strategy import Local
+
+# Bytes of the pairs of numbers that are kept at a time, for scan points and laser spots together.
+MOST_BYTES = 2**28
+# Samples that one turn of the loop takes; blocks are filled up with samples that nothing reaches.
+UNROLLED = 4
+
+
+def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None = None) -> None:
+    """Light of all pairs, onto a film for exhaustive scans whose laser grid has a position for every spot, row by row.
+
+    ``reciprocal``: use that light goes either way, so that half of the pairs need no work. None: where that is exact
+    to the last digit, which it is where ``lasers`` and scan points are one object (legs too), normals are not
+    interpolated and the film is stored in one band. Raises SceneError, ShapeError.
+    """
+    film = job.film
+    if not film.exhaustive_scan:
+        raise SceneError(
+            "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
+            "exhaustive_scan, laser_scan_width and laser_scan_height."
+        )
+    if lasers.width != film.laser_count():
+        raise ShapeError(
+            f"add_exhaustive: expected a laser position of the film for every spot, got {film.laser_count()} and "
+            f"{lasers.width}."
+        )
+    possible = lasers is job.sensors and not job.samples.smooth and len(film.band_layout()) == 1
+    if reciprocal and not possible:
+        raise SceneError(
+            "add_exhaustive: reciprocity needs the scan points themselves as laser spots, normals that are not "
+            "interpolated, and a film of less than 2^32 values; leave reciprocal out."
+        )
+    mirrored = possible if reciprocal is None else reciprocal
+    points = job.sensors.width + (0 if lasers is job.sensors else lasers.width)
+    size = max(UNROLLED, MOST_BYTES // (8 * points) // UNROLLED * UNROLLED)
+    blocks = [(k, min(k + size, job.samples.count)) for k in range(0, job.samples.count, size)]
+    for number, (first, last) in enumerate(blocks):
+        block = SampleBlock(job, lasers, first, last)
+        for band, (row, rows) in enumerate(film.band_layout()):
+            _launch(job, block, lasers, band, row, rows, mirrored)
+            job.done((number + (band + 1) / len(film.band_layout())) / len(blocks), band)
+    if mirrored:
+        _mirror(film)
+
+
+class SampleBlock:
+    """Samples ``first`` to ``last`` (exclusive): how scan points and laser spots see them, and their colours. A plain
+    class.
+
+    ``seen``, ``lit``: ``[g, r]`` for each sample and point, sample by sample, ``g`` negative where the back of the
+    sample is seen. One colour is split evenly among both ``g``, as a square root, so that it needs no load of its own.
+    """
+
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, first: int, last: int) -> None:
+        self.colours = len(job.energy)
+        self.first, self.count = first, last - first
+        # Filled up, with rows of zeros.
+        self.rows = -(-self.count // UNROLLED) * UNROLLED
+        self.size = dr.opaque(mi.UInt32, self.rows)
+        self.values = None
+        if self.colours > 1:
+            sample = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, self.count)
+            weight = dr.gather(mi.Float, job.samples.weight, sample)
+            sides = [
+                dr.gather(mi.UnpolarizedSpectrum, s, sample) * weight for s in (job.samples.front, job.samples.back)
+            ]
+            self.values = packed_columns([[*side, mi.Float(0)] for side in sides], self.rows)
+        self.seen = self._visibility(job, job.sensors, from_laser=False)
+        same = lasers is job.sensors and not job.samples.smooth
+        self.lit = self.seen if same else self._visibility(job, lasers, from_laser=True)
+
+    def _visibility(self, job: ThirdBounce, points: WallPoints, from_laser: bool) -> Any:
+        samples, width = job.samples, dr.opaque(mi.UInt32, points.width)
+        lane = dr.arange(mi.UInt32, self.count * points.width)
+        row = lane // width
+        k = row + dr.opaque(mi.UInt32, self.first)
+        p, n, _, _ = points.take(lane - row * width)
+        shading_n = mi.Vector3f(dr.gather(mi.Normal3f, samples.n, k))
+        geometric_n = mi.Vector3f(dr.gather(mi.Normal3f, samples.geometric_n, k)) if samples.smooth else shading_n
+        sample = Local(p=dr.gather(mi.Point3f, samples.p, k), n=shading_n, geometric_n=geometric_n)
+        line = span(sample, p, mi.Vector3f(n))
+        value = dr.select(
+            line.cos > 0,
+            dr.gather(mi.UnpolarizedSpectrum, samples.front, k),
+            dr.gather(mi.UnpolarizedSpectrum, samples.back, k),
+        )
+        cos = line.cos if from_laser else line.geometric_cos
+        g = dr.abs(cos) * line.wall_cos * line.inverse_square
+        if self.colours == 1:
+            g *= dr.sqrt(value[0] * dr.gather(mi.Float, samples.weight, k))
+        active = (g > 0) & (dr.max(value) > 0)
+        active &= ~occluded(job.scene, sample, line, p, mi.Vector3f(n), active)
+        g = dr.select(active, dr.mulsign(g, line.cos), 0)
+        table = dr.zeros(mi.Float, 2 * self.rows * points.width)
+        dr.scatter(table, mi.Vector2f(g, line.r), lane)
+        dr.eval(table)
+        return table
+
+
+class Pairs:
+    """What the lanes of a launch know of their pairs: constants of the loop, a plain object."""
+
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, laser: Any) -> None:
+        _, _, value, leg = job.sensors.take(pixel)
+        _, _, spot_value, spot_leg = lasers.take(laser)
+        self.factor = value * job.energy * spot_value
+        self.opl = leg + spot_leg - job.film.start_opl
+        self.pixel, self.laser = pixel, laser
+        self.sensor_count = dr.opaque(mi.UInt32, job.sensors.width)
+        self.spot_count = dr.opaque(mi.UInt32, lasers.width)
+        dr.eval(self.factor, self.opl, self.pixel, self.laser)
+
+
+def _launch(
+    job: ThirdBounce, block: SampleBlock, lasers: WallPoints, band: int, row: int, rows: int, mirrored: bool
+) -> None:
+    film = job.film
+    width = int(film.crop_size()[0])
+    lane = dr.arange(mi.UInt32, width * rows * lasers.width)
+    local = lane // dr.opaque(mi.UInt32, lasers.width)
+    laser = lane - local * dr.opaque(mi.UInt32, lasers.width)
+    pixel = local + dr.opaque(mi.UInt32, row * width)
+    pairs = Pairs(job, lasers, pixel, laser)
+    wanted = pixel <= laser if mirrored else mi.Mask(True)
+    base = film.pixel_base(local * film.entries_per_pixel(), laser)
+    target = film.create_block(Local(band=band), base, job.match, 1, exclusive=True)
+    kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
+    kept = sum_over_block(job, block, pairs, target, kept, wanted)
+    _count(film, job.match, pixel, kept, wanted)
+    if mirrored:
+        _count(film, job.match, laser, kept, pixel < laser)
+    dr.eval(film.bands[band][2], film.steady, film.outside)
+
+
+def _count(film: Any, match: Any, pixel: Any, kept: dict[str, Any], active: Any) -> None:
+    film.add_steady(pixel, [dr.select(active, c, 0) for c in match.to_channels(kept["L"])])
+    film.add_outside(pixel, dr.select(active, kept["before"], 0), dr.select(active, kept["after"], 0))
+
+
+@dr.syntax
+def sum_over_block(job, block, pairs, target, kept, wanted):
+    """What the samples of a block send from each lane's laser spot to its scan point, into the film's block."""
+    k = mi.UInt32(0)
+    going = mi.Mask(wanted)
+    while dr.hint(going, label="pairs of points"):
+        for u in range(UNROLLED):
+            deposit(job, block, pairs, target, kept, k + u)
+        k += UNROLLED
+        going &= k < block.size
+    return kept
+
+
+def deposit(job, block, pairs, target, kept, k):
+    """One sample's light."""
+    seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
+    lit = dr.gather(mi.Vector2f, block.lit, k * pairs.spot_count + pairs.laser)
+    g = seen.x * lit.x
+    active = g > 0
+    opl = pairs.opl + mi.Float64(seen.y + lit.y)
+    if job.window is not None:
+        active &= job.window.counts(opl)
+    value = pairs.factor * g
+    if block.values is not None:
+        row = dr.gather(mi.Vector4f, block.values, 2 * k + dr.select(seen.x > 0, mi.UInt32(0), 1), active)
+        value *= mi.UnpolarizedSpectrum(row.x, row.y, row.z)
+    kept["L"] = kept["L"] + dr.select(active, value, 0)
+    before, after = target.put({}, opl, value, active)
+    kept["before"] = kept["before"] + before
+    kept["after"] = kept["after"] + after
+
+
+def _mirror(film: Any) -> None:
+    """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
+    cube = film.band_array(0)
+    points, size = film.laser_count(), film.temporal_bins * film.channel_count()
+    # Row by row of scan points: what is in flight stays small.
+    at_once = max(1, 2**24 // (points * size))
+    for first in range(0, points, at_once):
+        rows = min(at_once, points - first)
+        i = dr.arange(mi.UInt32, rows * points * size)
+        entry = i % dr.opaque(mi.UInt32, size)
+        pair = i // dr.opaque(mi.UInt32, size)
+        point = pair // dr.opaque(mi.UInt32, points)
+        laser, point = pair - point * dr.opaque(mi.UInt32, points), point + dr.opaque(mi.UInt32, first)
+        below = laser < point
+        other = (laser * points + point) * size + entry
+        value = dr.gather(type(cube), cube, other, below)
+        dr.scatter(cube, value, (point * points + laser) * size + entry, below)
+        dr.eval(cube)

@@ -1,0 +1,50 @@
+"""From a hidden point to a point of the wall: cosines, distance, and whether something is in between."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.transport.strategy import Local
+
+
+def span(sample: Any, p: Any, n: Any) -> Local:
+    """The straight line from samples to wall points ``p`` with normals ``n``.
+
+    ``r`` (metres), ``cos`` (of the shading normal there, signed), ``geometric_cos`` (signed), ``wall_cos`` (0 behind
+    the wall), ``inverse_square`` (1 / r^2), ``d`` (not normalized).
+    """
+    d = mi.Vector3f(p - sample.p)
+    square = dr.squared_norm(d)
+    inverse = dr.rsqrt(square)
+    cos = dr.dot(sample.n, d) * inverse
+    geometric_cos = cos if sample.geometric_n is sample.n else dr.dot(sample.geometric_n, d) * inverse
+    wall_cos = dr.maximum(-dr.dot(n, d) * inverse, 0)
+    return Local(
+        d=d,
+        r=square * inverse,
+        cos=cos,
+        geometric_cos=geometric_cos,
+        wall_cos=wall_cos,
+        inverse_square=inverse * inverse,
+    )
+
+
+def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) -> Any:
+    """Whether something stands between samples and wall points.
+
+    Both ends are moved off their surfaces along the geometric normals, by what single precision leaves of the largest
+    coordinate on the way: on curved meshes neighbouring triangles are not met, whatever the scale of the scene.
+    """
+    # No coordinate of the sample exceeds the largest of the wall point by more than the distance.
+    reach = dr.max(dr.abs(p)) + line.r
+    offset = mi.math.RayEpsilon * reach
+    start = mi.Point3f(sample.p + sample.geometric_n * dr.mulsign(offset, line.geometric_cos))
+    ray = dr.zeros(mi.Ray3f)
+    ray.o = start
+    ray.d = mi.Vector3f(p + mi.Vector3f(n) * offset - start)
+    # The end lies before the wall already: what remains is the rounding of the length itself.
+    ray.maxt = mi.Float(1 - mi.math.RayEpsilon)
+    return scene.ray_test(ray, False, active)

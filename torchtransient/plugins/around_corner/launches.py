@@ -1,0 +1,104 @@
+"""The kernel launches of a capture: which pixels, which samples, how many lanes a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Lanes that keep all cores busy: with fewer scan points each gets several lanes, which then add atomically.
+_BUSY = {dr.JitBackend.LLVM: 2**12}
+_BUSY_GPU = 2**17
+# Connections of one launch, so that a progress bar moves: some ten seconds of one core.
+_CONNECTIONS = 2**28
+# Samples that a lane lists as events, for films that sum events up afterwards.
+EVENTS = 16
+
+
+@dataclass
+class Launch:
+    """``rows`` rows of pixels from ``first_row`` on in one storage band, samples ``first`` to ``last`` (exclusive), in
+    ``spp`` lanes each (named as the film asks for it).
+    """
+
+    band: int
+    first_row: int
+    rows: int
+    spp: int
+    width: int
+    band_first_row: int
+    first: int
+    last: int
+    most_events: int
+    lists_events: bool
+
+    @property
+    def chunks(self) -> int:
+        """Lanes of a pixel."""
+        return self.spp
+
+    def lanes(self) -> tuple[Any, Any, Any]:
+        """Pixel of every lane, its first sample and the last one (exclusive), ``UInt32``."""
+        pixels = self.width * self.rows
+        lane = dr.arange(mi.UInt32, pixels * self.chunks)
+        if self.chunks == 1:
+            pixel, chunk = lane, mi.UInt32(0)
+        elif self.lists_events:
+            # The events of a pixel stand together.
+            chunks = dr.opaque(mi.UInt32, self.chunks)
+            pixel = lane // chunks
+            chunk = lane - pixel * chunks
+        else:
+            # Neighbouring lanes have the same samples, which are loaded once.
+            count = dr.opaque(mi.UInt32, pixels)
+            chunk = lane // count
+            pixel = lane - chunk * count
+        size = -(-(self.last - self.first) // self.chunks)
+        first = dr.opaque(mi.UInt32, self.first) + chunk * dr.opaque(mi.UInt32, size)
+        last = dr.minimum(first + dr.opaque(mi.UInt32, size), dr.opaque(mi.UInt32, self.last))
+        return pixel + dr.opaque(mi.UInt32, self.first_row * self.width), first, last
+
+    def base(self, film: Any, pixel: Any) -> Any:
+        """Index of the first value of each lane's pixel in its band."""
+        return (pixel - dr.opaque(mi.UInt32, self.band_first_row * self.width)) * film.entries_per_pixel()
+
+
+def launches_of(film: Any, points: int, samples: int) -> list[Launch]:
+    """The launches that bring ``samples`` samples to ``points`` scan points."""
+    width = int(film.crop_size()[0])
+    most = film.lanes_at_most(EVENTS)
+    found = []
+    for band, (band_first, band_rows) in enumerate(film.band_layout()):
+        if most is None:
+            found += _with_sums(band, band_first, band_rows, width, samples)
+        else:
+            found += _with_events(band, band_first, band_rows, width, samples, most)
+    return found
+
+
+def _with_sums(band: int, first_row: int, rows: int, width: int, samples: int) -> list[Launch]:
+    """A lane for each pixel, several where there are few."""
+    busy = _BUSY.get(dr.backend_v(mi.Float), _BUSY_GPU)
+    pixels = width * rows
+    block = min(samples, max(1, _CONNECTIONS // pixels))
+    chunks = min(max(1, busy // pixels), block)
+    return [
+        Launch(band, first_row, rows, chunks, width, first_row, k, min(k + block, samples), 1, False)
+        for k in range(0, samples, block)
+    ]
+
+
+def _with_events(band: int, band_first: int, rows: int, width: int, samples: int, most: int) -> list[Launch]:
+    """Lanes of ``EVENTS`` samples each, at most ``most`` of them in a launch."""
+    chunks = min(-(-samples // EVENTS), max(1, most // width))
+    at_once = max(1, most // (width * chunks))
+    found = []
+    for row in range(band_first, band_first + rows, at_once):
+        height = min(at_once, band_first + rows - row)
+        for k in range(0, samples, chunks * EVENTS):
+            last = min(k + chunks * EVENTS, samples)
+            lanes = -(-(last - k) // EVENTS)
+            found.append(Launch(band, row, height, lanes, width, band_first, k, last, EVENTS, True))
+    return found

@@ -1,0 +1,189 @@
+"""Light of three bounces, laser spot, hidden point, scan point, from hidden samples that all scan points share.
+
+A laser of energy ``Q`` falls on the wall at ``l``, which scatters ``value_l cos Q`` (radiance times area). A hidden
+point ``x`` of a diffuse surface lights the scan point ``s``, and the pixel is the radiance that leaves ``s``::
+
+    value_s value_l Q f(x) cos(x, l) cos(l) / r_l^2 cos(x, s) cos(s) / r_s^2        at r_l + r_s + legs
+
+summed over samples ``x`` times the area that each stands for. Where normals are interpolated, the cosine towards the
+laser is that of the shading normal and the one towards the scan point that of the surface, as in a path that is traced
+from the sensor. Every lane has a scan point (several lanes do, where there are few of them) and loops over the samples,
+so that it owns its histogram and no sum is atomic.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import SceneError, ShapeError, VariantError
+from torchtransient.plugins.around_corner.geometry import occluded, span
+from torchtransient.plugins.around_corner.launches import Launch, launches_of
+from torchtransient.plugins.around_corner.sample_table import SampleTable
+from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.films.colour import ChannelMatch
+from torchtransient.plugins.sampling.shared_samples import SharedSamples
+from torchtransient.plugins.transport.strategy import Local
+
+
+class ThirdBounce:
+    """One capture: scene, film and samples, and the points that ``add_confocal`` and ``add_single`` go through.
+
+    ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
+    will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
+    ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall too.
+    ``progress(fraction)`` is called after every kernel launch.
+
+    Light outside of the film's window is counted as the film does. Raises SceneError, ShapeError, VariantError. Not
+    supported: spectral and polarized variants; derivatives.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        film: Any,
+        samples: SharedSamples,
+        sensors: WallPoints,
+        energy: Any = 1.0,
+        progress: Any = None,
+    ) -> None:
+        if mi.is_spectral or mi.is_polarized:
+            raise VariantError(
+                f"ThirdBounce: expected a mono or RGB variant without polarization, got {mi.variant()}. Use the "
+                "general path integrator."
+            )
+        width, height = (int(size) for size in film.crop_size())
+        if sensors.width != width * height:
+            raise ShapeError(
+                f"ThirdBounce: expected a pixel of the film for every scan point, got {width} x {height} pixels and "
+                f"{sensors.width} points."
+            )
+        if film.steady is None:
+            raise SceneError("ThirdBounce: expected a film that is prepared; call film.prepare(samples=...) before.")
+        self.scene, self.film, self.samples, self.sensors = scene, film, samples, sensors
+        self.energy = mi.UnpolarizedSpectrum(energy)
+        dr.make_opaque(self.energy)
+        self.match = ChannelMatch(None, mi.UnpolarizedSpectrum(1))
+        self.window = film.arrivals()
+        self.progress = progress
+
+    def add_confocal(self, lasers: WallPoints | None = None) -> None:
+        """The laser falls on each scan point while that one is looked at. ``lasers``: the same points with the legs and
+        albedo of the laser's side, where those differ.
+        """
+        lasers = self.sensors if lasers is None else lasers
+        if lasers.width != self.sensors.width:
+            raise ShapeError(
+                "add_confocal: expected a laser spot for every scan point, got "
+                f"{lasers.width} spots and {self.sensors.width} points."
+            )
+        self._check_not_exhaustive("add_confocal")
+        self._run(SampleTable(self.samples), lasers)
+
+    def add_single(self, laser: WallPoints) -> None:
+        """The laser falls on one spot all the time."""
+        if laser.width != 1:
+            raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
+        self._check_not_exhaustive("add_single")
+        self._run(lit_by(self.scene, self.samples, laser), laser)
+
+    def _check_not_exhaustive(self, name: str) -> None:
+        if self.film.exhaustive_scan:
+            raise SceneError(
+                f"{name}: expected a film with one histogram a pixel, got one for exhaustive scans. Use "
+                "exhaustive.add_exhaustive, or set exhaustive_scan to false."
+            )
+
+    def _run(self, table: SampleTable, lasers: WallPoints) -> None:
+        launches = launches_of(self.film, self.sensors.width, table.count)
+        for i, launch in enumerate(launches):
+            self._launch(table, lasers, launch)
+            self.done((i + 1) / len(launches), launch.band)
+
+    def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch) -> None:
+        film = self.film
+        pixel, first, last = launch.lanes()
+        lane = ScanLanes(self, lasers, pixel, table.lit)
+        block = film.create_block(
+            launch, launch.base(film, pixel), self.match, launch.most_events, exclusive=launch.chunks == 1
+        )
+        kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
+        kept = sum_over_samples(self, table, lane, block, kept, first, last)
+        block.end(kept["block"])
+        film.add_steady(pixel, self.match.to_channels(kept["L"]))
+        film.add_outside(pixel, kept["before"], kept["after"])
+        block.finish()
+
+    def done(self, fraction: float, band: int) -> None:
+        """Run what is recorded."""
+        dr.eval(self.film.bands[band][2], self.film.steady, self.film.outside)
+        if self.progress:
+            dr.sync_thread()
+            self.progress(fraction)
+
+
+class ScanLanes:
+    """What the lanes of a launch know of their scan points and laser spots: constants of the loop, a plain object."""
+
+    def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool) -> None:
+        self.p, n, value, leg = job.sensors.take(pixel)
+        self.n = mi.Vector3f(n)
+        _, _, spot_value, spot_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        # What arrives at the samples of one spot holds neither the spot's albedo nor the energy.
+        self.factor = value * job.energy * spot_value
+        self.opl = leg + spot_leg - job.film.start_opl
+        dr.eval(self.p, self.n, self.factor, self.opl)
+
+
+@dr.syntax
+def sum_over_samples(job, table, lane, block, kept, first, last):
+    """What the samples from ``first`` to ``last`` (exclusive) send to the lanes' scan points, into the film's block."""
+    k = mi.UInt32(first)
+    while dr.hint(k < last, label="hidden samples"):
+        deposit(job, table, lane, block, kept, k)
+        k += 1
+    return kept
+
+
+def deposit(job, table, lane, block, kept, k):
+    """One sample's light."""
+    sample = table.load(k)
+    line = span(sample, lane.p, lane.n)
+    if table.lit:
+        side, value, opl = line.cos > 0, sample.front, line.r + sample.delay
+        geometry = dr.abs(line.geometric_cos) * line.wall_cos * line.inverse_square
+    else:
+        side, opl = line.cos != 0, 2 * line.r
+        value = dr.select(line.cos > 0, sample.front, sample.back)
+        geometry = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
+    value = value * geometry
+    opl = lane.opl + mi.Float64(opl)
+    active = side & (dr.max(value) > 0)
+    if job.window is not None:
+        active &= job.window.counts(opl)
+    active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
+    value = value * lane.factor
+    kept["L"] = kept["L"] + dr.select(active, value, 0)
+    before, after = block.put(kept["block"], opl, value, active)
+    kept["before"] = kept["before"] + before
+    kept["after"] = kept["after"] + after
+
+
+def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable:
+    """The samples with what reaches them from one laser spot, one ray for each."""
+    sample = _as_lines(samples)
+    p, n, _, _ = laser.take(mi.UInt32(0))
+    line = span(sample, p, mi.Vector3f(n))
+    arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
+    reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
+    active = (arrives > 0) & (dr.max(reflected) > 0)
+    active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), active)
+    front = dr.select(active, reflected * arrives, 0)
+    return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
+
+
+def _as_lines(samples: SharedSamples) -> Any:
+    n = mi.Vector3f(samples.n)
+    return Local(p=samples.p, n=n, geometric_n=mi.Vector3f(samples.geometric_n) if samples.smooth else n)
