@@ -143,12 +143,13 @@ class MutualOcclusion:
         number = lane - lane // dr.opaque(mi.UInt32, job.spp) * dr.opaque(mi.UInt32, job.spp)
         # Every pixel has points of its own.
         seed, _ = mi.sample_tea_32(mi.UInt32(job.seed), pixel)
-        index, u, pmf, sides = self.edges.sample(*plane_point(number, job.spp, seed))
+        x, u = plane_point(number, job.spp, seed)
+        index, per_edge = self.edges.sample(x)
         a, b = self.edges.end_points(index)
         along = dr.detach(b) - dr.detach(a)
         length = dr.norm(along)
-        p = dr.lerp(a, b, u)
-        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length / pmf)
+        p, sides = dr.lerp(a, b, u), self.edges.third_corners(index)
+        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length * per_edge)
 
     def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
         """The boundary term of one viewpoint."""
@@ -172,7 +173,10 @@ class MutualOcclusion:
             beyond = dr.norm(si.p - viewer.p)
             active &= si.is_valid() & (beyond > distance * (1 - BEFORE))
             value, opl, active = self._light(place, si, from_spot, active)
-            value *= -dr.select(active, edge.weight * spans / distance, 0)
+            weight = -edge.weight * spans / distance
+            if not self.spots.confocal:
+                weight *= self._seen_otherwise(place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active)
+            value *= dr.select(active, weight, 0)
         sweep = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
         return Local(value=value, sweep=dr.select(active, sweep, 0), opl=opl, active=active)
 
@@ -184,9 +188,6 @@ class MutualOcclusion:
         d_seen, d_spot = to_hidden / r_seen, to_spot / r_spot
         cos_seen, cos_spot = dr.abs_dot(si.n, d_seen), dr.abs_dot(si.n, d_spot)
         active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
-        if not self.spots.confocal:
-            other = seen if from_spot else lit
-            active &= ~world.scene.ray_test(si.spawn_ray_to(other.p), active)
         at_wall = self._scattered(seen, place.ray.d, d_seen, active)
         hidden = self._scattered(si, d_seen, d_spot, active)
         light = self.spots.light(lit, d_spot, active)
@@ -196,6 +197,17 @@ class MutualOcclusion:
         opl = place.before + mi.Float64((r_seen + r_spot) * place.η)
         active = world.counted(active, opl)
         return dr.select(active, value * measure, 0), opl, active
+
+    def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
+        """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).
+
+        The mean of both sides of the outline, ``d`` pointing to the one that is hidden: where a spot, a scanned point
+        and an edge lie in one plane, both viewpoints have the same outline, which counts once and not twice.
+        """
+        hidden = dr.copy(si)
+        hidden.p = mi.Point3f(viewer.p + d * (dr.dot(si.n, si.p - viewer.p) / dr.dot(si.n, d)))
+        tests = [self.world.scene.ray_test(at.spawn_ray_to(other.p), active) for at in (si, hidden)]
+        return sum(dr.select(hit, mi.Float(0), 0.5) for hit in tests)
 
     def _scattered(self, si: Any, into: Any, out: Any, active: Any) -> Any:
         """Value of the BSDF between the frames of the segments: the ray of direction ``into`` goes on by ``out``."""

@@ -71,10 +71,10 @@ def mutual_occlusion(
     shapes = list(world.scene.shapes())
     moving = {k for k, shape in enumerate(shapes) if shape.ptr in wanted.shapes}
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
-    parts = parts_of(shapes)
+    parts, triangles = parts_of(shapes)
 
     def of_interest(i: int, j: int) -> bool:
-        return moves_viewpoints or parts[i].shape in moving or parts[j].shape in moving
+        return bool(moves_viewpoints or moving & parts[i].shapes or moving & parts[j].shapes)
 
     pairs = hiding_pairs(parts, viewpoints.p, of_interest)
     if not pairs:
@@ -86,7 +86,7 @@ def mutual_occlusion(
     if not hiders:
         return None
     rows = viewpoints.references
-    edges = EdgeTable([(shapes[parts[i].shape], parts[i].edges) for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
+    edges = EdgeTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
     sampler = sensor.sampler().clone()
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
@@ -98,10 +98,10 @@ def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -
     """Up to three of the pairs in words."""
 
     def name(part: Part) -> str:
-        return repr(shapes[part.shape].id() or shapes[part.shape].class_name())
+        return " and ".join(repr(shapes[k].id() or shapes[k].class_name()) for k in sorted(part.shapes))
 
     words = [
-        f"{name(parts[i])} hides another part of itself" if parts[i].shape == parts[j].shape
+        f"{name(parts[i])} hides another part of itself" if name(parts[i]) == name(parts[j])
         else f"{name(parts[i])} hides {name(parts[j])}"
         for i, j in pairs
     ]  # fmt: skip

@@ -138,4 +138,8 @@ def _points_of(props: Any, name: str) -> Any:
 
 register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
 _PLACE = ParameterEffect(moves_length=True, role="sensor")
-declare_effects(NLOSCaptureMeter, dict.fromkeys(("sensor_origin", "points", "laser_points", "laser_origin"), _PLACE))
+# The rays of the sensor do not follow the laser.
+_LASER = ParameterEffect(moves_length=True, role="emitter")
+declare_effects(
+    NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER, "laser_origin": _LASER}
+)
