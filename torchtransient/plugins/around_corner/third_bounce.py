@@ -107,7 +107,12 @@ class ThirdBounce:
         pixel, first, last = launch.lanes()
         lane = ScanLanes(self, lasers, pixel, table.lit)
         block = film.create_block(
-            launch, launch.base(film, pixel), self.match, launch.most_events, exclusive=launch.chunks == 1
+            launch,
+            launch.base(film, pixel),
+            self.match,
+            launch.most_events,
+            exclusive=launch.chunks == 1,
+            origin=lane.origin,
         )
         kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
         kept = sum_over_samples(self, table, lane, block, kept, first, last)
@@ -130,11 +135,11 @@ class ScanLanes:
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool) -> None:
         self.p, n, value, leg = job.sensors.take(pixel)
         self.n = mi.Vector3f(n)
-        _, _, spot_value, spot_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        _, _, laser_value, laser_leg = lasers.take(mi.UInt32(0) if lit else pixel)
         # What arrives at the samples of one spot holds neither the spot's albedo nor the energy.
-        self.factor = value * job.energy * spot_value
-        self.opl = leg + spot_leg - job.film.start_opl
-        dr.eval(self.p, self.n, self.factor, self.opl)
+        self.factor = value * job.energy * laser_value
+        self.origin = leg + laser_leg - job.film.start_opl
+        dr.eval(self.p, self.n, self.factor, self.origin)
 
 
 @dr.syntax
@@ -159,10 +164,9 @@ def deposit(job, table, lane, block, kept, k):
         value = dr.select(line.cos > 0, sample.front, sample.back)
         geometry = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
     value = value * geometry
-    opl = lane.opl + mi.Float64(opl)
     active = side & (dr.max(value) > 0)
     if job.window is not None:
-        active &= job.window.counts(opl)
+        active &= job.window.counts(block.counted(opl))
     active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
     value = value * lane.factor
     kept["L"] = kept["L"] + dr.select(active, value, 0)
