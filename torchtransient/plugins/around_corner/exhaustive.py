@@ -34,6 +34,7 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
     interpolated and the film is stored in one band. Raises SceneError, ShapeError.
     """
     film = job.film
+    job.check_region(lasers)
     if not film.exhaustive_scan:
         raise SceneError(
             "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
@@ -109,7 +110,7 @@ class SampleBlock:
         if self.colours == 1:
             g *= dr.sqrt(value[0] * dr.gather(mi.Float, samples.weight, k))
         active = (g > 0) & (dr.max(value) > 0)
-        active &= ~occluded(job.scene, sample, line, p, mi.Vector3f(n), active)
+        active &= ~occluded(job.scene, sample, line, p, mi.Vector3f(n), active & (k >= samples.clear))
         g = dr.select(active, dr.mulsign(g, line.cos), 0)
         table = dr.zeros(mi.Float, 2 * self.rows * points.width)
         dr.scatter(table, mi.Vector2f(g, line.r), lane)

@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.errors import SceneError, ShapeError, VariantError
 from torchtransient.plugins.around_corner.geometry import occluded, span
@@ -63,6 +64,7 @@ class ThirdBounce:
         if film.steady is None:
             raise SceneError("ThirdBounce: expected a film that is prepared; call film.prepare(samples=...) before.")
         self.scene, self.film, self.samples, self.sensors = scene, film, samples, sensors
+        self.check_region(sensors)
         self.energy = mi.UnpolarizedSpectrum(energy)
         dr.make_opaque(self.energy)
         self.match = ChannelMatch(None, mi.UnpolarizedSpectrum(1))
@@ -80,6 +82,7 @@ class ThirdBounce:
                 f"{lasers.width} spots and {self.sensors.width} points."
             )
         self._check_not_exhaustive("add_confocal")
+        self.check_region(lasers)
         self._run(SampleTable(self.samples), lasers)
 
     def add_single(self, laser: WallPoints) -> None:
@@ -87,7 +90,16 @@ class ThirdBounce:
         if laser.width != 1:
             raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
         self._check_not_exhaustive("add_single")
+        self.check_region(laser)
         self._run(lit_by(self.scene, self.samples, laser), laser)
+
+    def check_region(self, points: WallPoints) -> None:
+        """Raise ShapeError for points that samples without visibility rays were not told of."""
+        if self.samples.has_clear and not self.samples.region.holds(np.array(points.p, dtype=float).T):
+            raise ShapeError(
+                "ThirdBounce: expected points within the region that shafts.spare_rays was given, got others; hand all "
+                "scan points and laser spots to it."
+            )
 
     def _check_not_exhaustive(self, name: str) -> None:
         if self.film.exhaustive_scan:
@@ -115,7 +127,11 @@ class ThirdBounce:
             origin=lane.origin,
         )
         kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
-        kept = sum_over_samples(self, table, lane, block, kept, first, last)
+        if self.samples.has_clear:
+            clear = dr.clip(self.samples.clear, first, last)
+            kept = sum_over_samples(self, table, lane, block, kept, (first, clear), False)
+            first = clear
+        kept = sum_over_samples(self, table, lane, block, kept, (first, last), True)
         block.end(kept["block"])
         film.add_steady(pixel, self.match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
@@ -143,16 +159,18 @@ class ScanLanes:
 
 
 @dr.syntax
-def sum_over_samples(job, table, lane, block, kept, first, last):
-    """What the samples from ``first`` to ``last`` (exclusive) send to the lanes' scan points, into the film's block."""
-    k = mi.UInt32(first)
+def sum_over_samples(job, table, lane, block, kept, numbers, rays):
+    """What the samples of these ``numbers``, from the first to the last (exclusive), send to the lanes' scan points,
+    into the film's block. ``rays``: whether something may hide them.
+    """
+    k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
-        deposit(job, table, lane, block, kept, k)
+        deposit(job, table, lane, block, kept, k, rays)
         k += 1
     return kept
 
 
-def deposit(job, table, lane, block, kept, k):
+def deposit(job, table, lane, block, kept, k, rays):
     """One sample's light."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
@@ -167,7 +185,8 @@ def deposit(job, table, lane, block, kept, k):
     active = side & (dr.max(value) > 0)
     if job.window is not None:
         active &= job.window.counts(block.counted(opl))
-    active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
+    if rays:
+        active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
     value = value * lane.factor
     kept["L"] = kept["L"] + dr.select(active, value, 0)
     before, after = block.put(kept["block"], opl, value, active)
@@ -183,7 +202,8 @@ def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable
     arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
     reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
     active = (arrives > 0) & (dr.max(reflected) > 0)
-    active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), active)
+    in_doubt = active & (dr.arange(mi.UInt32, samples.count) >= samples.clear)
+    active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), in_doubt)
     front = dr.select(active, reflected * arrives, 0)
     return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
 

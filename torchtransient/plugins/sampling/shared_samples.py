@@ -25,7 +25,9 @@ class SharedSamples:
     false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
     and of the other one; ``weight`` (``Float``): one over ``count`` times the density per area, so that a mean over the
     area is a sum over samples; ``element`` (``UInt32``): number in the table; ``shape``, ``primitive``, ``u``
-    (``Point2f``): the material point, the same for other positions of the shape.
+    (``Point2f``): the material point, the same for other positions of the shape. ``clear`` (``UInt32`` of width one):
+    how many samples, the first ones, nothing hides from any point that ``region.holds``; ``has_clear``: whether there
+    are elements of that kind.
     """
 
     count: int
@@ -40,6 +42,9 @@ class SharedSamples:
     primitive: Any
     u: Any
     smooth: bool
+    clear: Any
+    has_clear: bool
+    region: Any
 
 
 def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = None) -> SharedSamples:
@@ -75,6 +80,7 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = No
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
         element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
+        clear=dr.count(element < elements.clear_count), has_clear=elements.has_clear, region=elements.region,
     )  # fmt: skip
     dr.eval(samples)
     return samples
