@@ -156,6 +156,7 @@ def test_points_outside_of_the_region_are_refused():
         ThirdBounce(scene, film, samples, wall_of(points, normals)).add_single(wall_of([[0, 0.9, 0]], [[0, 0, 1]]))
 
 
+@pytest.mark.slow
 def test_time_grows_with_the_triangles_not_with_their_square():
     """200 000 triangles in seconds; four times as many triangles at most eight times the time."""
     points, normals = wall_grid(4)

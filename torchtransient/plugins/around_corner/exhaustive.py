@@ -40,6 +40,11 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
             "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
             "exhaustive_scan, laser_scan_width and laser_scan_height."
         )
+    if job.samples.tiles > 1:
+        raise SceneError(
+            "add_exhaustive: expected samples that all scan points share, got those of "
+            f"{job.samples.tiles} tiles; build HiddenElements without tiles."
+        )
     if lasers.width != film.laser_count():
         raise ShapeError(
             f"add_exhaustive: expected a laser position of the film for every spot, got {film.laser_count()} and "

@@ -35,7 +35,8 @@ class ThirdBounce:
     ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
     will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
     ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall too.
-    ``progress(fraction)`` is called after every kernel launch.
+    ``progress(fraction)`` is called after every kernel launch. ``tile`` (``UInt32``): which tile's samples each scan
+    point takes, where there are several.
 
     Light outside of the film's window is counted as the film does. Raises SceneError, ShapeError, VariantError. Not
     supported: spectral and polarized variants; derivatives.
@@ -49,6 +50,7 @@ class ThirdBounce:
         sensors: WallPoints,
         energy: Any = 1.0,
         progress: Any = None,
+        tile: Any = None,
     ) -> None:
         if mi.is_spectral or mi.is_polarized:
             raise VariantError(
@@ -61,9 +63,15 @@ class ThirdBounce:
                 f"ThirdBounce: expected a pixel of the film for every scan point, got {width} x {height} pixels and "
                 f"{sensors.width} points."
             )
+        if (samples.tiles > 1) != (tile is not None) or (tile is not None and dr.width(tile) != sensors.width):
+            raise ShapeError(
+                f"ThirdBounce: expected the tile of every scan point for samples of {samples.tiles} tiles, and none "
+                f"for one; got {'none' if tile is None else dr.width(tile)}."
+            )
         if film.steady is None:
             raise SceneError("ThirdBounce: expected a film that is prepared; call film.prepare(samples=...) before.")
         self.scene, self.film, self.samples, self.sensors = scene, film, samples, sensors
+        self.tile = tile
         self.check_region(sensors)
         self.energy = mi.UnpolarizedSpectrum(energy)
         dr.make_opaque(self.energy)
@@ -117,6 +125,7 @@ class ThirdBounce:
     def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch) -> None:
         film = self.film
         pixel, first, last = launch.lanes()
+        tile = mi.UInt32(0) if self.tile is None else dr.gather(mi.UInt32, self.tile, pixel)
         lane = ScanLanes(self, lasers, pixel, table.lit)
         block = film.create_block(
             launch,
@@ -127,8 +136,9 @@ class ThirdBounce:
             origin=lane.origin,
         )
         kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
+        clear = dr.clip(dr.gather(mi.UInt32, self.samples.clear, tile), first, last)
+        first, clear, last = (k + tile * dr.opaque(mi.UInt32, table.count) for k in (first, clear, last))
         if self.samples.has_clear:
-            clear = dr.clip(self.samples.clear, first, last)
             kept = sum_over_samples(self, table, lane, block, kept, (first, clear), False)
             first = clear
         kept = sum_over_samples(self, table, lane, block, kept, (first, last), True)
@@ -202,10 +212,17 @@ def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable
     arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
     reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
     active = (arrives > 0) & (dr.max(reflected) > 0)
-    in_doubt = active & (dr.arange(mi.UInt32, samples.count) >= samples.clear)
+    in_doubt = active & ~_clear(samples)
     active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), in_doubt)
     front = dr.select(active, reflected * arrives, 0)
     return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
+
+
+def _clear(samples: SharedSamples) -> Any:
+    """Which samples need no rays."""
+    k, count = dr.arange(mi.UInt32, samples.count * samples.tiles), dr.opaque(mi.UInt32, samples.count)
+    tile = k // count
+    return k - tile * count < dr.gather(mi.UInt32, samples.clear, tile)
 
 
 def _as_lines(samples: SharedSamples) -> Any:
