@@ -28,6 +28,7 @@ _LAZY = {
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
+    "nlos": "torchtransient.nlos",
     "render": "torchtransient.render.functional",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",

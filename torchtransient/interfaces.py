@@ -9,6 +9,7 @@ leaves something out is refused where it is registered (:func:`missing_members`)
 from __future__ import annotations
 
 import abc
+import enum
 from typing import Any, TypeGuard
 
 
@@ -313,3 +314,11 @@ def missing_members(plugin: type) -> list[str]:
 
 def _undefined(plugin: type, name: str) -> bool:
     return getattr(getattr(plugin, name, abc.abstractmethod(lambda: None)), "__isabstractmethod__", False)
+
+
+class CaptureType(enum.Enum):
+    """Which laser positions belong to a scanned point: one for all, its own, or each of a grid."""
+
+    SINGLE = 1
+    CONFOCAL = 2
+    EXHAUSTIVE = 3

@@ -99,10 +99,10 @@ class AreaOfShape(Guide):
         self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
         self.per_area = 1 / self.shape.surface_area()
 
-    def draw(self, world, vertex, sampler):
-        return self.shape.sample_position(0.0, sampler.next_2d()).p
+    def draw(self, world, vertex, u):
+        return self.shape.sample_position(0.0, u).p
 
-    def density(self, world, p, q, n, shape, active):
+    def density(self, world, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))
         per_area = solid_angle_over_area(p, q, n, on_it)
         return dr.select(on_it & (per_area > 0), self.per_area / per_area, 0)

@@ -26,6 +26,8 @@ _NUMBERS_IN_TEXT = (
 )  # fmt: skip
 # Entries of a bitmap or volume that hold pixels, not a transform, even when they happen to be 4 x 4.
 _ARRAY_KEYS = ("data", "bitmap", "grid")
+# The arrays of a mesh in the dictionary.
+_MESH, _MESH_KEYS = "mesh_arrays", ("vertices", "faces")
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,12 @@ class DictDescription:
         """Mitsuba's parser state."""
         import mitsuba as mi
 
-        return mi.parser.parse_dict(config, _to_mitsuba(self.tree, ""))
+        state = mi.parser.parse_dict(config, _to_mitsuba(self.tree, ""))
+        for node in state.nodes:
+            # Mitsuba learns the kind of a plugin written in Python when it builds it.
+            if node.type == mi.ObjectType.Unknown and plugins.kind_of(node.props.plugin_name()) == "shape":
+                node.type = mi.ObjectType.Shape
+        return state
 
     @contextmanager
     def resolved_files(self) -> Iterator[None]:
@@ -291,7 +298,10 @@ def _to_mitsuba(value: Any, key: str) -> Any:
     import mitsuba as mi
 
     if isinstance(value, dict):
-        return {name: _to_mitsuba(item, name) for name, item in value.items()}
+        rows = _MESH_KEYS if value.get("type") == _MESH else ()
+        return {
+            name: _mesh_rows(item, name) if name in rows else _to_mitsuba(item, name) for name, item in value.items()
+        }
     if isinstance(value, Pixels):
         return value.to_bitmap()
     if isinstance(value, np.ndarray):
@@ -305,3 +315,13 @@ def _to_mitsuba(value: Any, key: str) -> Any:
             return value.tolist()
         return mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
     return value
+
+
+def _mesh_rows(value: Any, key: str) -> Any:
+    """Vertices or faces in one row: an array of three rows Mitsuba would take for a colour or a point."""
+    import mitsuba as mi
+
+    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.shape[1] != 3 or value.dtype.kind not in "fiu":
+        got = f"shape {value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise SceneError(f"{_MESH}: expected {key} as rows of three numbers, an array (N, 3), got {got}.")
+    return mi.TensorXd(np.ascontiguousarray(value, dtype=np.float64).reshape(1, -1))

@@ -179,6 +179,8 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     elif kind == "integer":
         reason = "a list of vertex numbers" if name == "faces" else "not a real number"
         effect = replace(effect, supported=False, reason=reason)
+    elif kind == "vertices" and shape is not None and shape[0] == 0:
+        effect = replace(effect, supported=False, reason="the mesh has none")
     return _info(key, kind, shape, value, effect)
 
 
@@ -212,7 +214,9 @@ def classify(key: str, current: Any) -> tuple[str, tuple[int, ...] | None]:
     if not dr.is_float_v(current):
         return "integer", (dr.width(current),)
     if dr.depth_v(current) == 2:
-        return "vector", (len(current),)
+        width = dr.width(current)
+        several = width > 1 or key.rsplit(".", 1)[-1] == "points"
+        return ("points", (width, len(current))) if several else ("vector", (len(current),))
     size = dr.width(current)
     columns = _VERTEX_COLUMNS.get(key.rsplit(".", 1)[-1])
     if columns is not None:
@@ -230,6 +234,8 @@ def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
         return None
     elif not dr.is_array_v(current):
         return current if shape == () else type(current).__name__
+    if dr.is_jit_v(current) and not dr.is_tensor_v(current) and len(shape or ()) == 2 and dr.depth_v(current) == 2:
+        return np.array(current).T.reshape(shape)
     # Arrays of width one come with a trailing dimension of one.
     return np.array(current).reshape(shape)
 
@@ -283,7 +289,7 @@ class Slot:
         current = originals[self.key]
         if self.kind == "tensor":
             params[self.key] = type(current)(leaf, shape=self.shape)
-        elif self.kind == "vector":
+        elif self.kind in ("vector", "points"):
             params[self.key] = dr.unravel(type(current), leaf)
         elif self.kind == "transform":
             n = self.shape[0]

@@ -40,6 +40,11 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
             "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
             "exhaustive_scan, laser_scan_width and laser_scan_height."
         )
+    if film.lanes_at_most(1) is not None:
+        raise SceneError(
+            f"add_exhaustive: expected a film that adds events up at once, got a {film.plugin}, which lists them. Use "
+            "the general path integrator."
+        )
     if job.samples.tiles > 1:
         raise SceneError(
             "add_exhaustive: expected samples that all scan points share, got those of "
@@ -198,7 +203,7 @@ def deposit(job, block, pairs, target, kept, k):
 def _mirror(film: Any) -> None:
     """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
     cube = film.band_array(0)
-    points, size = film.laser_count(), film.temporal_bins * film.channel_count()
+    points, size = film.laser_count(), film.entries_per_array()
     # Four numbers at once where a histogram is made of fours.
     packet = 4 if size % 4 == 0 else 1
     kind = type(cube) if packet == 1 else (mi.Vector4f if type(cube) is mi.Float else mi.Vector4d)

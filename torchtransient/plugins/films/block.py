@@ -38,7 +38,9 @@ class FilmBlock:
 
     def store(self, opl, channels, active):
         """Write to the film; returns the fractions before and after the window."""
-        return self.film.put(self.band, self.base, self.counted(opl), channels, active, self.exclusive)
+        # Films that know nothing of it add atomically.
+        alone = {"exclusive": True} if self.exclusive else {}
+        return self.film.put(self.band, self.base, self.counted(opl), channels, active, **alone)
 
     def counted(self, opl):
         """A path length from the film's start on, ``Float64``."""

@@ -12,7 +12,8 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
-from torchtransient.plugins.integrators.launch import Pass, passes_of
+from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
+from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.polarized import rotation_tangent
@@ -66,6 +67,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     # Whether paths scatter in participating media; others refuse scenes that have them.
     walks_through_media = False
+    # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
+    scans_exhaustively = False
+    aims_lasers = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -91,7 +95,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
                 f"sensor has {film.class_name()}; change the film's type in the scene."
             )
-        if film.exhaustive_scan:
+        if film.exhaustive_scan and not self.scans_exhaustively:
             raise SceneError(
                 "transient_hdr_film: exhaustive_scan needs an integrator with a scanned laser; surface path tracing "
                 "has no laser positions. Remove exhaustive_scan."
@@ -101,6 +105,12 @@ class TransientIntegrator(mi.CppADIntegrator):
                 f"{self.class_name()}: the scene has participating media, which this integrator would pass through as "
                 "if they were empty. Use the integrator transient_prbvolpath, or remove the interior and exterior "
                 "media of the scene's shapes and sensors."
+            )
+        beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
+        if beams and not self.aims_lasers:
+            raise SceneError(
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
         return sensor, film
@@ -148,15 +158,17 @@ class TransientIntegrator(mi.CppADIntegrator):
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(job.spp)
         sampler.set_samples_per_wavefront(job.spp)
-        width = int(film.crop_size()[0])
-        lanes = width * job.rows * job.spp
+        width, lasers = int(film.crop_size()[0]), laser_count(film)
+        lanes = width * job.rows * job.spp * lasers
         sampler.seed(job.seed, lanes)
-        index = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp)
+        index, laser = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp), None
+        if film.exhaustive_scan:
+            laser, index = index % lasers, index // lasers
         row = index // width
         column = dr.fma(mi.UInt32(mi.Int32(-width)), row, index)
         row += dr.opaque(mi.UInt32, job.first_row)
 
-        offset, weight = film.sample_offset(sampler.next_2d())
+        offset, weight = self.offset_in_pixel(film, sensor, sampler)
         position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
         # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
         position = position / mi.ScalarVector2f(film.crop_size())
@@ -174,7 +186,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η)
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser)
+
+    def offset_in_pixel(self, film, sensor, sampler):
+        """(offset of a sample from its pixel's centre, weight or None for one)."""
+        return film.sample_offset(sampler.next_2d())
 
     def channel_match(self, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
@@ -188,7 +204,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         first = film.band_layout()[job.band][0]
         pixel = dr.fma(rays.row, width, rays.column)
         in_band = pixel - dr.opaque(mi.UInt32, first * width)
-        return in_band * film.entries_per_pixel(), pixel
+        base = in_band * film.entries_per_pixel()
+        return base if rays.laser is None else film.pixel_base(base, rays.laser), pixel
 
     def first_opl(self, film, rays):
         """Optical path before the first ray starts, counted from ``start_opl``: doubles keep late times exact."""
@@ -197,9 +214,20 @@ class TransientIntegrator(mi.CppADIntegrator):
             length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
 
+    def walks(self, world):
+        """Whether paths bring some of a job's light."""
+        return True
+
+    def beside(self, world, sensor, film, seed, samples):
+        """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
+        ``backward(incoming)`` and ``forward()``. Raises GradientError where one is needed and cannot be computed.
+        """
+        return []
+
     def _walk(self, world, film, rays, sink):
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
-        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η)
+        world.start(rays)
+        return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η, rays.leg)
 
     # ----------------------------------------------------------------------------------- entry points
 
@@ -218,15 +246,19 @@ class TransientIntegrator(mi.CppADIntegrator):
             world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
             film.prepare(self.aov_names(), samples)
-            for i, job in enumerate(jobs):
-                self._render_pass(world, sensor, film, job)
-                if evaluate or len(jobs) > 1:
-                    dr.eval(film.bands[job.band][2], film.steady, film.outside)
-                if progress_callback:
-                    dr.sync_thread()
-                    progress_callback((i + 1) / len(jobs))
+            self.add_light(world, sensor, film, Job(jobs, seed, samples, evaluate, progress_callback))
             film.finish_render()
             return film.develop() if develop else None
+
+    def add_light(self, world, sensor, film, job):
+        """Bring all light to a film that is prepared; ``job``: a :class:`.launch.Job`."""
+        for i, launch in enumerate(job.passes):
+            self._render_pass(world, sensor, film, launch)
+            if job.evaluate or len(job.passes) > 1:
+                dr.eval(film.bands[launch.band][2], film.steady, film.outside)
+            if job.progress:
+                dr.sync_thread()
+                job.progress((i + 1) / len(job.passes))
 
     def _render_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, world.contents, sensor, film, job)
@@ -256,13 +288,17 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             world = self.world(scene, contents, wanted, film.arrivals())
-            jobs, _ = self.passes(world, sensor, film, seed, int(spp))
+            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
+            incoming = IncomingAdjoint(film, g_steady, g_transient)
+            beside = self.beside(world, sensor, film, seed, samples)
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad(), contents.hidden_from_mitsuba():
-                for job in jobs:
-                    self._backward_pass(world, sensor, film, job, g_steady, g_transient)
+                for job in jobs if self.walks(world) else ():
+                    self._backward_pass(world, sensor, film, job, incoming)
                     dr.eval()
+                for part in beside:
+                    part.backward(incoming)
 
     def _wanted(self, scene, sensor, film):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
@@ -293,20 +329,11 @@ class TransientIntegrator(mi.CppADIntegrator):
         count, store = self._walk(world, film, rays, sink)
         return sink.layout, store, count
 
-    def _backward_pass(self, world, sensor, film, job, g_steady, g_transient):
+    def _backward_pass(self, world, sensor, film, job, incoming):
         rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(film, rays)
-        channels = film.channel_count()
         _, pixel = self.pixel_indices(film, job, rays)
-        steady = [mi.Float(0)] * channels
-        if g_steady is not None:
-            steady = [dr.gather(mi.Float, g_steady.array, pixel * channels + c) for c in range(channels)]
-        transient, base = None, mi.UInt32(0)
-        if g_transient is not None:
-            flat, offset, strides = self._adjoint_layout(film, g_transient)
-            base = rays.row * strides[0] + rays.column * strides[1] + offset
-            transient = (flat, strides[2], strides[3])
-        block = film.create_adjoint_block(transient, base, steady, match)
+        block = incoming.block(rays, pixel, match)
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         with dr.resume_grad():
             if world.wanted.sensor or dr.grad_enabled(rays.η):
@@ -335,14 +362,18 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             contents, wanted = self._wanted(scene, sensor, film)
             world = self.world(scene, contents, wanted, film.arrivals())
-            with dr.resume_grad():
-                propagate_tangents(self.parameters(scene), world)
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
+            beside = self.beside(world, sensor, film, seed, samples)
+            with dr.resume_grad():
+                tables = [table for part in beside for table in part.tables()]
+                propagate_tangents(self.parameters(scene), world.tables() + tables)
             film.prepare(self.aov_names(), samples)
             with contents.hidden_from_mitsuba():
-                for job in jobs:
+                for job in jobs if self.walks(world) else ():
                     self._forward_pass(world, sensor, film, job)
                     dr.eval(film.bands[job.band][2], film.steady)
+                for part in beside:
+                    part.forward()
             film.finish_render()
             return film.develop() if develop else None
 
@@ -373,18 +404,6 @@ class TransientIntegrator(mi.CppADIntegrator):
         if mi.is_polarized:
             tangent.β = rotation_tangent(rotation[0])
         return tangent
-
-    @staticmethod
-    def _adjoint_layout(film, g_transient):
-        if isinstance(g_transient, tuple):
-            return g_transient
-        expected = film.cube_shape()
-        if tuple(g_transient.shape) != expected:
-            raise GradientError(
-                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}."
-            )
-        _, w, t, c = expected
-        return g_transient.array, 0, (w * t * c, t * c, c, 1)
 
     def to_string(self):
         return (

@@ -30,6 +30,24 @@ class Pass:
     seed: Any
 
 
+@dataclass
+class Job:
+    """A render: its launches, the seed and the largest number of samples of a pixel that they are made of, whether what
+    is recorded is run, and who is told of the progress (a function of the share that is done, or None).
+    """
+
+    passes: list[Pass]
+    seed: Any
+    samples: int
+    evaluate: bool
+    progress: Any
+
+
+def laser_count(film: Any) -> int:
+    """How many laser positions every pixel of a film tells apart."""
+    return film.laser_count() if film.exhaustive_scan else 1
+
+
 def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) -> tuple[list[Pass], int]:
     """The launches of a job of ``spp`` samples per pixel (0: the sampler's own number), and the largest number of
     samples of a pixel. ``sampler`` is changed. ``most_events``: of one path.
@@ -40,7 +58,7 @@ def passes_of(sampler: Any, film: Any, seed: Any, spp: int, most_events: int) ->
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
-    width = int(film.crop_size()[0])
+    width = int(film.crop_size()[0]) * laser_count(film)
     most = min(MAX_LANES, film.lanes_at_most(most_events) or MAX_LANES)
     result = []
     for band, (first_row, rows) in enumerate(film.band_layout()):

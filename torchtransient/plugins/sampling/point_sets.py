@@ -35,11 +35,17 @@ def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
     sorting afterwards. A common shift leaves half of the variance that shifts of their own would, where a bin of time
     is an interval of one coordinate. ``seed``: UInt32 of width one, in memory.
     """
-    bits = max(1, (count - 1).bit_length())
     j = dr.arange(mi.UInt32, sets * count)
     number = j // dr.opaque(mi.UInt32, count)
-    j -= number * dr.opaque(mi.UInt32, count)
-    shift, key = mi.sample_tea_32(mi.UInt32(seed), number, ROUNDS)
+    return plane_point(j - number * dr.opaque(mi.UInt32, count), count, seed, number)
+
+
+def plane_point(j: Any, count: int, seed: Any, number: Any = 0) -> tuple[Any, Any]:
+    """Point number ``j`` (UInt32) of the set ``number`` of :func:`plane_points`; ``seed`` (UInt32) may be another one
+    in each lane, which then has a set of its own.
+    """
+    bits = max(1, (count - 1).bit_length())
+    shift, key = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(number), ROUNDS)
     below = dr.opaque(mi.UInt32, 2 ** (32 - bits) - 1)
     # The middle of the last bit keeps both coordinates inside of (0, 1).
     x = (mi.Float64(j) + (mi.Float64(shift) + 0.5) * 2.0**-32) / dr.opaque(mi.Float64, float(count))

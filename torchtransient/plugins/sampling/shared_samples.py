@@ -12,6 +12,8 @@ from torchtransient.errors import SceneError, UnitError, VariantError
 from torchtransient.plugins.node_walk import objects_of
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.point_sets import plane_points
+from torchtransient.plugins.transport.scattering.geometry_terms import material_point
+from torchtransient.plugins.transport.strategy import Local
 
 # A launch has a lane per sample, and chunks of it are numbered in 32 bits.
 MAX_SAMPLES = 2**26
@@ -90,6 +92,20 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
     return samples
 
 
+def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: Any) -> Local:
+    """Samples as points that follow their shapes, attached where these are: ``p``, ``n``, ``geometric_n``, and
+    ``front`` and ``back``, albedo over pi of the sides times the area that a sample stands for. ``meshes``
+    (:class:`~..pointer_table.PointerTable`): the shapes with vertices of their own.
+    """
+    a, y = samples.u.x, samples.u.y
+    pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)
+    si, area = material_point(pi, ray, mi.Mask(True), meshes)
+    weight = samples.weight * dr.relative_grad(area)
+    n = mi.Vector3f(si.sh_frame.n if samples.smooth else si.n)
+    front, back = (_scattered(si, side) * weight for side in (1.0, -1.0))
+    return Local(p=mi.Point3f(si.p), n=n, geometric_n=mi.Vector3f(si.n), front=front, back=back)
+
+
 def not_diffuse(shapes: list[Any]) -> list[str]:
     """Names of the shapes, with their BSDFs, that scatter light in another way than a Lambertian surface."""
     found = {}
@@ -109,13 +125,19 @@ def _held(bsdf: Any) -> list[Any]:
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
     """What Mitsuba says of the points: shading frame, texture coordinates."""
+    pi, ray = _preliminary(elements, element, p, n, a, y)
+    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
+    """(the points as they would be found, by a ray from a metre before them)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)
     pi.prim_uv = elements.coordinates(element, a, y)
     ray = dr.zeros(mi.Ray3f, dr.width(p))
     ray.o, ray.d = mi.Point3f(p + mi.Vector3f(n)), -mi.Vector3f(n)
-    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    return pi, ray
 
 
 def _scattered(si: Any, side: float) -> Any:

@@ -32,7 +32,7 @@ DAMPING = 0.005
 class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
-    ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
+    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
     shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
     (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
     transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around the sensor
@@ -41,7 +41,7 @@ class SceneContents:
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own;
-    ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
+    ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
     instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
@@ -52,6 +52,7 @@ class SceneContents:
     """
 
     def __init__(self, scene: Any, sensor: Any, reference: DistantReference) -> None:
+        self.sensor = sensor
         outermost = bsdfs_of_scene(scene)
         met, self.delays = delays_of(outermost)
         self.bsdfs, self.mixtures = mixtures_of(met, mi.BSDF, shapes_of_scene(scene))
@@ -68,6 +69,7 @@ class SceneContents:
         self.sphere_lights = SphereLights.of(scene)
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
         self.emitting_meshes = PointerTable.marking([s for s in scene.shapes() if s.is_emitter() and has_vertices(s)])
+        self.meshes = PointerTable.marking([s for s in scene.shapes() if has_vertices(s)])
         self.damping_radius = dr.opaque(mi.Float, DAMPING * reference.radius)
         self.patterned_lights = any(emits_by_place(e) for e in scene.emitters())
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())

@@ -53,7 +53,8 @@ class Proposal(Local):
 class Answer(Local):
     """Scattering towards a proposal: ``value`` (what it makes of unpolarized light, in the frame of the segment towards
     the sensor), ``pdf`` (per solid angle, with which the walk would have gone there), ``eta`` (relative index on that
-    side). Not defined where the proposal is not active.
+    side). ``matrix``: that value between the frames of the segment and of the connection, for light that may be
+    polarized. Not defined where the proposal is not active.
     """
 
 
@@ -89,6 +90,9 @@ class Strategy:
 
     def prepare(self, world: Any) -> None:
         """Once a job, outside of traced code, with gradients enabled: what all lanes share."""
+
+    def start(self, world: Any, rays: Any) -> None:
+        """Before every launch, outside of traced code: what is told by the lane (``rays``: its primary rays)."""
 
     def tables(self) -> list[Any]:
         """What ``prepare`` has computed of parameters: attached where they are."""
@@ -159,6 +163,13 @@ class Segment(Strategy):
         """
         raise NotImplementedError
 
+    def motion(self, world: Any, vertex: Any, following: Any, ahead: Any) -> Any:
+        """How the segment from an attached ``vertex`` to the one that is ``following`` it moves where that one lies
+        ``ahead`` (mask): attached ``d``, ``J``, ``drag`` and ``longer()`` as a
+        :class:`.scattering.geometry_terms.DampedMotion` has them.
+        """
+        raise NotImplementedError
+
     def attached_transmittance(self, world: Any, vertex: Any, connected: Any, active: Any) -> Any:
         """One with the derivative of the logarithm of the transmittance towards ``connected``: Local with attached
         ``p``, detached ``d``, ``far``, and ``ahead`` (whether the segment is the one to the next vertex).
@@ -169,13 +180,15 @@ class Segment(Strategy):
 class Connection(Strategy):
     """Light that is found at a vertex, or that a vertex is connected to.
 
-    What a connection owes: it keeps to ``vertex.goes_on`` and ``vertex.connectable``, asks ``world.counted`` before it
-    traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
+    What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``world.deep_enough``, asks
+    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
     ``vertex.η * answer.eta``.
     """
 
     # Whether all of its light is that of the scene's emitters, so that their box bounds where it can come from.
     light_of_scene_alone = False
+    # Whether it may have an event at the last vertex of a path, from where nothing is connected any more.
+    finds_light = True
 
     def events(self, wanted: Any) -> int:
         """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
@@ -234,12 +247,20 @@ class Guide(Strategy):
 
     share = 0.5
 
-    def draw(self, world: Any, vertex: Vertex, sampler: Any) -> Any:
-        """A Point3f on a surface."""
+    def share_at(self, depth: Any) -> Any:
+        """Its share of the samples at the vertices number ``depth`` of their paths (UInt32). All shares of a vertex may
+        sum to one only where the guides reach all that the scattering does, and it has no delta lobe.
+        """
+        return self.share
+
+    def draw(self, world: Any, vertex: Vertex, u: Any) -> Any:
+        """A Point3f on a surface for two uniform numbers (Point2f)."""
         raise NotImplementedError
 
-    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any) -> Any:
-        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``."""
+    def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
+        """Density per solid angle at ``p`` with which it draws the point ``q`` (normal ``n``) of ``shape``.
+        ``primitive``: the number of the shape's triangle, None where it is not known: then it is that of any.
+        """
         raise NotImplementedError
 
 

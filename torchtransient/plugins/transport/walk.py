@@ -72,11 +72,14 @@ def bounce(world, path, kept, sampler, sink):
         samples[c.name] = Local(proposal=proposal, event=event)
 
     # ------------------------------------------------------------- to the next vertex
+    onward = vertex.goes_on
+    if not world.finds_light:  # nothing would be looked for at the last vertex
+        onward &= path.depth + 2 < world.max_depth
     ray, leg = vertex.at.spawn_ray(step.out), None
     if world.scattering.guides:  # the density of what a guide drew is known once the segment has ended
-        leg = world.segment.depart(world, ray, vertex, vertex.β, sampler, vertex.goes_on)
+        leg = world.segment.depart(world, ray, vertex, vertex.β, sampler, onward)
         world.scattering.weigh(world, path, vertex, step, ray, leg)
-    β, goes_on, rr = roulette(world, path, vertex, step, sampler, sink.zeros)
+    β, goes_on, rr = roulette(world, path, vertex, step, sampler, onward, sink.zeros)
     samples[world.segment.name], samples[world.scattering.name] = vertex, step
     samples["walk"] = Local(β=path.β, τ=vertex.τ, η=path.η, rr=rr, goes_on=goes_on)
     sink.vertex(kept, path, samples)
@@ -88,9 +91,9 @@ def bounce(world, path, kept, sampler, sink):
     path.leg = leg if leg is not None else world.segment.depart(world, ray, vertex, β, sampler, goes_on)
 
 
-def roulette(world, path, vertex, step, sampler, zeros):
+def roulette(world, path, vertex, step, sampler, goes_on, zeros):
     """(throughput behind the vertex, whether the path goes on, factor of the throughput)."""
-    β, goes_on = product(vertex.β, step.weight), vertex.goes_on
+    β = product(vertex.β, step.weight)
     β_max = dr.max(mi.unpolarized_spectrum(β))
     if zeros:
         # The derivative of a product with one factor of zero needs the light beyond it: go on past the first black
@@ -101,6 +104,8 @@ def roulette(world, path, vertex, step, sampler, zeros):
         β_max = dr.select(β_max == 0, 1, β_max)
     else:
         goes_on &= β_max != 0
+    if not world.plays_roulette:
+        return β, goes_on, mi.Float(1)
     chance = dr.minimum(β_max * dr.square(path.η * step.eta), 0.95)
     plays = path.depth >= world.rr_depth
     rr = dr.select(plays, dr.rcp(chance), 1)
@@ -109,12 +114,12 @@ def roulette(world, path, vertex, step, sampler, zeros):
 
 
 @dr.syntax
-def walk(world, sampler, ray, first_opl, sink, η=1):
+def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept). ``η``: index of
-    refraction where they start.
+    refraction where they start; ``leg``: how their first segment ends, None where that is not known.
     """
     path = start(world, ray, first_opl, η)
-    path.leg = world.segment.first(world, ray, sampler)
+    path.leg = leg if leg is not None else world.segment.first(world, ray, sampler)
     kept = sink.begin(world)
     while dr.hint(path.active, max_iterations=world.max_depth, label="path"):
         bounce(world, path, kept, sampler, sink)

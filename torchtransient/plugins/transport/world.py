@@ -15,13 +15,17 @@ from torchtransient.plugins.transport.instances import AttachedSurfaces
 
 @dataclass(frozen=True)
 class PathSettings:
-    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`."""
+    """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
+    of smaller depths do not count. ``left_out``: nor do those of this depth.
+    """
 
     max_depth: int
     rr_depth: int
     hide_emitters: bool
     discard_direct_light: bool
     camera_unwarp: bool
+    min_depth: int = 0
+    left_out: int | None = None
 
 
 class World:
@@ -35,7 +39,8 @@ class World:
 
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
         self.scene, self.contents, self.wanted = scene, contents, wanted
-        self.max_depth, self.rr_depth = settings.max_depth, settings.rr_depth
+        self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
+        self.left_out = settings.left_out
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
@@ -43,6 +48,9 @@ class World:
         # Only where path lengths change is it asked how surfaces move.
         self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
+        self.finds_light = any(connection.finds_light for connection in self.connections)
+        # Where paths end before they would be thinned out, no number is drawn for it.
+        self.plays_roulette = self.finds_light or self.max_depth > self.rr_depth + 2
         self._check_names()
         # A lower bound of what a path still has to travel, where all light is that of the scene's emitters.
         bounded = window is not None and all(c.light_of_scene_alone for c in self.connections)
@@ -65,6 +73,11 @@ class World:
                 f"strategies of an integrator: expected a name of its own for each, not 'walk', got {', '.join(names)}."
             )
 
+    def start(self, rays: Any) -> None:
+        """Tell all strategies of the primary rays of a launch."""
+        for strategy in self.strategies():
+            strategy.start(self, rays)
+
     def strategies(self) -> list[Any]:
         """All strategies, each once."""
         return [self.segment, *self.connections, self.scattering]
@@ -82,6 +95,11 @@ class World:
     def index_changes(self) -> bool:
         """Whether paths can run in media of different indices of refraction, or through delta lobes."""
         return self.contents.delta or self.contents.refraction is not None
+
+    def deep_enough(self, active: Any, depth: Any) -> Any:
+        """Which events of depth ``depth`` (UInt32) count."""
+        active = active if self.min_depth == 0 else active & (depth >= self.min_depth)
+        return active if self.left_out is None else active & (depth != self.left_out)
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
         """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""

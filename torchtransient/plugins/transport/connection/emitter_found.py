@@ -41,6 +41,7 @@ class EmitterFound(Connection):
             seen &= (path.depth > 0) | vertex.valid
         if world.discard_direct_light:
             seen &= path.depth > 0
+        seen = world.deep_enough(seen, path.depth + 1)
         emitter = vertex.si.emitter(world.scene)
         hit = (emitter != None) & seen  # noqa: E711 (a Dr.Jit comparison)
         prev = dr.zeros(mi.Interaction3f)

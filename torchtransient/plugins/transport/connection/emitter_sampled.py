@@ -22,6 +22,7 @@ class EmitterSampled(Connection):
 
     name = "emitter_sampled"
     light_of_scene_alone = True
+    finds_light = False
 
     def prepare(self, world):
         lights = world.contents.sphere_lights
@@ -51,7 +52,7 @@ class EmitterSampled(Connection):
     # ------------------------------------------------------------------------------------------------- primal
 
     def propose(self, world, path, vertex, sampler):
-        active = vertex.goes_on & vertex.connectable
+        active = world.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         u = sampler.next_2d()
         ds, weight = self.sample(world, vertex.at, u, active)
         active &= ds.pdf != 0

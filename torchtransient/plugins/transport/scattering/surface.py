@@ -16,7 +16,6 @@ from torchtransient.plugins.polarized import (
     scatter_unpolarized,
 )
 from torchtransient.plugins.transport.carry import Carry, slope_only
-from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
 
@@ -28,10 +27,13 @@ class Surface(Scattering):
 
     def __init__(self, guides=()):
         self.guides = list(guides)
-        self.own_share = 1 - sum(guide.share for guide in self.guides)
-        if self.own_share <= 0 or any(guide.share <= 0 for guide in self.guides):
+        if sum(guide.share for guide in self.guides) >= 1 or any(guide.share <= 0 for guide in self.guides):
             shares = ", ".join(str(guide.share) for guide in self.guides)
             raise SceneError(f"guides: expected positive shares that sum to less than one, got {shares}.")
+
+    def own_share(self, depth):
+        """Share of the next directions that the scattering draws itself, at the vertices number ``depth``."""
+        return 1 - sum(guide.share_at(depth) for guide in self.guides)
 
     def prepare(self, world):
         contents = world.contents
@@ -40,6 +42,10 @@ class Surface(Scattering):
         self.mixtures = None if contents.mixtures is None else contents.mixtures.read(world.wanted)
         for guide in self.guides:
             guide.prepare(world)
+
+    def start(self, world, rays):
+        for guide in self.guides:
+            guide.start(world, rays)
 
     def tables(self):
         tables = [] if self.delays is None else self.delays.attached()
@@ -89,7 +95,7 @@ class Surface(Scattering):
             else:
                 value, pdf = bsdf.eval_pdf(ctx, si, wo, p.active)
             value = self.correct_two_sided(world, bsdf, si, wo, vertex.delay.scaled(value))
-            answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo)))
+            answers.append(Answer(value=value, pdf=pdf, eta=self.relative_index(bsdf, si, wo), wo=wo))
         bs, weight = sample or bsdf.sample(ctx, si, u_lobe, u_dir, vertex.goes_on)
         weight = self.correct_two_sided(world, bsdf, si, bs.wo, vertex.delay.scaled(weight))
         step = Step(
@@ -102,15 +108,16 @@ class Surface(Scattering):
             step.pdf = dr.select(is_black(weight) & strayed(si.wi, bs), 0, step.pdf)
         self.elsewhere(world, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
-        for answer in answers:
+        for p, answer in zip(proposals, answers, strict=True):
             if answer is not None:
+                answer.matrix = rotate_mueller(answer.value, rotation, rotation_from_light(si, answer.wo, p.d))
                 answer.value = scatter_unpolarized(answer.value, rotation)
         step.weight = rotate_mueller(step.weight, rotation, rotation_from_light(si, step.wo, step.out))
         if self.guides:
-            self._follow_guides(world, vertex, step, sampler)
+            self._follow_guides(world, path, vertex, step, sampler)
             for p, answer in zip(proposals, answers, strict=True):
                 if p is not None:
-                    answer.pdf = self.mixture(world, vertex.at.p, p.ds, answer.pdf, p.active)
+                    answer.pdf = self.mixture(world, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
         return answers, step
 
     def elsewhere(self, world, vertex, proposals, answers, step):
@@ -118,30 +125,37 @@ class Surface(Scattering):
 
     # ------------------------------------------------------------------------------------------------- guides
 
-    def _follow_guides(self, world, vertex, step, sampler):
-        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``."""
-        u, below = sampler.next_1d(), 0.0
-        step.guided, step.point = u < 1 - self.own_share, mi.Point3f(vertex.at.p)
+    def _follow_guides(self, world, path, vertex, step, sampler):
+        """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``. Of the scattering's own sample
+        and those of the guides one is used: they share the numbers of the direction.
+        """
+        u, below, own = sampler.next_1d(), 0.0, self.own_share(path.depth)
+        step.guided, step.point = u < 1 - own, mi.Point3f(vertex.at.p)
         for guide in self.guides:
-            point = guide.draw(world, vertex, sampler)
-            chosen = (u >= below) & (u < below + guide.share)
+            point, share = guide.draw(world, vertex, step.u_dir), guide.share_at(path.depth)
+            chosen = (u >= below) & (u < below + share)
             step.point = dr.select(chosen, point, step.point)
-            below += guide.share
-        to = dr.select(step.guided, step.point - vertex.at.p, step.out)
-        step.out = dr.select(step.guided, dr.normalize(to), step.out)
+            below += share
+        # Rays start beside the surface, from where a near point lies in another direction.
+        step.out = dr.select(step.guided, vertex.at.spawn_ray_to(step.point).d, step.out)
         step.delta, step.unconnected = step.delta & ~step.guided, step.unconnected & ~step.guided
-        step.weight = dr.select(step.delta, step.weight / self.own_share, step.weight)
+        step.weight = dr.select(step.delta, step.weight / own, step.weight)
 
-    def mixture(self, world, p, ds, pdf, active):
-        """Density with which the walk goes from ``p`` to the light's point ``ds``; ``pdf``: that of the scattering."""
+    def mixture(self, world, depth, p, ds, pdf, active):
+        """Density with which the walk goes from its vertex ``p``, number ``depth``, to the light's point ``ds``;
+        ``pdf``: that of the scattering.
+        """
         if not self.guides:
             return pdf
         if ds.emitter is None:  # a light that lies on no shape
-            return self.own_share * pdf
-        shape = ds.emitter.get_shape()
+            return self.own_share(depth) * pdf
         active = active & ~ds.delta
-        guided = sum(g.share * g.density(world, p, ds.p, ds.n, shape, active) for g in self.guides)
-        return self.own_share * pdf + dr.select(active, guided, 0)
+        guided = self.guided_density(world, depth, p, ds, ds.emitter.get_shape(), active)
+        return self.own_share(depth) * pdf + dr.select(active, guided, 0)
+
+    def guided_density(self, world, depth, p, to, shape, active, primitive=None):
+        """Density per solid angle, shares included, with which guides draw the point ``to`` (``p, n``) from ``p``."""
+        return sum(g.share_at(depth) * g.density(world, p, to.p, to.n, shape, active, primitive) for g in self.guides)
 
     def weigh(self, world, path, vertex, step, ray, leg):
         smooth = vertex.goes_on & ~step.delta
@@ -149,8 +163,8 @@ class Surface(Scattering):
         reached = smooth & reached & pi.is_valid()
         found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, reached)
         value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
-        guided = sum(g.share * g.density(world, vertex.at.p, found.p, found.n, pi.shape, reached) for g in self.guides)
-        pdf = self.own_share * pdf + dr.select(reached, guided, 0)
+        guided = self.guided_density(world, path.depth, vertex.at.p, found, pi.shape, reached, pi.prim_index)
+        pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
         # A guided sample stands for the point that was drawn, and for no other that its ray runs into before.
         way = dr.norm(step.point - vertex.at.p)
         arrived = reached & (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
@@ -225,7 +239,7 @@ class Surface(Scattering):
         wo = si.to_local(out)
         value, pdf = self.eval_pdf(vertex, wo, out, active, sampled)
         if ds is not None:
-            pdf = self.mixture(world, dr.detach(si.p), ds, pdf, active)
+            pdf = self.mixture(world, vertex.v.k, dr.detach(si.p), ds, pdf, active)
         value = self.correct_two_sided(world, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return Local(value=value, pdf=pdf, wo=wo, eta=self.relative_index(vertex.bsdf, si, wo))
 
@@ -239,9 +253,7 @@ class Surface(Scattering):
         ahead = smooth & following.valid
         out, J, drag = mi.Vector3f(following.d), mi.Float(1), mi.Vector3f(0)
         if wanted.geometry:
-            volume, δ = world.segment.has_no_normal(following), displacement(si.p, smooth)
-            radius = vertex.damping_radius
-            motion = damped_motion(δ, out, following.t, following.n, ahead, radius, volume=volume)
+            motion = world.segment.motion(world, vertex, following, ahead)
             out, J, drag = motion.d, motion.J, motion.drag
         towards = self.evaluate(world, vertex, out, smooth, sampled=True)
         pdf = r["pdf"] if self.guides else dr.detach(towards.pdf)
@@ -261,7 +273,7 @@ class Surface(Scattering):
             d_out = si.to_world(bs.wo)
             from_light = rotation_from_light(si, bs.wo, d_out, following.d)
             delta_weight = rotate_mueller(delta_weight, vertex.rotation, from_light)
-            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * (v.rr / self.own_share)
+            delta_weight *= self.lobe_probability(world, vertex.bsdf, bs) * (v.rr / self.own_share(v.k))
             weight = dr.select(mirrored, delta_weight, weight)
             eta = dr.select(mirrored, bs.eta, eta)
             o, d, w = dr.select(mirrored, si.p, o), dr.select(mirrored, d_out, 0), dr.select(mirrored, d_out, w)

@@ -10,7 +10,7 @@ from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.contents import DAMPING
 from torchtransient.plugins.transport.derivative.vertex import AttachedVertex, VertexEnd
 from torchtransient.plugins.transport.instances import surface_interaction
-from torchtransient.plugins.transport.scattering.geometry_terms import displacement, slide
+from torchtransient.plugins.transport.scattering.geometry_terms import damped_motion, displacement, slide
 from torchtransient.plugins.transport.strategy import Segment, Vertex
 
 # How a preliminary intersection is kept: its shape and instance as numbers in Dr.Jit's registry.
@@ -136,3 +136,8 @@ class Vacuum(Segment):
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)
         return vertex
+
+    def motion(self, world, vertex, following, ahead):
+        δ, volume = displacement(vertex.scattered_si.p, ahead), self.has_no_normal(following)
+        d, radius = mi.Vector3f(following.d), vertex.damping_radius
+        return damped_motion(δ, d, following.t, following.n, ahead, radius, volume=volume)

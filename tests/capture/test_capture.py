@@ -1,0 +1,171 @@
+"""Captures: layouts, parts of exhaustive ones, what is computed of them, and records as torch knows them."""
+
+import json
+import pickle
+
+import pytest
+import torch
+from torch.utils import _pytree
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Capture, Scan, Wall
+from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+
+WALL = Wall.plane(2.0, 1.6)
+AXIS = TimeAxis(1.0, 0.1, 8)
+LIST = torch.tensor([[0.1, 0.2, 0.0], [0.3, -0.4, 0.0], [-0.6, 0.7, 0.0]])
+ORIGIN = (0.0, 0.0, 1.0)
+SCANS = {
+    "single": Scan.grid(WALL, (4, 3), kind="single"),
+    "confocal": Scan.grid(WALL, (4, 3), kind="confocal"),
+    "exhaustive": Scan.grid(WALL, (4, 3), kind="exhaustive"),
+    "list": Scan.points(LIST, kind="confocal", sensor_origin=ORIGIN, laser_origin=ORIGIN),
+    "lists": Scan.points(LIST, kind="exhaustive", laser_points=LIST, sensor_origin=ORIGIN, laser_origin=ORIGIN),
+}
+
+
+def capture(name, channels=2, **changes):
+    scan = SCANS[name]
+    generator = torch.Generator().manual_seed(1)
+    transient = torch.rand(channels, AXIS.num_bins, *scan.shape, generator=generator)
+    return Capture(**{"transient": transient, "axis": AXIS, "scan": scan, **changes})
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("single", (2, 8, 3, 4)),
+        ("confocal", (2, 8, 3, 4)),
+        ("exhaustive", (2, 8, 3, 4, 3, 4)),
+        ("list", (2, 8, 3)),
+        ("lists", (2, 8, 3, 3)),
+    ],
+)
+def test_layouts(name, shape):
+    made = capture(name)
+    assert tuple(made.transient.shape) == shape
+    torch.testing.assert_close(made.total(), made.transient.sum(1))
+    assert made.total().shape == (2, *SCANS[name].shape)
+
+
+@pytest.mark.parametrize("name", ["exhaustive", "lists"])
+def test_the_diagonal_is_confocal(name):
+    made = capture(name, steady=torch.rand(2, *SCANS[name].shape))
+    diagonal = made.confocal()
+    assert diagonal.scan.kind == "confocal" and diagonal.scan.shape == diagonal.transient.shape[2:]
+    if name == "exhaustive":
+        for row in range(3):
+            for column in range(4):
+                expected = made.transient[:, :, row, column, row, column]
+                assert torch.equal(diagonal.transient[:, :, row, column], expected)
+                assert torch.equal(diagonal.steady[:, row, column], made.steady[:, row, column, row, column])
+    else:
+        expected = torch.stack([made.transient[..., k, k] for k in range(3)], -1)
+        assert torch.equal(diagonal.transient, expected)
+
+
+def test_one_spot_of_an_exhaustive_capture():
+    made = capture("exhaustive", steady=torch.rand(2, 3, 4, 3, 4))
+    one = made.single((2, -1))
+    assert one.scan.kind == "single" and torch.equal(one.scan.laser_points, made.scan.laser_points[2, 3])
+    assert torch.equal(one.transient, made.transient[:, :, 2, 3])
+    assert torch.equal(one.steady, made.steady[:, 2, 3])
+    assert torch.equal(capture("lists").single(1).transient, capture("lists").transient[:, :, 1])
+    with pytest.raises(SceneError):
+        capture("single").single(0)
+    with pytest.raises(SceneError):
+        capture("single").confocal()
+
+
+def test_peak_time():
+    made = capture("single", channels=3)
+    transient = torch.zeros(3, 8, 3, 4)
+    transient[0, 5, 1, 2], transient[1, 4, 1, 2], transient[2, 4, 1, 2] = 1.0, 0.6, 0.6
+    peaks = Capture(transient, AXIS, made.scan).peak_time()
+    assert peaks.shape == (3, 4) and peaks.dtype == torch.float64
+    assert float(peaks[1, 2]) == pytest.approx(1.45)
+    assert int(peaks.isnan().sum()) == 11
+
+
+def test_polarized_captures_have_their_components_first():
+    transient = torch.zeros(4, 1, 8, 3, 4)
+    transient[0, 0, 3], transient[1, 0, 6] = 1.0, 5.0
+    made = Capture(transient, AXIS, SCANS["single"], polarized=True)
+    assert bool((made.peak_time() == AXIS.centers_opl[3]).all())
+    with pytest.raises(ShapeError, match=r"\(4, C, 8, 3, 4\)"):
+        Capture(transient[:3], AXIS, SCANS["single"], polarized=True)
+
+
+def test_crop():
+    made = capture("exhaustive")
+    part = made.crop(1.2, 1.5)
+    assert part.axis.num_bins == 3 and part.axis.start_opl == pytest.approx(1.2)
+    assert torch.equal(part.transient, made.transient[:, 2:5])
+    assert part.transient.data_ptr() == made.transient[:, 2:].data_ptr()
+    assert made.crop(1.21, 1.49).axis.num_bins == 3
+    assert made.crop(0.0, 100.0).axis == AXIS
+    for start, end in ((3.0, 4.0), (1.5, 1.5), (1.5, 1.2), (float("nan"), 2.0)):
+        with pytest.raises(UnitError, match="crop"):
+            made.crop(start, end)
+
+
+def test_phasors():
+    axis = FrequencyAxis.uniform(1.0, 0.5, 5)
+    phasor = torch.zeros(1, 5, 3, 4, dtype=torch.complex64)
+    made = Capture(None, None, SCANS["single"], phasor=phasor, frequencies=axis)
+    assert made.to(torch.float64).phasor.dtype == torch.complex128
+    for method in ("total", "peak_time"):
+        with pytest.raises(ShapeError, match="phasors alone"):
+            getattr(made, method)()
+    with pytest.raises(ShapeError, match="without frequencies"):
+        Capture(None, None, SCANS["single"], phasor=phasor)
+    with pytest.raises(ShapeError, match="complex numbers"):
+        Capture(None, None, SCANS["single"], phasor=phasor.real, frequencies=axis)
+
+
+@pytest.mark.parametrize(
+    ("transient", "axis", "message"),
+    [
+        (torch.zeros(1, 7, 3, 4), AXIS, r"\(C, 8, 3, 4\).*single"),
+        (torch.zeros(1, 8, 4, 3), AXIS, r"\(C, 8, 3, 4\)"),
+        (torch.zeros(8, 3, 4), AXIS, r"\(C, 8, 3, 4\)"),
+        (torch.zeros(0, 8, 3, 4), AXIS, r"\(0, 8, 3, 4\)"),
+        (torch.zeros(1, 8, 3, 4), None, "without axis"),
+        (torch.zeros(1, 8, 3, 4, dtype=torch.complex64), AXIS, "real numbers"),
+    ],
+)
+def test_shapes_are_checked(transient, axis, message):
+    with pytest.raises(ShapeError, match=message):
+        Capture(transient, axis, SCANS["single"])
+
+
+def test_steady_has_the_shape_of_the_scan():
+    with pytest.raises(ShapeError, match="steady"):
+        capture("single", steady=torch.zeros(2, 4, 3))
+
+
+def test_metadata_is_plain():
+    made = capture("single", metadata={"spp": 64, "name": "Z"})
+    assert json.loads(json.dumps(made.metadata))["spp"] == 64
+    assert "spp, name" in repr(made)
+    with pytest.raises(StorageError, match="Tensor is not plain"):
+        capture("single", metadata={"t": torch.zeros(2)})
+
+
+def test_captures_are_records():
+    made = capture("confocal", metadata={"n": 1})
+    assert pickle.loads(pickle.dumps(made)).scan == made.scan
+    double = made.to(torch.float64)
+    assert double.transient.dtype == torch.float64 and double.scan is made.scan
+    both = Capture.stack([made, made])
+    assert both.transient.shape == (2, 2, 8, 3, 4) and both.metadata == {"batch": [{"n": 1}, {"n": 1}]}
+    assert both.total().shape == (2, 2, 3, 4) and both.peak_time().shape == (2, 3, 4)
+    assert both.crop(1.0, 1.2).transient.shape == (2, 2, 2, 3, 4)
+    assert torch.utils.data.default_collate([made, made]).transient.shape == both.transient.shape
+    with pytest.raises(ShapeError, match="scan"):
+        Capture.stack([made, capture("single")])
+    leaves, tree = _pytree.tree_flatten(made)
+    again = _pytree.tree_unflatten([2 * leaf for leaf in leaves], tree)
+    assert torch.equal(again.transient, 2 * made.transient)
+    grown = made.map(lambda t: t.requires_grad_())
+    assert grown.transient.requires_grad and not grown.detach().transient.requires_grad

@@ -1,0 +1,176 @@
+"""What was measured on a relay wall, as tensors."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.scan import Scan, laser_index
+from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.tensor_record import TensorRecord
+
+_CHANNEL_AND_TIME = 2
+
+
+@dataclass(frozen=True, repr=False)
+class Capture(TensorRecord):
+    """A capture around a corner: the light that leaves each sensor point of `scan` towards the sensor's origin.
+
+    Either or both of
+
+    - ``transient``: float32 (C, T, Sy, Sx), or (C, T, N) for a list of points; exhaustive (C, T, Ly, Lx, Sy, Sx), lists
+      (C, T, M, N). Radiance per joule of the laser, summed over each bin of ``axis``;
+    - ``phasor``: complex64, the same with F of ``frequencies`` in place of T: radiance times
+      ``exp(-2 pi i nu (opl - start_opl))``.
+
+    ``steady``: (C, ...) without the time, all light. ``polarized``: the four Stokes components come before C in all of
+    them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (what
+    JSON can hold); that of a batch is a list under ``batch``. ``axis`` is in metres of optical path, counted as the
+    scan's ``first_and_last_leg`` says.
+
+    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in results of renders: they concern the measured
+    tensors; the scan stays where it is, as the axes do (``capture.scan.to(device)`` moves it). Raises ShapeError where
+    tensors, scan and axis do not fit, StorageError for metadata that is not plain.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    transient: Tensor | None
+    axis: TimeAxis | None
+    scan: Scan
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    phasor: Tensor | None = None
+    frequencies: FrequencyAxis | None = None
+    steady: Tensor | None = None
+    channels: tuple[str, ...] = ()
+    polarized: bool = False
+
+    def __post_init__(self) -> None:
+        # Trees of tensors (``torch.utils._pytree``) take records apart and put anything into their places.
+        if isinstance(self.transient, Tensor):
+            self._check("transient", self.transient, None if self.axis is None else self.axis.num_bins, "axis")
+        if isinstance(self.phasor, Tensor):
+            count = None if self.frequencies is None else self.frequencies.num_frequencies
+            self._check("phasor", self.phasor, count, "frequencies")
+        if isinstance(self.steady, Tensor):
+            self._check_shape("steady", self.steady, ("C",), self.scan.shape)
+        try:
+            json.dumps(self.metadata, default=_refuse_plain)
+        except (TypeError, ValueError) as error:
+            raise StorageError(f"Capture: expected metadata of plain data that JSON can hold: {error}.") from None
+
+    def _check(self, name: str, tensor: Tensor, count: int | None, axis: str) -> None:
+        if count is None:
+            raise ShapeError(f"Capture: a {name} without {axis}= has no times. Give {axis}=.")
+        if tensor.is_complex() != (name == "phasor"):
+            kind = "complex" if name == "phasor" else "real"
+            raise ShapeError(f"Capture: expected {name} of {kind} numbers, got {tensor.dtype}.")
+        self._check_shape(name, tensor, ("C", count), self.scan.shape)
+
+    def _check_shape(self, name: str, tensor: Tensor, front: Sequence[Any], scan: tuple[int, ...]) -> None:
+        expected = ([4] if self.polarized else []) + [*front, *scan]
+        shape = tuple(tensor.shape)
+        fits = len(shape) >= len(expected) and all(
+            wanted in ("C", n) for wanted, n in zip(expected, shape[len(shape) - len(expected) :], strict=True)
+        )
+        if not fits or math.prod(shape) == 0:
+            words = ", ".join(map(str, expected))
+            raise ShapeError(f"Capture: expected {name} ({words}) as its {self.scan!r} and axis say, got {shape}.")
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[Capture]) -> dict[str, Any]:
+        return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
+
+    def _shown_notes(self) -> dict[str, str]:
+        return {"metadata": ", ".join(self.metadata)} if self.metadata else {}
+
+    # -------------------------------------------------------------------------------------------------- measurements
+
+    def total(self) -> Tensor:
+        """All light that the transient holds: its sum over time, (C, *scan.shape). Raises ShapeError without one."""
+        return self._cube("total").sum(self._time)
+
+    def peak_time(self) -> Tensor:
+        """Centre of the bin in which most light (sum over channels, S0 of a polarized capture) arrives at each pair,
+        metres, float64 in the scan's shape; NaN where there is none. Raises ShapeError without a transient.
+        """
+        cube = self._cube("peak_time").detach()
+        if self.polarized:
+            cube = cube.select(self._time - _CHANNEL_AND_TIME, 0)
+        highest, index = cube.sum(self._time - 1).max(self._time)
+        assert self.axis is not None  # a transient has one
+        return torch.where(highest > 0, self.axis.centers_opl.to(cube.device)[index], torch.nan)
+
+    def crop(self, start_opl: float, end_opl: float) -> Capture:
+        """The capture with the bins alone that lie in [start_opl, end_opl), metres, at least in part.
+
+        A view, with an axis of its own; ``steady`` stays all light, and a phasor what it is. Raises ShapeError without
+        a transient, UnitError where no bin is left.
+        """
+        cube, axis = self._cube("crop"), self.axis
+        assert axis is not None
+        if not (math.isfinite(start_opl) and math.isfinite(end_opl) and start_opl < end_opl):
+            raise UnitError(f"Capture.crop: expected a start before an end in metres, got {start_opl!r}, {end_opl!r}.")
+        # An edge that was computed in another way belongs to the bin that it is meant for.
+        first = max(0, math.floor((start_opl - axis.start_opl) / axis.bin_width_opl + 1e-6))
+        last = min(axis.num_bins, math.ceil((end_opl - axis.start_opl) / axis.bin_width_opl - 1e-6))
+        if last <= first:
+            raise UnitError(
+                f"Capture.crop: expected lengths between {axis.start_opl:.6g} and {axis.end_opl:.6g} m, got "
+                f"{start_opl:.6g} to {end_opl:.6g} m, which hold no bin."
+            )
+        kept = TimeAxis(axis.start_opl + first * axis.bin_width_opl, axis.bin_width_opl, last - first)
+        return replace(self, transient=cube.narrow(self._time, first, last - first), axis=kept)
+
+    # ---------------------------------------------------------------------------------------------- parts of a scan
+
+    def confocal(self) -> Capture:
+        """The confocal capture in an exhaustive one: its diagonal. Raises SceneError unless spots are sensor points."""
+        scan, rank = self.scan.confocal(), len(self.scan.sensor_shape)
+
+        def diagonal(tensor: Tensor) -> Tensor:
+            # Each laser dimension with the sensor dimension that it equals; `diagonal` puts the pair at the end.
+            for left in range(rank, 0, -1):
+                tensor = tensor.diagonal(dim1=tensor.ndim - rank - left, dim2=tensor.ndim - rank)
+            return tensor
+
+        return replace(self, scan=scan, **self._mapped(diagonal))
+
+    def single(self, laser: int | tuple[int, ...]) -> Capture:
+        """The single capture of one spot of an exhaustive one, a view; `laser`: its index in the laser's list or grid.
+
+        Raises SceneError for other kinds of scan, ShapeError for an index that is not there.
+        """
+        scan, index = self.scan.single(laser), laser_index(self.scan, laser)
+        rank = len(self.scan.sensor_shape)
+
+        def chosen(tensor: Tensor) -> Tensor:
+            for number in reversed(index):
+                tensor = tensor.select(tensor.ndim - rank - 1, number)
+            return tensor
+
+        return replace(self, scan=scan, **self._mapped(chosen))
+
+    def _mapped(self, function: Any) -> dict[str, Any]:
+        return {name: function(tensor) for name, tensor in self.tensors().items()}
+
+    @property
+    def _time(self) -> int:
+        """The dimension of time, from behind."""
+        return -len(self.scan.shape) - 1
+
+    def _cube(self, who: str) -> Tensor:
+        if self.transient is None:
+            raise ShapeError(f"Capture.{who}: expected a capture with a transient, got phasors alone.")
+        return self.transient
+
+
+def _refuse_plain(value: object) -> Any:
+    raise TypeError(f"{type(value).__name__} is not plain data")

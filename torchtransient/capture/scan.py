@@ -1,0 +1,339 @@
+"""Which points of a relay wall a laser lights and a sensor sees, and what lengths are counted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture.distances import bounds_of, longest, shortest
+from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, same, unit_normals
+from torchtransient.capture.wall import Wall, grid_size, triple
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+KINDS = ("single", "confocal", "exhaustive")
+# Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.
+_ASIDE, _BEFORE = 0.25, 0.125
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The points of a capture around a corner. All lengths in metres; tensors float64.
+
+    ``kind``: "single", one laser spot for all sensor points; "confocal", each sensor point is lit itself;
+    "exhaustive", all pairs of a spot and a sensor point. ``sensor_points``: (Sy, Sx, 3) or a list (N, 3), on the wall.
+    ``laser_points``: (3,) for single, equal to the sensor points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive.
+    ``sensor_normals``, ``laser_normals``: unit normals of the wall in the same shapes, None until they are known.
+    ``sensor_origin``, ``laser_origin``: (3,), where the sensor and the laser stand. ``first_and_last_leg``: whether
+    optical path lengths count from the laser's origin to the sensor's; False, from the spot to the sensor point.
+    ``wall``: Mitsuba's dictionary of the relay wall, None when a scene holds it.
+
+    Points may carry gradients. Frozen and picklable; two scans are equal when all of this is. Most scans are made by
+    :meth:`grid` or :meth:`points`. Raises ShapeError for shapes that do not belong together, UnitError for numbers that
+    are not finite, SceneError for an unknown kind, points off the wall and origins behind it.
+    """
+
+    kind: str
+    sensor_points: Tensor
+    laser_points: Tensor
+    sensor_origin: Tensor
+    laser_origin: Tensor
+    sensor_normals: Tensor | None = None
+    laser_normals: Tensor | None = None
+    first_and_last_leg: bool = False
+    wall: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {self.kind!r}.")
+        device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
+        for name in ("sensor_points", "laser_points", "sensor_origin", "laser_origin"):
+            object.__setattr__(self, name, float64_points(name, getattr(self, name), device))
+        for name in ("sensor_normals", "laser_normals"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, unit_normals(name, float64_points(name, getattr(self, name), device)))
+        if self.wall is not None and not isinstance(self.wall, Mapping):
+            raise SceneError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
+        check_shapes(self)
+        check_sides(self)
+
+    @classmethod
+    def grid(
+        cls,
+        wall: Any,
+        size: int | Sequence[int],
+        *,
+        kind: str,
+        laser: Any = None,
+        sensor_origin: Any = None,
+        laser_origin: Any = None,
+        laser_grid: int | Sequence[int] | None = None,
+        cell_centers: bool = True,
+        extent: Sequence[float] | None = None,
+        first_and_last_leg: bool = False,
+    ) -> Scan:
+        """A regular grid of nx x ny sensor points on a wall; `size` is (nx, ny) or one number for both.
+
+        `wall`: a :class:`Wall`, a Mitsuba dictionary of a rectangle, or (vertices, faces) of a curved wall, on which
+        points are found along its mean normal. Rows of the grid run along v, columns along u. `laser` is the spot of a
+        single scan: a point (3,) on the wall, or its coordinates (u, v); None is the middle of the wall. `laser_grid`
+        is the size of an exhaustive scan's grid of spots, None for the sensor's. `cell_centers` and `extent` as in
+        :meth:`Wall.grid`, for both grids. Origins that are None stand a quarter of the wall's width to the -u side of
+        its middle and an eighth of it before the wall, where they see all of a flat wall.
+
+        Raises SceneError where a spot misses the wall, for a laser or a laser grid that the kind has no use for, and
+        for an exhaustive scan of one pair, which is a single one; otherwise as the class and :meth:`Wall.grid`.
+        """
+        surface = Wall.of(wall)
+        nx, ny = grid_size(size, "Scan.grid")
+        points, normals = surface.grid((nx, ny), extent, cell_centers=cell_centers)
+        if kind == "single":
+            _refuse("laser_grid", laser_grid, kind, "its spot is laser=(u, v) or a point (3,)")
+            spots, spot_normals = _spot(surface, laser)
+        else:
+            _refuse("laser", laser, kind, "laser= is for kind='single'")
+            spots, spot_normals = points, normals
+        if kind == "confocal":
+            _refuse("laser_grid", laser_grid, kind, "it lights its sensor points, size= says how many")
+        if kind == "exhaustive":
+            if laser_grid is not None:
+                spots, spot_normals = surface.grid(laser_grid, extent, cell_centers=cell_centers)
+            if spots.size == 3 and points.size == 3:
+                raise SceneError(
+                    "Scan.grid: expected an exhaustive scan of several pairs, got a grid of one point for the laser "
+                    "and the sensor. Give kind='single' with laser=, or kind='confocal', or larger grids."
+                )
+        aside = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
+        return cls(
+            kind=kind,
+            sensor_points=torch.from_numpy(points),
+            laser_points=spots if isinstance(spots, Tensor) else torch.from_numpy(spots),
+            sensor_origin=float64_points("sensor_origin", aside if sensor_origin is None else sensor_origin),
+            laser_origin=float64_points("laser_origin", aside if laser_origin is None else laser_origin),
+            sensor_normals=torch.from_numpy(normals),
+            laser_normals=torch.from_numpy(spot_normals),
+            first_and_last_leg=first_and_last_leg,
+            wall=surface.shape,
+        )
+
+    @classmethod
+    def points(
+        cls,
+        sensor_points: Any,
+        *,
+        kind: str,
+        laser_points: Any = None,
+        sensor_origin: Any,
+        laser_origin: Any,
+        wall: Any = None,
+        normals: Any = None,
+        first_and_last_leg: bool = False,
+    ) -> Scan:
+        """A scan of given points: `sensor_points` (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
+
+        `laser_points` as in the class; left out for confocal scans. `wall` as in :meth:`grid`: all points must lie on
+        it, to 1e-4 of its diagonal, and take its normals; None when the points are known to lie on a wall of a scene.
+        `normals`: those of the sensor points where no wall is given, and of the spots of a confocal scan. Errors as the
+        class.
+        """
+        sensor = float64_points("sensor_points", sensor_points)
+        if kind == "confocal":
+            _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
+            laser = sensor
+        elif laser_points is None:
+            raise SceneError(f"Scan.points: expected laser_points for kind={kind!r}, got None. Give the laser's spots.")
+        else:
+            laser = float64_points("laser_points", laser_points, sensor.device)
+        sensor_normals = None if normals is None else float64_points("normals", normals, sensor.device)
+        laser_normals = sensor_normals if kind == "confocal" else None
+        shape = None
+        if wall is not None:
+            surface = Wall.of(wall)
+            sensor_normals = _normals_on(surface, sensor, "Scan.points sensor_points")
+            laser_normals = _normals_on(surface, laser, "Scan.points laser_points")
+            shape = surface.shape
+        return cls(
+            kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, first_and_last_leg, shape
+        )
+
+    # ------------------------------------------------------------------------------------------------------- sizes
+
+    @property
+    def sensor_shape(self) -> tuple[int, ...]:
+        """(Sy, Sx) or (N,)."""
+        return tuple(self.sensor_points.shape[:-1])
+
+    @property
+    def laser_shape(self) -> tuple[int, ...]:
+        """(Ly, Lx) or (M,); () for a single spot."""
+        return tuple(self.laser_points.shape[:-1])
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """What follows (C, T) in a capture: (Sy, Sx) or (N,); for exhaustive scans the laser's dimensions before it."""
+        return (*self.laser_shape, *self.sensor_shape) if self.kind == "exhaustive" else self.sensor_shape
+
+    @property
+    def pairs(self) -> int:
+        """How many histograms a capture has: pairs of a laser spot and a sensor point."""
+        return math.prod(self.shape)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether all laser and sensor points lie in one plane, to 1e-6 of their extent."""
+        points = torch.cat([self.sensor_points.detach().reshape(-1, 3), self.laser_points.detach().reshape(-1, 3)])
+        spread = torch.linalg.svdvals((points - points.mean(0)).cpu())
+        return bool(len(spread) < 3 or spread[2] <= 1e-6 * spread[0])
+
+    @property
+    def spacing(self) -> tuple[float, float]:
+        """Distances (along a row, along a column) between neighbours of a regular sensor grid, metres.
+
+        Raises ShapeError for a list of points, for a grid that is not regular to 1e-6 of its extent, and where a row or
+        column holds one point.
+        """
+        if self.sensor_points.ndim != 3 or min(self.sensor_shape) < 2:
+            raise ShapeError(f"Scan.spacing: expected a grid of at least 2 x 2 sensor points, got {self.sensor_shape}.")
+        points = self.sensor_points.detach()
+        (rows, columns), first = self.sensor_shape, points[0, 0]
+        across = (points[0, -1] - first) / (columns - 1)
+        down = (points[-1, 0] - first) / (rows - 1)
+        i = torch.arange(rows, dtype=torch.float64, device=points.device)[:, None, None]
+        j = torch.arange(columns, dtype=torch.float64, device=points.device)[None, :, None]
+        error = (points - (first + i * down + j * across)).norm(dim=-1).max()
+        if bool(error > 1e-6 * (points[-1, -1] - first).norm()):
+            raise ShapeError(
+                f"Scan.spacing: expected a regular grid, got points up to {float(error):.3g} m off it. Use the points "
+                "themselves."
+            )
+        return float(across.norm()), float(down.norm())
+
+    @property
+    def sensor_legs(self) -> Tensor:
+        """Distances from the sensor points to the sensor's origin, in the points' shape, metres."""
+        legs: Tensor = torch.linalg.vector_norm(self.sensor_points - self.sensor_origin, dim=-1)
+        return legs
+
+    @property
+    def laser_legs(self) -> Tensor:
+        """Distances from the laser's origin to its spots, in the spots' shape, metres."""
+        legs: Tensor = torch.linalg.vector_norm(self.laser_points - self.laser_origin, dim=-1)
+        return legs
+
+    @property
+    def legs(self) -> Tensor:
+        """What :attr:`first_and_last_leg` adds to the length of each pair, in the scan's :attr:`shape`, metres."""
+        laser = self.laser_legs
+        if self.kind == "exhaustive":
+            laser = laser.reshape(*self.laser_shape, *(1,) * len(self.sensor_shape))
+        return laser + self.sensor_legs
+
+    def default_axis(self, hidden_bounds: Any, bin_width_opl: float) -> TimeAxis:
+        """Bins of `bin_width_opl` metres that hold all light of three bounces off things in a box.
+
+        `hidden_bounds`: (2, 3), the corners of lowest and of highest coordinates, metres. The axis starts and ends on
+        multiples of the width. Lengths follow :attr:`first_and_last_leg`. Raises ShapeError and UnitError for bounds
+        that are none, and as TimeAxis.
+        """
+        low, high = bounds_of(hidden_bounds, "Scan.default_axis")
+        width = float(bin_width_opl)
+        if not (math.isfinite(width) and width > 0):
+            raise UnitError(f"Scan.default_axis: expected bin_width_opl > 0 metres, got {bin_width_opl!r}.")
+        first, last = math.floor(shortest(self, low, high) / width), math.ceil(longest(self, low, high) / width)
+        return TimeAxis(first * width, width, max(1, last - first))
+
+    # ------------------------------------------------------------------------------------------------- other scans
+
+    def to(self, device: Any) -> Self:
+        """The scan with its tensors on a device; they stay float64."""
+        if isinstance(device, torch.dtype):
+            raise ShapeError(f"Scan.to: expected a device, got {device}; points are float64 throughout.")
+        names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
+        moved = {name: getattr(self, name).to(device) for name in names if getattr(self, name) is not None}
+        return replace(self, **moved)
+
+    def detach(self) -> Self:
+        """The scan without gradients in its points."""
+        names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
+        return replace(self, **{n: getattr(self, n).detach() for n in names if getattr(self, n) is not None})
+
+    def single(self, laser: int | tuple[int, ...]) -> Scan:
+        """The single scan of one spot of an exhaustive one; `laser`: its index in the laser's list or grid.
+
+        Raises SceneError for other kinds, ShapeError for an index that is not there.
+        """
+        if self.kind != "exhaustive":
+            raise SceneError(f"Scan.single: expected an exhaustive scan, got a {self.kind} one.")
+        index = laser_index(self, laser)
+        normals = None if self.laser_normals is None else self.laser_normals[index]
+        return replace(self, kind="single", laser_points=self.laser_points[index], laser_normals=normals)
+
+    def confocal(self) -> Scan:
+        """The confocal scan in an exhaustive one whose spots are its sensor points. Raises SceneError for others."""
+        same = self.laser_points.shape == self.sensor_points.shape and bool(
+            torch.allclose(self.laser_points.detach(), self.sensor_points.detach(), rtol=0, atol=1e-9)
+        )
+        if self.kind != "exhaustive" or not same:
+            raise SceneError(
+                f"Scan.confocal: expected an exhaustive scan whose spots are its sensor points, got a {self.kind} one "
+                f"of spots {self.laser_shape} and sensor points {self.sensor_shape}."
+            )
+        return replace(self, kind="confocal", laser_points=self.sensor_points, laser_normals=self.sensor_normals)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scan):
+            return NotImplemented
+        return all(same(a, b) for a, b in zip(self._contents(), other._contents(), strict=True))
+
+    def __hash__(self) -> int:
+        return hash((self.kind, self.shape, self.first_and_last_leg))
+
+    def _contents(self) -> list[Any]:
+        return list(vars(self).values())
+
+    def __repr__(self) -> str:
+        points = self.sensor_points.detach().reshape(-1, 3)
+        size = (points.amax(0) - points.amin(0)).norm()
+        sensor = " x ".join(map(str, reversed(self.sensor_shape)))
+        spots = " x ".join(map(str, reversed(self.laser_shape)))
+        lasers = {"single": ", 1 spot", "confocal": "", "exhaustive": f", {spots} spots"}[self.kind]
+        legs = ", with first and last leg" if self.first_and_last_leg else ""
+        return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
+
+
+def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
+    """`laser` as an index into the spots of a scan. Raises ShapeError where there is none."""
+    index = laser if isinstance(laser, tuple) else (laser,)
+    inside = len(index) == len(scan.laser_shape) and all(
+        -n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)
+    )
+    if not inside:
+        raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {laser!r}.")
+    return tuple(int(i) for i in index)
+
+
+def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:
+    if laser is None:
+        return surface.at(0.5, 0.5)
+    plain = laser.detach().cpu().numpy() if isinstance(laser, Tensor) else np.asarray(laser, dtype=np.float64)
+    if plain.shape == (2,):
+        return surface.at(plain[0], plain[1])
+    point = triple("Scan.grid laser", laser)
+    normal = surface.normals_at(point[None], "Scan.grid laser")[0]
+    return (laser if isinstance(laser, Tensor) else point), normal
+
+
+def _normals_on(surface: Wall, points: Tensor, what: str) -> Tensor:
+    flat = points.detach().cpu().numpy().reshape(-1, 3)
+    return torch.from_numpy(surface.normals_at(flat, what)).reshape(points.shape).to(points.device)
+
+
+def _refuse(name: str, value: Any, kind: str, instead: str) -> None:
+    if value is not None:
+        raise SceneError(f"Scan: {name} has no meaning for kind={kind!r}: {instead}. Leave it out.")

@@ -1,0 +1,92 @@
+"""Whether the parts of a scan belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+if TYPE_CHECKING:
+    from torchtransient.capture.scan import Scan
+
+
+def float64_points(name: str, values: Any, device: torch.device | None = None) -> Tensor:
+    """Points (..., 3) as float64, with the gradients they carry. Raises ShapeError and UnitError."""
+    try:
+        tensor = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {values!r}.") from None
+    if tensor.is_complex() or tensor.ndim == 0 or tensor.shape[-1] != 3 or tensor.numel() == 0:
+        raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
+    tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        raise UnitError(f"Scan: expected {name} in finite metres, got NaN or infinity.")
+    return tensor
+
+
+def unit_normals(name: str, normals: Tensor) -> Tensor:
+    """Normals (..., 3) of length 1; those that have it keep every digit. Raises UnitError for zero vectors."""
+    length: Tensor = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
+    if not bool((length.detach() > 0).all()):
+        raise UnitError(f"Scan: expected {name} with a direction, got a zero vector.")
+    off = (length.detach() - 1).abs() > 1e-12
+    return torch.where(off, normals / length, normals)
+
+
+def check_shapes(scan: Scan) -> None:
+    """Raise ShapeError or SceneError where points, normals and origins do not have the shapes of the scan's kind."""
+    for name in ("sensor_origin", "laser_origin"):
+        if getattr(scan, name).shape != (3,):
+            raise ShapeError(f"Scan: expected {name} (3,), got {tuple(getattr(scan, name).shape)}.")
+    sensor, laser = scan.sensor_points, scan.laser_points
+    if sensor.ndim not in (2, 3):
+        raise ShapeError(f"Scan: expected sensor_points (Sy, Sx, 3) or (N, 3), got {tuple(sensor.shape)}.")
+    allowed = {"single": (1,), "confocal": (sensor.ndim,), "exhaustive": (2, 3)}[scan.kind]
+    words = {
+        "single": "(3,), the one spot",
+        "confocal": f"{tuple(sensor.shape)}, the sensor points",
+        "exhaustive": "(Ly, Lx, 3) or (M, 3)",
+    }[scan.kind]
+    if laser.ndim not in allowed or (scan.kind == "confocal" and laser.shape != sensor.shape):
+        raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
+    if scan.kind == "confocal" and not bool(torch.equal(laser.detach(), sensor.detach())):
+        raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")
+    for name in ("sensor", "laser"):
+        points, normals = getattr(scan, f"{name}_points"), getattr(scan, f"{name}_normals")
+        if normals is not None and normals.shape != points.shape:
+            raise ShapeError(
+                f"Scan: expected {name}_normals {tuple(points.shape)} as the points, got {tuple(normals.shape)}."
+            )
+
+
+def check_sides(scan: Scan) -> None:
+    """Origins must be able to see the points: in front of the wall at each of them."""
+    for name in ("sensor", "laser"):
+        normals = getattr(scan, f"{name}_normals")
+        if normals is None:
+            continue
+        origin, points = getattr(scan, f"{name}_origin"), getattr(scan, f"{name}_points")
+        heights = ((origin - points) * normals).sum(-1).detach()
+        behind = int((heights <= 0).sum())
+        if behind:
+            raise SceneError(
+                f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
+                f"{heights.numel()} points do not see: it is behind them by up to {-float(heights.min()):.4g} m. Move "
+                "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
+            )
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two tensors, arrays or dictionaries of them have equal values, wherever they are."""
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return a.shape == b.shape and bool(torch.equal(a.detach().cpu(), b.detach().cpu()))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.shape(a) == np.shape(b) and bool(np.array_equal(a, b))
+    return bool(a == b)

@@ -1,0 +1,344 @@
+"""The relay wall as a surface that points are laid out on: a parallelogram or a triangle mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.capture.triangles import first_hits, triangle_normals
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+Array = NDArray[np.float64]
+
+# A point counts as lying on the wall up to this part of the wall's diagonal: coordinates of files have five digits.
+ON_WALL = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
+
+    A flat wall is the parallelogram `center + (2u - 1) half_u + (2v - 1) half_v`. On a curved one a point is found by
+    going from that place along `normal` (the mesh's mean normal) to the mesh, from the front. `normal` points into the
+    room that the wall sees. `shape` is the Mitsuba dictionary that a renderer builds it from. Picklable.
+
+    Make one with :meth:`plane`, :meth:`mesh` or, of anything that describes a wall, :meth:`of`.
+    """
+
+    center: Array
+    half_u: Array
+    half_v: Array
+    normal: Array
+    shape: Mapping[str, Any]
+    vertices: Array | None = None
+    faces: NDArray[np.int64] | None = None
+
+    @classmethod
+    def plane(
+        cls,
+        width: float = 2.0,
+        height: float = 2.0,
+        *,
+        center: Sequence[float] = (0.0, 0.0, 0.0),
+        normal: Sequence[float] = (0.0, 0.0, 1.0),
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        albedo: float | Sequence[float] = 0.5,
+    ) -> Wall:
+        """A diffuse rectangle, metres. u runs along `up x normal`, v along `up` as far as it lies in the wall.
+
+        `albedo`: one number or a linear sRGB triple. Raises UnitError for sizes that are not positive or albedos
+        outside of [0, 1], SceneError for a normal without a direction or along `up`.
+        """
+        for name, size in (("width", width), ("height", height)):
+            if not (np.isfinite(size) and size > 0):
+                raise UnitError(f"Wall.plane: expected {name} > 0 metres, got {size!r}.")
+        n, u, v = _frame(triple("Wall.plane normal", normal), triple("Wall.plane up", up), "Wall.plane")
+        to_world = np.eye(4)
+        to_world[:3, 0], to_world[:3, 1], to_world[:3, 2] = u * width / 2, v * height / 2, n
+        to_world[:3, 3] = triple("Wall.plane center", center)
+        return cls.of({"type": "rectangle", "to_world": to_world, "bsdf": _diffuse(albedo)})
+
+    @classmethod
+    def mesh(
+        cls,
+        vertices: Any,
+        faces: Any,
+        *,
+        up: Sequence[float] = (0.0, 1.0, 0.0),
+        albedo: float | Sequence[float] = 0.5,
+    ) -> Wall:
+        """A diffuse triangle mesh: `vertices` (V, 3) metres, `faces` (F, 3) whole numbers, wound against the clock as
+        seen from the room.
+
+        u and v span the smallest rectangle across the mean normal that holds the mesh. Raises ShapeError for other
+        shapes or indices, UnitError for numbers that are not finite, SceneError for a mesh without a mean normal.
+        """
+        points, triangles = mesh_arrays("Wall.mesh", vertices, faces)
+        corners = points[triangles]
+        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        mean = areas.sum(0)
+        if not np.linalg.norm(mean) > 1e-3 * np.linalg.norm(areas, axis=1).sum():
+            raise SceneError(
+                "Wall.mesh: expected a surface that faces one side, got one whose normals cancel: a closed body, or "
+                "triangles wound both ways. Give the visible part alone, its corners against the clock."
+            )
+        n, u, v = _frame(mean, triple("Wall.mesh up", up), "Wall.mesh")
+        along = (points @ np.stack([u, v, n]).T)[triangles.reshape(-1)]
+        low, high = along.min(0), along.max(0)
+        middle = (low + high) / 2
+        return cls(
+            center=middle[0] * u + middle[1] * v + middle[2] * n,
+            half_u=(high[0] - low[0]) / 2 * u,
+            half_v=(high[1] - low[1]) / 2 * v,
+            normal=n,
+            shape={"type": "mesh_arrays", "vertices": points, "faces": triangles, "bsdf": _diffuse(albedo)},
+            vertices=points,
+            faces=triangles,
+        )
+
+    @classmethod
+    def of(cls, description: Any) -> Wall:
+        """A wall; a Mitsuba dictionary of a `rectangle` or of `mesh_arrays`; or a pair (vertices, faces).
+
+        Raises SceneError for anything else; then errors as :meth:`mesh`.
+        """
+        if isinstance(description, Wall):
+            return description
+        if isinstance(description, Mapping):
+            kind = description.get("type")
+            matrix = _to_world(description)
+            if kind == "rectangle":
+                return cls._rectangle(description, matrix)
+            if kind == "mesh_arrays":
+                points, triangles = mesh_arrays("Wall", description.get("vertices"), description.get("faces"))
+                if description.get("flip_normals"):
+                    triangles = triangles[:, ::-1]
+                placed = cls.mesh(points @ matrix[:3, :3].T + matrix[:3, 3], triangles)
+                return cls(**{**placed.__dict__, "shape": description})
+            raise SceneError(
+                f"Wall: expected a Mitsuba dictionary of type 'rectangle' or 'mesh_arrays', got {kind!r}. Give the "
+                "triangles of other shapes: Wall.mesh(vertices, faces)."
+            )
+        if isinstance(description, Sequence) and len(description) == 2:
+            return cls.mesh(*description)
+        raise SceneError(
+            "Wall: expected Wall.plane(...), a Mitsuba dictionary of a rectangle, or a pair (vertices, faces), got "
+            f"{type(description).__name__}."
+        )
+
+    @classmethod
+    def _rectangle(cls, description: Mapping[str, Any], matrix: Array) -> Wall:
+        half_u, half_v = matrix[:3, 0], matrix[:3, 1]
+        # Normals go by the inverse transpose; Mitsuba's keep their side when the transform mirrors.
+        try:
+            normal = np.linalg.inv(matrix[:3, :3])[2]
+        except np.linalg.LinAlgError:
+            raise SceneError(f"Wall: expected a to_world with an inverse, got {matrix.tolist()}.") from None
+        if description.get("flip_normals"):
+            normal = -normal
+        return cls(matrix[:3, 3], half_u, half_v, normal / np.linalg.norm(normal), description)
+
+    @property
+    def width(self) -> float:
+        """Length along u, metres."""
+        return float(2 * np.linalg.norm(self.half_u))
+
+    @property
+    def height(self) -> float:
+        """Length along v, metres."""
+        return float(2 * np.linalg.norm(self.half_v))
+
+    @property
+    def diagonal(self) -> float:
+        """The longer diagonal of the rectangle that (u, v) spans, metres."""
+        a, b = self.half_u + self.half_v, self.half_u - self.half_v
+        return float(2 * max(np.linalg.norm(a), np.linalg.norm(b)))
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the wall is a parallelogram; a mesh counts as curved, however flat it is."""
+        return self.vertices is None
+
+    def at(self, u: Any, v: Any) -> tuple[Array, Array]:
+        """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. Raises SceneError for coordinates
+        outside of [0, 1] and where a curved wall has a hole.
+        """
+        u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        if not (np.all((u >= 0) & (u <= 1)) and np.all((v >= 0) & (v <= 1))):
+            raise SceneError("Wall.at: expected coordinates (u, v) between 0 and 1, got some outside of the wall.")
+        flat = self.center + (2 * u[..., None] - 1) * self.half_u + (2 * v[..., None] - 1) * self.half_v
+        if self.vertices is None:
+            return flat, np.broadcast_to(self.normal, flat.shape).copy()
+        points, normals, hit = self._from_front(flat.reshape(-1, 3))
+        if not hit.all():
+            missed = np.flatnonzero(~hit)
+            raise SceneError(
+                f"Wall: {len(missed)} of {len(hit)} points do not meet the mesh along its mean normal, the first at "
+                f"(u, v) = ({u.flat[missed[0]]:.4g}, {v.flat[missed[0]]:.4g}). Scan a part of the wall that has no "
+                "holes: extent=(u0, v0, u1, v1)."
+            )
+        return points.reshape(flat.shape), normals.reshape(flat.shape)
+
+    def grid(
+        self, size: int | Sequence[int], extent: Sequence[float] | None = None, *, cell_centers: bool = True
+    ) -> tuple[Array, Array]:
+        """Points and normals (ny, nx, 3) of a regular grid; `size` is (nx, ny) or one number for both.
+
+        Rows run along v, columns along u. `extent` (u0, v0, u1, v1) is the part of the wall that is scanned, None for
+        all of it. `cell_centers`: points are the middles of nx x ny cells; else they begin and end on the edges of the
+        extent (a single one stands in the middle). Raises ShapeError for sizes below 1, SceneError for an extent
+        without an area or outside of the wall, and as :meth:`at`.
+        """
+        nx, ny = grid_size(size, "Wall.grid")
+        u0, v0, u1, v1 = _extent(extent)
+        u, v = _places(nx, u0, u1, cell_centers), _places(ny, v0, v1, cell_centers)
+        return self.at(u[None, :], v[:, None])
+
+    def normals_at(self, points: Array, what: str) -> Array:
+        """Unit normals (N, 3) at points (N, 3) of the wall, up to `ON_WALL` of its diagonal. `what` the points are, for
+        messages. Raises SceneError when some are not on it.
+        """
+        relative = points - self.center
+        basis = np.stack([self.half_u, self.half_v, self.normal], axis=1)
+        a, b, height = np.linalg.solve(basis, relative.T)
+        tolerance = ON_WALL * self.diagonal
+        margin_u, margin_v = (1 + tolerance / np.linalg.norm(h) for h in (self.half_u, self.half_v))
+        inside = (np.abs(a) <= margin_u) & (np.abs(b) <= margin_v)
+        normals = np.broadcast_to(self.normal, points.shape).copy()
+        if self.vertices is not None:
+            flat = points - height[:, None] * self.normal
+            found, normals, hit = self._from_front(flat)
+            height = np.where(hit, ((points - found) * self.normal).sum(1), np.inf)
+        off = np.flatnonzero(~inside | ~(np.abs(height) <= tolerance))
+        if len(off):
+            first = points[off[0]]
+            where = "beside it" if not inside[off[0]] else f"{abs(height[off[0]]):.4g} m off it"
+            raise SceneError(
+                f"{what}: expected points on the wall, got {len(off)} of {len(points)} elsewhere, the first at "
+                f"{np.array2string(first, precision=4)}, {where}. The wall is {self.width:.4g} x {self.height:.4g} m "
+                f"around {np.array2string(self.center, precision=4)}; Wall.at(u, v) gives points on it."
+            )
+        return normals
+
+    def _from_front(self, places: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """First points of the mesh met by rays that come from the room through `places` (N, 3), their normals, and
+        whether there is one.
+        """
+        assert self.vertices is not None and self.faces is not None
+        corners = self.vertices[self.faces]
+        above = (self.vertices @ self.normal).max() - places @ self.normal + self.diagonal
+        distance, triangle = first_hits(places + above[:, None] * self.normal, -self.normal, corners)
+        hit = triangle >= 0
+        points = places + (above - np.where(hit, distance, 0.0))[:, None] * self.normal
+        normals = triangle_normals(corners)[triangle]
+        back = hit & ((normals * self.normal).sum(1) <= 0)
+        if back.any():
+            raise SceneError(
+                f"Wall: {int(back.sum())} points lie on triangles that turn their back to the room. Wind the corners "
+                "of all triangles against the clock, as seen from the room."
+            )
+        return points, normals, hit
+
+    def __repr__(self) -> str:
+        kind = "plane" if self.faces is None else f"{len(self.faces)} triangles"
+        place = np.array2string(self.center, precision=4, separator=", ")
+        return f"Wall({kind}, {self.width:.4g} x {self.height:.4g} m, center={place})"
+
+
+def triple(what: str, values: Any) -> Array:
+    """Three finite numbers as float64 (3,). Raises ShapeError and UnitError."""
+    try:
+        array = np.asarray(_detached(values), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{what}: expected three numbers [x, y, z], got {values!r}.") from None
+    if array.shape != (3,):
+        raise ShapeError(f"{what}: expected three numbers [x, y, z], got shape {array.shape}.")
+    if not np.isfinite(array).all():
+        raise UnitError(f"{what}: expected finite metres, got {array.tolist()}.")
+    return array
+
+
+def mesh_arrays(who: str, vertices: Any, faces: Any) -> tuple[Array, NDArray[np.int64]]:
+    """A triangle mesh as float64 (V, 3) and int64 (F, 3). Raises ShapeError and UnitError."""
+    try:
+        points = np.array(_detached(vertices), dtype=np.float64)
+        given = np.array(_detached(faces))
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f"{who}: expected vertices (V, 3) and faces (F, 3), got something else: {error}.") from None
+    if points.ndim != 2 or points.shape[1] != 3 or given.ndim != 2 or given.shape[1] != 3 or not len(given):
+        raise ShapeError(
+            f"{who}: expected vertices (V, 3) and faces (F, 3), got shapes {points.shape} and {given.shape}."
+        )
+    if not np.isfinite(points).all():
+        raise UnitError(f"{who}: expected finite vertices in metres, got {int((~np.isfinite(points)).sum())} others.")
+    whole = given.dtype.kind in "iu" or (given.dtype.kind == "f" and bool((given == np.round(given)).all()))
+    triangles = given.astype(np.int64)
+    if not whole or triangles.min() < 0 or triangles.max() >= len(points):
+        raise ShapeError(
+            f"{who}: expected faces of whole numbers from 0 to {len(points) - 1}, one less than the vertices, got "
+            f"{given.dtype} from {given.min()} to {given.max()}."
+        )
+    return points, triangles
+
+
+def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
+    """(nx, ny) of one number or a pair. Raises ShapeError unless both are whole and at least 1."""
+    pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
+    whole = [isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in pair]
+    if len(pair) != 2 or not all(whole):
+        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {size!r}.")
+    return int(pair[0]), int(pair[1])
+
+
+def _detached(values: Any) -> Any:
+    return values.detach().cpu().numpy() if hasattr(values, "detach") else values
+
+
+def _frame(normal: Array, up: Array, who: str) -> tuple[Array, Array, Array]:
+    length = np.linalg.norm(normal)
+    if not length > 0:
+        raise SceneError(f"{who}: expected a normal with a direction, got {normal.tolist()}.")
+    n = normal / length
+    u = np.cross(up, n)
+    if not np.linalg.norm(u) > 1e-9 * np.linalg.norm(up):
+        raise SceneError(f"{who}: up {up.tolist()} is parallel to the wall's normal; choose another up=.")
+    u = u / np.linalg.norm(u)
+    return n, u, np.cross(n, u)
+
+
+def _to_world(description: Mapping[str, Any]) -> Array:
+    given = description.get("to_world", np.eye(4))
+    matrix = np.asarray(getattr(given, "matrix", given), dtype=np.float64)
+    matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ShapeError(f"Wall: expected to_world as a (4, 4) array of finite numbers, got shape {matrix.shape}.")
+    return matrix
+
+
+def _diffuse(albedo: float | Sequence[float]) -> dict[str, Any]:
+    values = np.asarray(albedo, dtype=np.float64)
+    if values.shape not in ((), (3,)) or not bool(((values >= 0) & (values <= 1)).all()):
+        raise UnitError(f"Wall: expected an albedo or three between 0 and 1, got {albedo!r}.")
+    plain: Any = float(values) if values.ndim == 0 else {"type": "rgb", "value": values.tolist()}
+    return {"type": "diffuse", "reflectance": plain}
+
+
+def _extent(extent: Sequence[float] | None) -> tuple[float, float, float, float]:
+    if extent is None:
+        return 0.0, 0.0, 1.0, 1.0
+    given = np.asarray(extent, dtype=np.float64)
+    if given.shape != (4,):
+        raise ShapeError(f"extent: expected four coordinates of the wall (u0, v0, u1, v1), got {extent!r}.")
+    u0, v0, u1, v1 = given.tolist()
+    if not (0 <= u0 < u1 <= 1 and 0 <= v0 < v1 <= 1):
+        raise SceneError(f"extent: expected 0 <= u0 < u1 <= 1 and 0 <= v0 < v1 <= 1, got {extent!r}.")
+    return u0, v0, u1, v1
+
+
+def _places(count: int, low: float, high: float, centers: bool) -> Array:
+    share = (np.arange(count) + 0.5) / count if centers or count == 1 else np.arange(count) / (count - 1)
+    return low + (high - low) * share

@@ -1,0 +1,159 @@
+"""From hidden things and a scan to a scene: relay wall, laser, sensor, integrator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchtransient.capture import Scan
+from torchtransient.errors import SceneError
+from torchtransient.render.build import BuildOptions
+from torchtransient.render.scene_handle import load
+from torchtransient.render.variant import active_variant
+
+# Names of a capture's own nodes: those of hidden things must be others.
+WALL, SENSOR, LASER = "wall", "sensor", "laser"
+_INTEGRATOR = "integrator"
+_MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
+_CHAIN = ("sensor", "integrator", "emitter")
+
+
+def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy: Any = 1.0) -> dict[str, Any]:
+    """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
+
+    ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
+    object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
+    numbers of bounces that count, without gaps; 3 is light around one corner. ``energy``: joules of the laser, a number
+    or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor ``wall.sensor``.
+
+    Raises SceneError for what is no shape, for names that the capture needs itself, and for a scan without a wall.
+    """
+    if scan.wall is None:
+        raise SceneError(
+            "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
+            "or Scan.points(..., wall=...)."
+        )
+    first, last = _range(bounces)
+    shapes = hidden_shapes(hidden)
+    taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
+    if taken:
+        raise SceneError(f"capture: the names {', '.join(taken)} belong to the capture itself; rename the hidden nodes.")
+    rows, columns = film_size(scan)
+    film: dict[str, Any] = {
+        "type": "transient_hdr_film", "width": columns, "height": rows, "rfilter": {"type": "box"}, "temporal_bins": 1,
+    }  # fmt: skip
+    sensor: dict[str, Any] = {
+        "type": "nlos_capture_meter",
+        "sensor_origin": _numbers(scan.sensor_origin).tolist(),
+        "laser_origin": _numbers(scan.laser_origin).tolist(),
+        "points": _numbers(scan.sensor_points).reshape(-1, 3),
+        "sampler": {"type": "independent"},
+        "film": film,
+    }
+    if scan.kind != "confocal":
+        sensor["laser_points"] = _numbers(scan.laser_points).reshape(-1, 3)
+    if scan.kind == "exhaustive":
+        laser_rows, laser_columns = laser_size(scan)
+        film |= {"exhaustive_scan": True, "laser_scan_height": laser_rows, "laser_scan_width": laser_columns}
+    integrator = {
+        "type": "transient_nlos_path",
+        "capture_type": scan.kind,
+        "max_depth": last,
+        "min_bounces": first,
+        "rr_depth": max(5, last),
+        "account_first_and_last_bounces": scan.first_and_last_leg,
+        "nlos_laser_sampling": True,
+        "nlos_hidden_geometry_sampling": True,
+    }
+    return {
+        "type": "scene",
+        _INTEGRATOR: integrator,
+        LASER: {"type": "laser_beam", "energy": energy},
+        WALL: dict(scan.wall) | {SENSOR: sensor},
+        **shapes,
+    }
+
+
+def hidden_shapes(hidden: Any) -> dict[str, Any]:
+    """Hidden things as a dictionary of Mitsuba shapes (and what they refer to) by name."""
+    if isinstance(hidden, (str, Path)):
+        plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
+        if plugin is None:
+            raise SceneError(
+                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got {hidden!r}."
+            )
+        return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
+    if isinstance(hidden, Mapping):
+        if hidden.get("type") == "scene" or "type" not in hidden:
+            shapes = {name: node for name, node in hidden.items() if name != "type"}
+            _check_shapes(shapes)
+            return shapes
+        return {"hidden": dict(hidden)}
+    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:  # noqa: PLR2004 (vertices and faces)
+        return {"hidden": _mesh(*hidden)}
+    if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
+        return {"hidden": _mesh(hidden.vertices, hidden.faces)}
+    raise SceneError(
+        "hidden: expected a Mitsuba shape dictionary, a dictionary of them, (vertices, faces), an object with vertices "
+        f"and faces, or a mesh file, got {type(hidden).__name__}."
+    )
+
+
+def film_size(scan: Scan) -> tuple[int, int]:
+    """(rows, columns) of the film: a list of points is one row."""
+    shape = scan.sensor_shape
+    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0])
+
+
+def laser_size(scan: Scan) -> tuple[int, int]:
+    """(rows, columns) of the laser's positions, likewise; (1, 1) for a single spot."""
+    shape = scan.laser_shape
+    return (shape[0], shape[1]) if len(shape) > 1 else (1, *shape) if shape else (1, 1)
+
+
+def _check_shapes(shapes: Mapping[str, Any]) -> None:
+    if not shapes:
+        raise SceneError("hidden: expected at least one shape, got an empty dictionary.")
+    for name, node in shapes.items():
+        if not isinstance(node, Mapping) or "type" not in node:
+            raise SceneError(f"hidden: expected {name!r} as a dictionary with a type, got {node!r}.")
+        found = [key for key in ("sensor", "integrator") if key == name]
+        kind = str(node["type"])
+        if found or kind.startswith("transient_") or kind.endswith("_capture_meter"):
+            raise SceneError(
+                f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
+                "it out, or render a complete scene with tt.TransientRenderer."
+            )
+
+
+def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
+    return {"type": "mesh_arrays", "vertices": _numbers(vertices), "faces": _numbers(faces)}
+
+
+def _range(bounces: Sequence[int]) -> tuple[int, int]:
+    numbers = sorted(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in numbers)  # noqa: PLR2004
+    if not numbers or not whole or list(numbers) != list(range(numbers[0], numbers[0] + len(numbers))):
+        raise SceneError(
+            f"bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), got {bounces!r}. "
+            "The laser's spot is the first bounce, so light around one corner has 3."
+        )
+    return int(numbers[0]), int(numbers[-1])
+
+
+def _numbers(values: Any) -> np.ndarray:
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=np.float64)
+
+
+def hidden_bounds(hidden: Any) -> np.ndarray:
+    """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
+    scene = load({"type": "scene", **hidden_shapes(hidden)})
+    with active_variant(scene.variant):
+        box = scene.built(BuildOptions()).scene.bbox()
+        return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)

@@ -1,0 +1,171 @@
+"""Third-bounce light of a whole scan from shared samples: what it needs of a scene, and when it is possible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
+from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, sensor_targets
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
+from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
+from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.sampling.shared_samples import draw_samples
+
+# Light of the laser's spot, of a hidden point, of the scanned point.
+BOUNCES = 3
+
+
+def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
+    """What stands against shared samples in a scene, None for nothing."""
+    if mi.is_spectral or mi.is_polarized:
+        return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
+    if sensor.film().exhaustive_scan and sensor.film().measures != "transient":
+        return f"the film of an exhaustive capture is a {sensor.film().plugin}"
+    if not hasattr(sensor, "targets"):
+        return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
+    if contents.media is not None:
+        return "there are participating media"
+    if contents.delays is not None or contents.mixtures is not None:
+        return "some surfaces scatter late, or are mixtures"
+    others = [bsdf.id() or bsdf.class_name() for bsdf in contents.bsdfs if not is_lambertian(bsdf)]
+    if others:
+        return f"not all surfaces are diffuse ({', '.join(others[:3])})"
+    table = elements_of(scene, sensor, includes_wall=False)
+    if table.left_out:
+        return f"points cannot be drawn on {', '.join(table.left_out[:3])}"
+    return None
+
+
+def elements_of(scene: Any, sensor: Any, includes_wall: bool) -> HiddenElements:
+    """The table of hidden elements; of the relay wall as well where it is asked for."""
+    wall = None if includes_wall else sensor.get_shape()
+    hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
+    return HiddenElements(hidden, *reference_points(scene, sensor))
+
+
+def wall_lights_itself(sensor: Any) -> bool:
+    """Whether points of the relay wall can see each other, as far as its kind says: whether it is not flat."""
+    wall = sensor.get_shape()
+    return wall is not None and not is_flat_shape(wall) and not _is_flat_mesh(wall)
+
+
+def _is_flat_mesh(shape: Any) -> bool:
+    import numpy as np
+
+    if not shape.is_mesh():
+        return False
+    v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+    spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
+    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])  # noqa: PLR2004 (thickness, the least of three)
+
+
+@dataclass
+class ScanLight:
+    """What shared samples need of a capture: scanned points and laser spots, each with what they scatter, and the
+    laser's energy by colour. Attached where the scene's parameters are. Where every spot is a scanned point, both are
+    one object.
+    """
+
+    sensors: WallPoints
+    spots: WallPoints
+    energy: Any
+
+
+def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType, legs: bool) -> ScanLight:
+    """Of the scene as it is now."""
+    origin = mi.Point3f(sensor.origin)
+    seen = seen_points(scene, sensor, origin)
+    looked_at = _points(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
+    si = dr.copy(spots.si)
+    si.wi = si.to_local(-spots.ray.d)
+    cos = dr.abs_dot(si.n, spots.ray.d)
+    index = dr.arange(mi.UInt32, dr.width(si.p))
+    factor, energy = mi.UnpolarizedSpectrum(1), mi.UnpolarizedSpectrum(1)
+    if hasattr(spots.emitter, "energy_at"):
+        energy = spots.emitter.energy_at([], True)
+        same_legs = not legs or bool(dr.all(spots.origin == origin))
+        if capture is CaptureType.EXHAUSTIVE and same_legs and _same(si, seen):
+            return ScanLight(looked_at, looked_at, energy)
+    else:
+        factor = spots.energy([], index, cos, si.is_valid()) * cos
+    return ScanLight(looked_at, _points(si, factor * dr.inv_pi, spots.length if legs else mi.Float(0)), energy)
+
+
+def seen_points(scene: Any, sensor: Any, origin: Any) -> Any:
+    """What the rays of a scan meet (SurfaceInteraction3f), attached where sensor or shape are."""
+    targets = sensor_targets(sensor)
+    ray = mi.Ray3f(origin, dr.normalize(targets - origin))
+    with dr.suspend_grad():
+        pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
+        dr.eval(pi)
+    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def _same(spots: Any, points: Any) -> bool:
+    """Whether laser spots are the scanned points themselves, on the same side of the wall."""
+    if dr.width(spots.p) != dr.width(points.p):
+        return False
+    near = dr.norm(spots.p - points.p) <= 1e-6 * (1 + dr.norm(points.p))
+    return bool(dr.all(near & (spots.wi.z * points.wi.z > 0) & spots.is_valid() & points.is_valid()))
+
+
+def _points(si: Any, factor: Any, length: Any) -> WallPoints:
+    """Points of a wall as they are seen (or lit) along ``si.wi``, with their albedo times ``factor``."""
+    bsdf, valid = si.bsdf(), si.is_valid()
+    side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
+    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, valid))
+    value = dr.select(valid & (side != 0), albedo * factor, 0)
+    n = dr.select(valid, dr.select(side < 0, -si.n, si.n), mi.Normal3f(0, 0, 1))
+    return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
+
+
+class SharedThirdBounce:
+    """Light of three bounces of one job: its render, and its derivatives beside those of paths (confocal and single).
+
+    ``light``: attached where the scene is; ``draw``: (seed, number of samples).
+    """
+
+    def __init__(
+        self, world: Any, film: Any, light: ScanLight, elements: HiddenElements, capture: CaptureType, draw: tuple[Any, int]
+    ) -> None:
+        self.world, self.film, self.light, self.capture = world, film, light, capture
+        self.samples = draw_samples(elements, draw[1], draw[0])
+        self.gradients = None
+        if world.wanted is not None:
+            with dr.resume_grad():
+                ends = Ends.of_samples(elements, self.samples, world.contents.meshes)
+            confocal = capture is CaptureType.CONFOCAL
+            self.gradients = ThirdBounceGradients(world.scene, film, light, ends, confocal)
+
+    def add(self, progress: Any = None) -> None:
+        """Add the light to the film."""
+        third = ThirdBounce(
+            self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress
+        )
+        if self.capture is CaptureType.CONFOCAL:
+            third.add_confocal(self.light.spots)
+        elif self.capture is CaptureType.SINGLE:
+            third.add_single(self.light.spots)
+        else:
+            add_exhaustive(third, self.light.spots)
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters."""
+        return self.gradients.tables()
+
+    def backward(self, incoming: Any) -> None:
+        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        self.gradients.backward(incoming)
+
+    def forward(self) -> None:
+        """Add to the film, along the tangents of the scene."""
+        self.gradients.forward()

@@ -1,0 +1,62 @@
+"""``laser_beam``: a laser that lights one spot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, ParameterEffect, declare_effects
+
+
+class LaserBeam(mi.Emitter):
+    r"""A beam without width (:monosp:`laser_beam`), for the integrator ``transient_nlos_path``.
+
+    ``to_world`` (transform): the laser stands at its origin and shines along its +z; scans that aim the laser
+    themselves use the origin alone. ``energy`` (spectrum, 1): what falls on the spot, per colour.
+
+    Nothing of it has an area or a solid angle: integrators that do not aim at its spot refuse it.
+    """
+
+    needs_aim = True
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.energy = props.get_emissive_texture("energy", 1.0)
+        self.m_flags = +mi.EmitterFlags.DeltaPosition
+
+    def traverse(self, cb: Any) -> None:
+        super().traverse(cb)
+        cb.put("energy", self.energy, mi.ParamFlags.Differentiable)
+
+    def energy_at(self, wavelengths: Any, active: Any) -> Any:
+        """Energy per colour (UnpolarizedSpectrum) at a path's wavelengths."""
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wavelengths = wavelengths
+        return self.energy.eval(si, active)
+
+    def eval(self, si: Any, active: Any = True) -> Any:
+        return mi.Spectrum(0)
+
+    def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.delta = True
+        return ds, mi.Spectrum(0)
+
+    def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        return mi.Float(0)
+
+    def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+        return mi.Spectrum(0)
+
+    def bbox(self) -> Any:
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self) -> str:
+        return f"LaserBeam[\n  energy = {self.energy}\n]"
+
+
+register("emitter", "laser_beam", LaserBeam)
+declare_effects(LaserBeam, {ANY_KEY: VALUE, "to_world": ParameterEffect(moves_length=True, role="emitter")})

@@ -1,0 +1,323 @@
+"""``transient_nlos_path``: light around the corner, from a laser spot on a relay wall back to points of the wall."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.errors import SceneError
+from torchtransient.interfaces import CaptureType
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.outlines import mutual_occlusion
+from torchtransient.plugins.around_corner.scan_table import (
+    LaserSpots,
+    laser_of,
+    origin_of,
+    sensor_targets,
+    targets_of,
+)
+from torchtransient.plugins.around_corner.shared_light import (
+    BOUNCES,
+    SharedThirdBounce,
+    elements_of,
+    scan_light,
+    wall_lights_itself,
+    why_not,
+)
+from torchtransient.plugins.integrators import base
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
+from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.connection.laser_spot import LaserSpot
+from torchtransient.plugins.transport.scattering.guides.hidden_geometry import HiddenGeometry
+from torchtransient.plugins.transport.scattering.lambertian import Lambertian
+from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
+from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.segment.media import Media
+from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.world import PathSettings
+
+# Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
+AT_WALL, BEYOND = 0.9, 0.25
+
+
+class TransientNLOSPath(base.TransientIntegrator):
+    r"""Time-resolved path tracer for non-line-of-sight scenes (:monosp:`transient_nlos_path`).
+
+    Parameters beside those of :class:`TransientIntegrator`:
+
+    ``capture_type`` (``single`` | ``confocal`` | ``exhaustive``, or 1, 2, 3; single)
+        One laser spot for all scanned points; the spot follows the scanned point; every laser position for every
+        scanned point (the film needs ``exhaustive_scan``).
+    ``account_first_and_last_bounces`` (bool, false)
+        Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
+    ``filter_bounces`` (int, -1)
+        Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
+        corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+    ``min_bounces`` (int, 0): leave out light of fewer bounces.
+    ``filter_depth`` (int, -1)
+        ``filter_bounces + 1``, as in mitransient.
+    ``discard_direct_paths`` (bool, false): leave out light of one bounce.
+    ``nlos_laser_sampling`` (bool, false)
+        Connect every vertex to the laser's spot. Without it lights are sampled as in ``transient_path``, and a laser's
+        spot is found by paths that hit it.
+    ``nlos_hidden_geometry_sampling`` (bool, false)
+        Draw next vertices over the area of the hidden surfaces, weighed against the BSDF's own samples by their
+        densities; points that something hides do not count.
+    ``nlos_hidden_geometry_sampling_do_rroulette`` (bool, false)
+        Share the samples equally between the two everywhere, instead of mostly hidden area at the wall.
+    ``nlos_hidden_geometry_sampling_includes_relay_wall`` (bool, false): draw points of the relay wall, too.
+    ``third_bounce`` (``auto`` | ``shared`` | ``paths``; auto)
+        Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
+        which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
+        and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
+        can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
+        polarization. Both have the same mean.
+    ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
+        Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
+        horizontal field of view around the laser's axis.
+
+    ``max_depth`` is the largest number of bounces with ``nlos_laser_sampling``: 3 for light around one corner, as in
+    mitransient. Without it the light's own way is a segment more, as in ``transient_path``.
+
+    Sensors: ``nlos_capture_meter``, whose samples of a pixel look all at one point, and any other (single captures, and
+    confocal ones, whose spots lie at pixel centres).
+
+    Gradients in both modes as in :class:`TransientIntegrator`.
+    """
+
+    walks_through_media = True
+    scans_exhaustively = True
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        if self.camera_unwarp:
+            raise SceneError(
+                "transient_nlos_path: camera_unwarp is account_first_and_last_bounces here; set that to false instead."
+            )
+        self.capture = capture_type(props.get("capture_type", "single"))
+        self.legs = bool(props.get("account_first_and_last_bounces", False))
+        self.camera_unwarp = not self.legs
+        self.laser_sampling = bool(props.get("nlos_laser_sampling", False))
+        self.hidden_sampling = bool(props.get("nlos_hidden_geometry_sampling", False))
+        self.equal_shares = bool(props.get("nlos_hidden_geometry_sampling_do_rroulette", False))
+        self.samples_wall = bool(props.get("nlos_hidden_geometry_sampling_includes_relay_wall", False))
+        self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
+        self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
+        self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
+        self.third_bounce = str(props.get("third_bounce", "auto"))
+        if self.third_bounce not in ("auto", "shared", "paths"):
+            raise SceneError(
+                f"transient_nlos_path: third_bounce: expected auto, shared or paths, got {self.third_bounce!r}."
+            )
+        props.get("block_size", 0)
+        self.min_bounces = int(props.get("min_bounces", 0))
+        self.only_bounces = self._bounces_of(props)
+        if self.min_bounces > (self.max_depth if self.only_bounces is None else self.only_bounces):
+            raise SceneError(
+                f"transient_nlos_path: min_bounces {self.min_bounces} leaves out everything up to max_depth "
+                f"{self.max_depth} or filter_bounces; the picture would be black."
+            )
+
+    def _bounces_of(self, props: Any) -> int | None:
+        depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
+        if depth != -1 and bounces != -1:
+            raise SceneError(
+                "transient_nlos_path: filter_depth and filter_bounces say the same; give one of them, got both."
+            )
+        bounces = depth - 1 if depth != -1 else bounces
+        if bounces == -1:
+            return None
+        if bounces < 1:
+            raise SceneError(
+                "transient_nlos_path: filter_bounces: expected -1 or a number >= 1 (filter_depth: >= 2), got "
+                f"{bounces} bounces."
+            )
+        depth = bounces if self.laser_sampling else bounces + 1
+        if depth > self.max_depth:
+            raise SceneError(
+                f"transient_nlos_path: light of {bounces} bounces has depth {depth}, which max_depth {self.max_depth} "
+                f"leaves out: the picture would be black. Set max_depth to at least {depth}."
+            )
+        return bounces
+
+    # ----------------------------------------------------------------------------------- preparation
+
+    def resolve(self, scene: Any, sensor: Any) -> Any:
+        sensor, film = super().resolve(scene, sensor)
+        exhaustive = self.capture is CaptureType.EXHAUSTIVE
+        if exhaustive != film.exhaustive_scan:
+            raise SceneError(
+                f"transient_nlos_path: expected a film with exhaustive_scan = {str(exhaustive).lower()} for capture "
+                f"type {self.capture.name.lower()}, got {str(film.exhaustive_scan).lower()}."
+            )
+        if exhaustive and not self.laser_sampling:
+            raise SceneError("transient_nlos_path: exhaustive captures need nlos_laser_sampling; set it to true.")
+        if self.laser_sampling:
+            laser_of(scene)
+        return sensor, film
+
+    @property
+    def aims_lasers(self) -> bool:
+        """Whether beams without width are seen."""
+        return self.laser_sampling
+
+    def settings(self) -> PathSettings:
+        # The light's own way is a segment where lights are sampled, and none where its spot is.
+        light = 0 if self.laser_sampling else 1
+        first, last = max(2 if self.discard_direct_paths else 0, self.min_bounces), None
+        if self.only_bounces is not None:
+            first = last = self.only_bounces
+        most = self.max_depth if last is None else last + light
+        least = first + light if first else 0
+        return PathSettings(
+            most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
+        )
+
+    def shares(self, scene: Any, contents: Any) -> bool:
+        """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
+        if self.third_bounce == "paths" or not self._wants(BOUNCES):
+            return False
+        if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
+            reason = why_not(scene, contents.sensor, contents)
+        else:
+            reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+        if reason and self.third_bounce == "shared":
+            raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
+        return reason is None
+
+    def _wants(self, bounces: int) -> bool:
+        settings = self.settings()
+        return settings.min_depth <= bounces <= settings.max_depth
+
+    def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+        # Exhaustive captures have their derivatives from paths.
+        derived = wanted is None or self.capture is not CaptureType.EXHAUSTIVE
+        if settings is None and derived and self.shares(scene, contents):
+            settings = replace(self.settings(), left_out=BOUNCES)
+        return super().world(scene, contents, wanted, window, settings)
+
+    def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
+        if world.left_out != BOUNCES:
+            super().add_light(world, sensor, film, job)
+            return
+        walks = self.walks(world)
+        share = 0.5 if walks else 1.0
+        told = job.progress and (lambda done: job.progress(share * done))
+        self._shared(world, sensor, film, job.seed, job.samples).add(told)
+        if walks:
+            told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
+            super().add_light(world, sensor, film, replace(job, progress=told))
+
+    def strategies(self, contents: Any) -> Any:
+        guides = self._guides(contents)
+        in_media = contents.media is not None
+        surface = Lambertian if Lambertian.fits(contents) else Surface
+        # Instances, and what Mitsuba leaves detached, are attached along rays alone.
+        along_rays = contents.instances is not None or contents.detached_hits is not None
+        vacuum = Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
+        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (vacuum(), surface(guides))
+        return segment, scattering, self._connections(contents)
+
+    def _connections(self, contents: Any) -> list[Any]:
+        if not self.laser_sampling:
+            return [EmitterFound(), EmitterSampled()]
+        sensor, capture = contents.sensor, self.capture
+        fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
+
+        def read_spots(scene: Any) -> LaserSpots:
+            targets = targets_of(scene, sensor, capture, fov)
+            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
+
+        return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
+
+    def _guides(self, contents: Any) -> list[HiddenGeometry]:
+        if not self.hidden_sampling:
+            return []
+
+        def read_elements(scene: Any) -> HiddenElements:
+            return elements_of(scene, contents.sensor, self.samples_wall)
+
+        shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
+        return [HiddenGeometry(read_elements, *shares)]
+
+    # ----------------------------------------------------------------------------------- primary rays
+
+    def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
+        if hasattr(sensor, "targets"):  # a scan looks at points
+            return mi.Point2f(0), None
+        return super().offset_in_pixel(film, sensor, sampler)
+
+    def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
+        rays = super().start(scene, contents, sensor, film, job)
+        # A pilot run has a smaller film than the sensor, and one laser position a path.
+        width, height = (int(n) for n in sensor.film().crop_size())
+        columns, rows = (int(n) for n in film.crop_size())
+        row, column = rays.row, rays.column
+        if (columns, rows) != (width, height):
+            row, column = (2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns)
+        pixel = row * width + column
+        if hasattr(sensor, "targets") and contents.media is None:
+            rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
+        laser = rays.laser
+        if self.capture is CaptureType.EXHAUSTIVE and laser is None:
+            count = sensor.film().laser_count()
+            laser = dr.minimum(mi.UInt32(rays.sampler.next_1d() * count), count - 1)
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, laser)
+        return rays
+
+    # ----------------------------------------------------------------------------------- derivatives
+
+    def walks(self, world: Any) -> bool:
+        if world.left_out != BOUNCES:
+            return True
+        return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
+
+    def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
+        if not self.laser_sampling:
+            return []
+        shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
+        ray = _scan_rays(sensor)
+        scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
+        return shared if edges is None else [*shared, edges]
+
+    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+        with dr.resume_grad():
+            light = scan_light(world.scene, sensor, spots, self.capture, self.legs)
+        elements = elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+        return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
+
+
+def _scan_rays(sensor: Any) -> Any:
+    """One ray for each pixel of a sensor's film, detached."""
+    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    return mi.Ray3f(origin, dr.normalize(dr.detach(sensor_targets(sensor)) - origin))
+
+
+def _scanned(scene: Any, sensor: Any) -> Any:
+    """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
+    found = scene.ray_intersect_preliminary(_scan_rays(sensor), coherent=True)
+    dr.eval(found)
+    return found
+
+
+def capture_type(given: Any) -> CaptureType:
+    """A capture type by its number or name. Raises SceneError."""
+    if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
+        names = {c.name.lower(): c for c in CaptureType}
+        if given.lower() in names:
+            return names[given.lower()]
+    elif int(given) in (c.value for c in CaptureType):
+        return CaptureType(int(given))
+    raise SceneError(
+        f"transient_nlos_path: capture_type: expected single, confocal or exhaustive (or 1, 2, 3), got {given!r}."
+    )
+
+
+register("integrator", "transient_nlos_path", TransientNLOSPath)

@@ -1,0 +1,145 @@
+"""``nlos_capture_meter``: a sensor that scans points of a relay wall, one for each pixel of its film."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import SceneError
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
+
+
+class NLOSCaptureMeter(mi.Sensor):
+    r"""Scans a relay wall (:monosp:`nlos_capture_meter`): a child of the wall's shape, or with ``points`` anywhere.
+
+    ``sensor_origin`` (point, (0, 0, 0))
+        Where the sensor stands, metres.
+    ``points`` (array (N, 3) or (H, W, 3); none)
+        The scanned points, in the order of the film's pixels. Without them pixel (i, j) of a film of W x H scans the
+        point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H), so that no two pixels share one.
+    ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
+        Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
+        ``transient_nlos_path`` says.
+    ``laser_origin`` (point; that of the scene's emitter)
+        Where the laser stands.
+    ``laser_lookat_pixel`` (point; none)
+        Of scenes from before ``laser_points``: the laser points at the place of the shape with texture coordinates
+        (x / W, y / H).
+    ``film`` (``transient_hdr_film`` or another film of this library)
+
+    Every sample of a pixel looks along the same ray, so spatial filters do not spread it. A pixel measures the radiance
+    that leaves its point towards the sensor.
+
+    Differentiable: ``sensor_origin``, ``points``, ``laser_points`` and ``laser_origin`` (the rays follow; what they meet decides where
+    the points are).
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.origin = mi.Point3f(mi.ScalarPoint3f(props.get("sensor_origin", mi.ScalarPoint3f(0))))
+        self.points = _points_of(props, "points")
+        self.laser_points = _points_of(props, "laser_points")
+        self.laser_origin = mi.Point3f(props["laser_origin"]) if "laser_origin" in props else None
+        self.lookat_pixel = list(props["laser_lookat_pixel"]) if "laser_lookat_pixel" in props else None
+        # Said once more in older scenes: the integrator knows them.
+        for name in ("account_first_and_last_bounces", "confocal"):
+            props.get(name, None)
+        self._check()
+        dr.make_opaque(self.origin, self.laser_origin)
+
+    def _check(self) -> None:
+        size = self.film().size()
+        if self.points is not None and dr.width(self.points) != size[0] * size[1]:
+            raise SceneError(
+                f"nlos_capture_meter: expected one of 'points' for each of the film's {size[0]} x {size[1]} pixels, "
+                f"got {dr.width(self.points)}. Set the film's width and height to the scan's."
+            )
+        if self.lookat_pixel is not None and self.laser_points is not None:
+            raise SceneError(
+                "nlos_capture_meter: laser_lookat_pixel and laser_points both say where the laser points; give one."
+            )
+
+    def traverse(self, cb: Any) -> None:
+        super().traverse(cb)
+        cb.put("sensor_origin", self.origin, mi.ParamFlags.Differentiable)
+        for name in ("points", "laser_points", "laser_origin"):
+            if getattr(self, name) is not None:
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+    def world_transform(self) -> Any:
+        """The sensor's place, for the frame that polarization is told in: upright, as the world is."""
+        return mi.Transform4f().translate(self.origin)
+
+    def targets(self, pixel: Any) -> Any:
+        """The scanned points (Point3f) of pixels, given by their index in the film."""
+        if self.points is not None:
+            return dr.gather(mi.Point3f, self.points, pixel)
+        shape = self.get_shape()
+        if shape is None:
+            raise SceneError(
+                "nlos_capture_meter: expected a shape to scan or 'points', got neither. Put the sensor into the relay "
+                "wall's shape, or give the points."
+            )
+        size = self.film().size()
+        row = pixel // int(size[0])
+        column = pixel - row * int(size[0])
+        place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
+        return shape.sample_position(0.0, place).p
+
+    def spots(self) -> Any:
+        """Where the laser points (Point3f), None where nothing of the sensor says so."""
+        if self.lookat_pixel is None:
+            return self.laser_points
+        size = self.film().size()
+        place = mi.Point2f(self.lookat_pixel[0] / int(size[0]), self.lookat_pixel[1] / int(size[1]))
+        return self.get_shape().sample_position(0.0, place).p
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        film = self.film()
+        size, crop = film.size(), film.crop_size()
+        cell = mi.Vector2u(dr.clip(mi.Vector2i(dr.floor(sample2 * mi.ScalarVector2f(crop))), 0, mi.Vector2i(crop) - 1))
+        cell += mi.Vector2u(film.crop_offset())
+        target = self.targets(cell.y * int(size[0]) + cell.x)
+        wavelengths, weight = [], mi.Spectrum(1)
+        if mi.is_spectral:
+            wavelengths, weight = mi.sample_rgb_spectrum(mi.sample_shifted(sample1))
+            weight = mi.unpolarized_spectrum(weight)
+        ray = mi.RayDifferential3f(mi.Ray3f(self.origin, dr.normalize(target - self.origin), time, wavelengths))
+        return ray, weight
+
+    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        return self.sample_ray(time, sample1, sample2, sample3, active)
+
+    def bbox(self) -> Any:
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self) -> str:
+        return f"NLOSCaptureMeter[\n  sensor_origin = {self.origin},\n  film = {self.film()}\n]"
+
+
+def _points_of(props: Any, name: str) -> Any:
+    """An array of points of a sensor's properties as a Point3f in memory, None where there is none."""
+    if name not in props:
+        return None
+    values = np.asarray(props[name], dtype=np.float32)
+    if values.size == 0 or values.shape[-1] != 3 or not np.isfinite(values).all():
+        raise SceneError(
+            f"nlos_capture_meter: expected {name} as finite points of shape (N, 3) or (H, W, 3) in metres, got shape "
+            f"{values.shape}."
+        )
+    points = mi.Point3f(np.ascontiguousarray(values.reshape(-1, 3).T))
+    dr.make_opaque(points)
+    return points
+
+
+register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
+_PLACE = ParameterEffect(moves_length=True, role="sensor")
+# The rays of the sensor do not follow the laser.
+_LASER = ParameterEffect(moves_length=True, role="emitter")
+declare_effects(
+    NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER, "laser_origin": _LASER}
+)

@@ -1,0 +1,62 @@
+"""Scattering where every surface is Lambertian: cosines instead of virtual calls."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.bsdfs.delay_table import DelaySample
+from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
+from torchtransient.plugins.transport.scattering.surface import Surface
+from torchtransient.plugins.transport.strategy import Answer, Step
+
+
+class Lambertian(Surface):
+    """:class:`.surface.Surface` for scenes that :meth:`fits`; derivatives are those of surfaces."""
+
+    @staticmethod
+    def fits(contents):
+        """Whether all that paths meet is Lambertian, in unpolarized light."""
+        special = (contents.delays, contents.mixtures, contents.refraction, contents.media, contents.hidden_probability)
+        return not mi.is_polarized and all(s is None for s in special) and all(is_lambertian(b) for b in contents.bsdfs)
+
+    def arrive(self, world, path, vertex, sampler):
+        si = vertex.si
+        vertex.u_delay = vertex.u_part = None
+        vertex.bsdf = si.bsdf(path.ray)
+        vertex.delay, vertex.scattered_si = DelaySample(vertex.bsdf), si
+        # On the back of a one-sided surface nothing scatters.
+        vertex.side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(vertex.bsdf) & (si.wi.z < 0), -1, 0))
+        ρ = mi.unpolarized_spectrum(vertex.bsdf.eval_diffuse_reflectance(si, vertex.goes_on))
+        vertex.ρ = dr.select(vertex.goes_on, ρ, 0)
+        vertex.connectable = mi.Bool(True)
+
+    def scatter(self, world, path, vertex, proposals, sampler):
+        u_dir = sampler.next_2d()
+        answers = [None if p is None else self._towards(vertex, p.d) for p in proposals]
+        wo = mi.warp.square_to_cosine_hemisphere(u_dir)
+        pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
+        lit = vertex.side != 0
+        wo.z *= vertex.side
+        step = Step(
+            out=vertex.si.to_world(wo), wo=wo, weight=dr.select(lit, vertex.ρ, 0), pdf=dr.select(lit, pdf, 0),
+            eta=mi.Float(1), u_lobe=mi.Float(0), u_dir=u_dir, u_delay=None, u_part=None, delta=mi.Bool(False),
+            unconnected=mi.Bool(False),
+        )  # fmt: skip
+        if self.guides:
+            self._follow_guides(world, path, vertex, step, sampler)
+            for p, answer in zip(proposals, answers, strict=True):
+                if p is not None:
+                    answer.pdf = self.mixture(world, path.depth, vertex.at.p, p.ds, answer.pdf, p.active)
+        return answers, step
+
+    @staticmethod
+    def _towards(vertex, d):
+        """The :class:`~..strategy.Answer` towards the world direction ``d``."""
+        pdf = dr.maximum(dr.dot(vertex.si.sh_frame.n, d) * vertex.side, 0) * dr.inv_pi
+        value = vertex.ρ * pdf
+        return Answer(value=value, matrix=value, pdf=pdf, eta=mi.Float(1))
+
+    def value_towards(self, world, path, vertex, out, active):
+        answer = self._towards(vertex, out)
+        return answer.value, answer.pdf
