@@ -175,7 +175,9 @@ class MutualOcclusion:
             value, opl, active = self._light(place, si, from_spot, active)
             weight = -edge.weight * spans / distance
             if not self.spots.confocal:
-                weight *= self._seen_otherwise(place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active)
+                weight *= self._seen_otherwise(
+                    place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active
+                )
             value *= dr.select(active, weight, 0)
         sweep = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
         return Local(value=value, sweep=dr.select(active, sweep, 0), opl=opl, active=active)
