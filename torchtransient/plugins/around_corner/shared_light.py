@@ -28,6 +28,8 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     """What stands against shared samples in a scene, None for nothing."""
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
+    if sensor.film().exhaustive_scan and sensor.film().measures != "transient":
+        return f"the film of an exhaustive capture is a {sensor.film().plugin}"
     if not hasattr(sensor, "targets"):
         return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:

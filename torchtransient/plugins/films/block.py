@@ -30,7 +30,9 @@ class FilmBlock:
     def put(self, events, opl, value, active):
         """Write a contribution; returns what fell before and after the window (mean over channels)."""
         channels = self.match.to_channels(value)
-        before, after = self.film.put(self.band, self.base, opl, channels, active, self.exclusive)
+        # Films that know nothing of it add atomically.
+        alone = {"exclusive": True} if self.exclusive else {}
+        before, after = self.film.put(self.band, self.base, opl, channels, active, **alone)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
 

@@ -66,6 +66,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "transient_hdr_film"
+    knows_exclusive_lanes = True
     measures = "transient"
 
     def __init__(self, props):
@@ -74,9 +75,6 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
         self._filter_name = str(props.get("temporal_filter", "box"))
         self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
-        self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
-        self.laser_scan_width = int(props.get("laser_scan_width", 0))
-        self.laser_scan_height = int(props.get("laser_scan_height", 0))
         self.keeps_steady = self.has_window = bool(props.get("steady", True))
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
@@ -94,17 +92,6 @@ class TransientHDRFilm(TimeResolvedFilm):
                 f"transient_hdr_film: bin_width_opl must be a positive length in metres, got {self.bin_width_opl}."
             )
         check_stddev(self._gaussian_stddev)
-        laser = self.laser_scan_width, self.laser_scan_height
-        if self.exhaustive_scan and min(laser) < 1:
-            raise SceneError(
-                "transient_hdr_film: exhaustive_scan needs laser_scan_width and laser_scan_height of at least 1, "
-                f"got {laser[0]} x {laser[1]}."
-            )
-        if not self.exhaustive_scan and max(laser) > 0:
-            raise SceneError(
-                "transient_hdr_film: laser_scan_width and laser_scan_height have no effect without exhaustive_scan; "
-                "set exhaustive_scan to true or leave them out."
-            )
 
     @property
     def temporal_filter(self) -> str:
@@ -168,29 +155,20 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     # ---------------------------------------------------------------------------------------- storage
 
-    def laser_count(self) -> int:
-        """Number of laser positions of an exhaustive scan, otherwise 1."""
-        return self.laser_scan_width * self.laser_scan_height if self.exhaustive_scan else 1
-
     def cube_shape(self) -> tuple[int, ...]:
         """Shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
         size = self.crop_size()
-        laser = (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
-        return (int(size[1]), int(size[0]), *laser, self.temporal_bins, self.channel_count())
+        return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
-    def entries_per_pixel(self) -> int:
-        """Floats behind one pixel."""
-        return self.laser_count() * self.temporal_bins * self.channel_count()
+    def entries_per_array(self) -> int:
+        """Floats of one histogram."""
+        return self.temporal_bins * self.channel_count()
 
     # ----------------------------------------------------------------------------------- splat and read
 
     def bin_position(self, opl_from_start):
         """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
         return opl_from_start / mi.Float64(self.bin_width_opl)
-
-    def pixel_base(self, base, laser):
-        """Index of the histogram of one laser position, where ``base`` is that of a pixel's first one."""
-        return base if laser is None else base + laser * (self.temporal_bins * self.channel_count())
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, laser=None):
         """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None

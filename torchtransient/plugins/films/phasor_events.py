@@ -48,7 +48,8 @@ class EventBlock(FilmBlock):
         self.job, self.tangents = job, tangents
         self.slots = slots_for(most_events)
         self.overflows = most_events > self.slots
-        self.width = int(film.crop_size()[0])
+        # Arrays of a row: those of all laser positions of a pixel stand together.
+        self.width = int(film.crop_size()[0]) * film.laser_count()
         self.paths = self.width * job.rows * job.spp
         # In memory: as a literal, every number of samples would compile kernels of its own.
         self.stride = dr.opaque(mi.UInt32, self.paths)
@@ -107,7 +108,7 @@ class EventBlock(FilmBlock):
         spp = dr.opaque(mi.UInt32, job.spp)
         first = pixel * spp + group * GROUP
         last = dr.minimum(first + GROUP, (pixel + 1) * spp)
-        base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_pixel()
+        base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_array()
         start = block * per_block
         frequencies = FrequencyBlock(film, start, per_block)
         re, im = sum_events(self, frequencies, first, last)

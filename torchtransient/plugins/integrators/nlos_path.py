@@ -258,10 +258,20 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
         rays = super().start(scene, contents, sensor, film, job)
-        pixel = rays.row * int(film.crop_size()[0]) + rays.column
+        # A pilot run has a smaller film than the sensor, and one laser position a path.
+        width, height = (int(n) for n in sensor.film().crop_size())
+        columns, rows = (int(n) for n in film.crop_size())
+        row, column = rays.row, rays.column
+        if (columns, rows) != (width, height):
+            row, column = (2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns)
+        pixel = row * width + column
         if hasattr(sensor, "targets") and contents.media is None:
             rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
-        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
+        laser = rays.laser
+        if self.capture is CaptureType.EXHAUSTIVE and laser is None:
+            count = sensor.film().laser_count()
+            laser = dr.minimum(mi.UInt32(rays.sampler.next_1d() * count), count - 1)
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, laser)
         return rays
 
     # ----------------------------------------------------------------------------------- derivatives
