@@ -109,10 +109,10 @@ def _edge_keys(joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class Edges:
-    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,), that
-    of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one. ``share``
-    (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one. ``closed``: no
-    edge has a single face.
+    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,),
+    that of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one.
+    ``share`` (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one.
+    ``closed``: no edge has a single face.
     """
 
     ends: np.ndarray
