@@ -14,9 +14,9 @@ from torchtransient.plugins.films.temporal_filter import check_name, check_stdde
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
-from torchtransient.plugins.integrators.primary_derivatives import objective_of, tangent_of
+from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
-from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
+from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
@@ -121,6 +121,10 @@ class TransientIntegrator(mi.CppADIntegrator):
     def parameters(self, scene) -> ParameterTracker:
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
+
+    def silhouettes(self, scene):
+        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
+        return SILHOUETTES
 
     def reference(self, scene):
         """The sphere around the scene as described, which light from and to infinity is timed by."""

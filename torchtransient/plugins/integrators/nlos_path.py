@@ -11,7 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.around_corner.outlines import mutual_occlusion
+from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     aims_of,
@@ -218,11 +218,15 @@ class TransientNLOSPath(base.TransientIntegrator):
         guides = self._guides(contents)
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
+        scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
+        return self._segment(contents)(), scattering, self._connections(contents)
+
+    def _segment(self, contents: Any) -> type:
+        if contents.media is not None:
+            return Media
         # Instances, and what Mitsuba leaves detached, are attached along rays alone.
         along_rays = contents.instances is not None or contents.detached_hits is not None
-        vacuum = Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
-        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (vacuum(), surface(guides))
-        return segment, scattering, self._connections(contents)
+        return Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
 
     def _connections(self, contents: Any) -> list[Any]:
         if not self.laser_sampling:
@@ -278,6 +282,14 @@ class TransientNLOSPath(base.TransientIntegrator):
         if world.left_out != BOUNCES:
             return True
         return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
+
+    def silhouettes(self, scene: Any) -> str:
+        sensors = scene.sensors()
+        contents = self.contents(scene, sensors[0]) if sensors else None
+        if contents is None or not follows_outlines(self._segment(contents), contents):
+            return super().silhouettes(scene)
+        settings = self.settings()
+        return silhouettes(settings.min_depth, settings.max_depth, self.capture is CaptureType.EXHAUSTIVE)
 
     def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:

@@ -1,6 +1,8 @@
-"""From the Carry of the primary rays to the sensor, and back."""
+"""What derivatives of the paths of a pass have to do with the sensor: the Carry of its primary rays."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +13,7 @@ from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.derivative.forward import tangents_of
 
 
-def objective_of(world, rays, adjoint):
+def objective_of(world: Any, rays: Any, adjoint: Carry) -> Any:
     """``<adjoint, Carry>`` of the primary rays."""
     objective = adjoint.η * rays.η
     if not world.camera_unwarp:
@@ -24,7 +26,7 @@ def objective_of(world, rays, adjoint):
     return objective
 
 
-def tangent_of(world, rays) -> Carry:
+def tangent_of(world: Any, rays: Any) -> Carry:
     """The tangent of the Carry of the primary rays."""
     tangent = Carry.zeros()
     with dr.resume_grad():
