@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.attached import ends_of_points, ends_of_samples
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -146,10 +146,11 @@ class SharedThirdBounce:
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
         if world.wanted is not None:
+            laser = None if capture is CaptureType.CONFOCAL else light.spots
             with dr.resume_grad():
-                ends = Ends.of_samples(elements, self.samples, world.contents.meshes)
-            confocal = capture is CaptureType.CONFOCAL
-            self.gradients = ThirdBounceGradients(world.scene, film, light, ends, confocal)
+                samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
+                points = ends_of_points(light.sensors, light.spots, light.energy)
+            self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
