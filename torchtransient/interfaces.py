@@ -259,6 +259,10 @@ class IntegratorInterface(abc.ABC):
         """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
 
     @abc.abstractmethod
+    def silhouettes(self, scene: Any) -> str:
+        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
+
+    @abc.abstractmethod
     def reference(self, scene: Any) -> Any:
         """The sphere around the scene that light from and to infinity is timed by."""
 

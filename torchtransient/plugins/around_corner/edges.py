@@ -46,7 +46,9 @@ class Triangles:
         first = np.cumsum([0, *(len(one) for one in v)])
         mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])
         positions = np.concatenate([np.zeros((0, 3), np.float32), *v])
-        faces = np.concatenate([np.zeros((0, 3), np.int64), *(one + start for one, start in zip(f, first, strict=False))])
+        faces = np.concatenate(
+            [np.zeros((0, 3), np.int64), *(one + start for one, start in zip(f, first, strict=False))]
+        )
         corners = positions.astype(np.float64)[faces]
         some = np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1)
         faces, mesh = faces[some], mesh[some]
@@ -107,10 +109,10 @@ def _edge_keys(joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class Edges:
-    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,), that
-    of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one. ``share``
-    (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one. ``closed``: no
-    edge has a single face.
+    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,),
+    that of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one.
+    ``share`` (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one.
+    ``closed``: no edge has a single face.
     """
 
     ends: np.ndarray
@@ -185,8 +187,9 @@ class EdgeTable:
     def __init__(self, triangles: Triangles, edges: list[Edges], viewpoints: np.ndarray, normals: np.ndarray) -> None:
         mesh = np.concatenate([part.mesh for part in edges])
         order = np.argsort(mesh, kind="stable")
-        mesh, ends, sides, share = mesh[order], *(
-            np.concatenate([getattr(part, name) for part in edges])[order] for name in ("ends", "sides", "share")
+        mesh, ends, sides, share = (
+            mesh[order],
+            *(np.concatenate([getattr(part, name) for part in edges])[order] for name in ("ends", "sides", "share")),
         )
         p = triangles.vertices[np.concatenate([ends, sides], 1)]
         length = np.linalg.norm(p[:, 1] - p[:, 0], axis=1)

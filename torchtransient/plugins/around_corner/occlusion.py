@@ -8,12 +8,12 @@ and what its interior derivative leaves out is the motion of the outlines: the j
 viewpoint ``Q``, a scanned point or a laser spot. An outline is a piece of an edge, and what it hides begins at the
 point ``y`` behind a point ``p`` of it. Seen from ``Q`` the edge moves outwards against ``y`` by the angle
 
-    sweep = n . ((dp - dQ) / |p - Q| - (dy - dQ) / |y - Q|),
+    outwards = n . ((dp - dQ) / |p - Q| - (dy - dQ) / |y - Q|),
 
 with ``n`` across the edge and the line of sight, out of what hides. An angle across is an area of ``y`` times
 ``cos_y / |y - Q|^2``, and the length ``dl`` of the edge spans ``|d x t| / |p - Q| dl`` along, so that
 
-    dI = - int  f(y) |y - Q|^2 / cos_y  |d x t| / |p - Q|  sweep  dl
+    dI = - int  f(y) |y - Q|^2 / cos_y  |d x t| / |p - Q|  outwards  dl
 
 over the outlines seen from ``Q``. Where a spot and the scanned point differ, both are viewpoints, each with the
 visibility from the other one as a factor. (The boundary term of differentiable rendering, Li et al. 2018, in the
@@ -80,7 +80,7 @@ class MutualOcclusion:
                 objective = mi.Float(0)
                 for term in self._terms(rays, pixel, job):
                     A, _ = block.read(term.opl, term.active)
-                    objective += dr.select(term.active, total_of(A, term.value) * term.sweep, 0)
+                    objective += dr.select(term.active, total_of(A, term.value) * term.outwards, 0)
                 if dr.grad_enabled(objective):
                     dr.backward_from(objective)
             dr.eval()
@@ -95,10 +95,10 @@ class MutualOcclusion:
             block = film.create_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():
                 terms = self._terms(rays, pixel, job)
-                sweeps = tangents_of([term.sweep for term in terms])
+                tangents = tangents_of([term.outwards for term in terms])
             events, total = block.begin(), light_type()(0)
-            for term, sweep in zip(terms, sweeps, strict=True):
-                value = dr.select(term.active, term.value * sweep, 0)
+            for term, outwards in zip(terms, tangents, strict=True):
+                value = dr.select(term.active, term.value * outwards, 0)
                 block.put_slope(events, term.opl, value, light_type()(0), term.active)
                 total += value
             block.end(events)
@@ -115,7 +115,7 @@ class MutualOcclusion:
     # --------------------------------------------------------------------------------------------- the terms
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
-        """One term for each viewpoint: ``value`` (detached), ``sweep`` (attached), ``opl``, ``active``."""
+        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl``, ``active``."""
         world = self.world
         ray = dr.detach(rays.ray)
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
@@ -175,10 +175,12 @@ class MutualOcclusion:
             value, opl, active = self._light(place, si, from_spot, active)
             weight = -edge.weight * spans / distance
             if not self.spots.confocal:
-                weight *= self._seen_otherwise(place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active)
+                weight *= self._seen_otherwise(
+                    place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active
+                )
             value *= dr.select(active, weight, 0)
-        sweep = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
-        return Local(value=value, sweep=dr.select(active, sweep, 0), opl=opl, active=active)
+        outwards = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
+        return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
 
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
         """(light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some)."""
