@@ -19,6 +19,7 @@ from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBou
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -127,6 +128,19 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
+def moves(world: Any, shapes: list[Any]) -> bool:
+    """Whether derivatives are asked for of what some of these shapes are or hold."""
+    held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
+    return bool(held & world.wanted.nodes)
+
+
+def moves_scan(world: Any, hidden: list[Any]) -> bool:
+    """Whether derivatives are asked for of anything that is no part of the hidden shapes alone: wall, sensor, laser."""
+    others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
+    held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
+    return bool(world.wanted.nodes - held) or moves(world, others)
+
+
 def _rows(vectors: Any, width: int) -> np.ndarray:
     """(width, 3), detached."""
     return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
@@ -148,8 +162,7 @@ class SharedThirdBounce:
         draw: tuple[Any, int],
     ) -> None:
         self.world, self.film, self.light, self.capture = world, film, light, capture
-        if world.wanted is None:
-            self._spare_rays(elements, draw[1])
+        self._spare_rays(elements, draw[1])
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
         if world.wanted is not None:
@@ -157,6 +170,15 @@ class SharedThirdBounce:
             with dr.resume_grad():
                 samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
                 points = ends_of_points(light.sensors, light.spots, light.energy)
+            # Forward mode has to pass by all that is attached, wanted or not.
+            self._tables = [ends.fields[n] for ends in (samples, points) for n in ends.fields]
+            self._tables += [*vars(light.sensors).values(), *vars(light.spots).values(), light.energy]
+            scan = moves_scan(world, elements.shapes)
+            if not scan:
+                points = points.detached()
+            # What a single spot lights follows the spot.
+            if not (moves(world, elements.shapes) or (scan and laser is not None)):
+                samples = samples.detached()
             self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
 
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
@@ -180,7 +202,8 @@ class SharedThirdBounce:
 
     def tables(self) -> list[Any]:
         """What has been computed of the scene's parameters."""
-        return self.gradients.tables()
+        with dr.resume_grad():
+            return [table for table in self._tables if dr.is_array_v(table) and dr.grad_enabled(table)]
 
     def backward(self, incoming: Any) -> None:
         """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
