@@ -115,12 +115,20 @@ class FilmInterface(abc.ABC):
 
     @abc.abstractmethod
     def create_block(
-        self, job: Any, base: Any, match: Any, most_events: int, tangents: bool = False, exclusive: bool = False
+        self,
+        job: Any,
+        base: Any,
+        match: Any,
+        most_events: int,
+        tangents: bool = False,
+        exclusive: bool = False,
+        origin: Any = None,
     ) -> Any:
         """How the samples of one pass write (``FilmBlock``). ``job``: the pass, with the number of its band; ``base``:
         index of each sample's first entry in it; ``match``: from spectra to channels; ``most_events`` of
         a path; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``); ``exclusive``:
-        as in ``put``.
+        as in ``put``; ``origin`` (``Float64``, for each sample, or None for zero): path length that those of the events
+        are counted from, which then may come in single precision.
         """
 
     @abc.abstractmethod

@@ -103,8 +103,10 @@ class TimeResolvedFilm(mi.Film):
     def lanes_at_most(self, most_events: int) -> int | None:
         return None
 
-    def create_block(self, job, base, match, most_events: int, tangents=False, exclusive=False) -> FilmBlock:
-        return FilmBlock(self, job.band, base, match, exclusive and self.knows_exclusive_lanes)
+    def create_block(
+        self, job, base, match, most_events: int, tangents=False, exclusive=False, origin=None
+    ) -> FilmBlock:
+        return FilmBlock(self, job.band, base, match, exclusive and self.knows_exclusive_lanes, origin)
 
     def create_adjoint_block(self, response, base, steady, match) -> AdjointBlock:
         return AdjointBlock(self, response, base, steady, match)

@@ -150,8 +150,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False):
-        return EventBlock(self, job, base, match, most_events, tangents)
+    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+        return EventBlock(self, job, base, match, most_events, tangents, origin)
 
     def _table(self, flat, exclusive=False):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)

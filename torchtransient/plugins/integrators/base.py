@@ -108,7 +108,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
         if beams and not self.aims_lasers:
             raise SceneError(
-                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling sees the light of the "
                 f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)

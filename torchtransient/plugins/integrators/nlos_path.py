@@ -14,10 +14,11 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
+    aims_of,
+    check_count,
     laser_of,
     origin_of,
-    sensor_targets,
-    targets_of,
+    scan_rays,
 )
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
@@ -234,8 +235,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
 
         def read_spots(scene: Any) -> LaserSpots:
-            targets = targets_of(scene, sensor, capture, fov)
-            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
+            aims = aims_of(scene, sensor, capture, fov)
+            check_count(aims, sensor, capture)
+            return LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
 
         return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
@@ -252,7 +254,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     # ----------------------------------------------------------------------------------- primary rays
 
     def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
-        if hasattr(sensor, "targets"):  # a scan looks at points
+        if hasattr(sensor, "scanned"):  # a scan looks at points
             return mi.Point2f(0), None
         return super().offset_in_pixel(film, sensor, sampler)
 
@@ -265,7 +267,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if (columns, rows) != (width, height):
             row, column = (2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns)
         pixel = row * width + column
-        if hasattr(sensor, "targets") and contents.media is None:
+        if hasattr(sensor, "scanned") and contents.media is None:
             rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
         laser = rays.laser
         if self.capture is CaptureType.EXHAUSTIVE and laser is None:
@@ -293,7 +295,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.laser_sampling:
             return []
         shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
-        ray = _scan_rays(sensor)
+        ray = dr.detach(scan_rays(sensor))
         scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
         return shared if edges is None else [*shared, edges]
@@ -306,15 +308,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
 
 
-def _scan_rays(sensor: Any) -> Any:
-    """One ray for each pixel of a sensor's film, detached."""
-    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
-    return mi.Ray3f(origin, dr.normalize(dr.detach(sensor_targets(sensor)) - origin))
-
-
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    found = scene.ray_intersect_preliminary(_scan_rays(sensor), coherent=True)
+    found = scene.ray_intersect_preliminary(dr.detach(scan_rays(sensor)), coherent=True)
     dr.eval(found)
     return found
 
