@@ -127,10 +127,10 @@ class Edges:
     def of(all_of_them: Triangles, faces: np.ndarray) -> Edges:
         """The edges that can be outlines of some faces (F,), given by their numbers."""
         corners = all_of_them.faces[faces]
-        key, whole = _edge_keys(all_of_them.joined[faces])
+        key, proper = _edge_keys(all_of_them.joined[faces])
         mesh = np.repeat(all_of_them.mesh[faces], 3)
         order = np.lexsort((mesh, key))
-        order = order[whole[order]]
+        order = order[proper[order]]
         ends = np.stack([corners.ravel(), corners[:, [1, 2, 0]].ravel()], 1)[order]
         third, mesh, key = corners[:, [2, 0, 1]].ravel()[order], mesh[order], key[order]
         new = np.diff(key, prepend=-1) != 0
