@@ -1,4 +1,4 @@
-"""Third-bounce light of a whole scan from shared samples: what it needs of a scene, and when it is possible."""
+"""Light of a whole scan from shared samples and chains: what it needs of a scene, and when it is possible."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import mitsuba as mi
 
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
+from torchtransient.plugins.around_corner.late_density import late_density
+from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, sensor_targets
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.wall_points import WallPoints
@@ -122,6 +124,15 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
     value = dr.select(valid & (side != 0), albedo * factor, 0)
     n = dr.select(valid, dr.select(side < 0, -si.n, si.n), mi.Normal3f(0, 0, 1))
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
+
+
+def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
+    """Add the light of these bounces (first, last) to a film; ``job`` as in :func:`add_third_bounce`, ``run``: ``seed``,
+    ``samples`` and ``progress``.
+    """
+    elements = late_density(scene, job.elements, *reference_points(scene, sensor))
+    film_job = ThirdBounce(scene, film, None, job.light.sensors, job.light.energy, run.progress)
+    LateLight(film_job, elements, job.light.spots, job.capture, bounces).add(run.samples, run.seed)
 
 
 def add_third_bounce(job: Any, scene: Any, film: Any, seed: Any, count: int, progress: Any = None) -> None:

@@ -34,7 +34,8 @@ class ThirdBounce:
     ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
     will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
     ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall too.
-    ``progress(fraction)`` is called after every kernel launch.
+    ``progress(fraction)`` is called after every kernel launch. ``samples``: None where others bring the light
+    (:class:`.late_light.LateLight`).
 
     Light outside of the film's window is counted as the film does. Raises SceneError, ShapeError, VariantError. Not
     supported: spectral and polarized variants; derivatives.
@@ -44,7 +45,7 @@ class ThirdBounce:
         self,
         scene: Any,
         film: Any,
-        samples: SharedSamples,
+        samples: SharedSamples | None,
         sensors: WallPoints,
         energy: Any = 1.0,
         progress: Any = None,

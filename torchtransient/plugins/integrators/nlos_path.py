@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.late_light import FIRST, MOST
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
     laser_of,
@@ -20,6 +21,7 @@ from torchtransient.plugins.around_corner.scan_table import (
 )
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
+    add_late_light,
     add_third_bounce,
     elements_of,
     scan_light,
@@ -77,6 +79,10 @@ class TransientNLOSPath(base.TransientIntegrator):
         and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
         can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
         polarization. Both have the same mean.
+    ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
+        Light of four to seven bounces from chains that scanned points far from each other share
+        (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
+        ``third_bounce``; both have the same mean.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -109,11 +115,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
         self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
-        self.third_bounce = str(props.get("third_bounce", "auto"))
-        if self.third_bounce not in ("auto", "shared", "paths"):
-            raise SceneError(
-                f"transient_nlos_path: third_bounce: expected auto, shared or paths, got {self.third_bounce!r}."
-            )
+        self.third_bounce = _choice(props, "third_bounce", "shared")
+        self.late_light = _choice(props, "late_light", "chains")
         props.get("block_size", 0)
         self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
@@ -178,43 +181,64 @@ class TransientNLOSPath(base.TransientIntegrator):
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
 
-    def shares(self, scene: Any, contents: Any) -> bool:
-        """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
-        if self.third_bounce == "paths" or not self._wants(BOUNCES):
-            return False
+    def beside_paths(self, scene: Any, contents: Any) -> tuple[int, int] | None:
+        """First and last number of bounces whose light comes from shared samples and chains, None where all comes from
+        paths. Raises SceneError where it may not and a parameter says that it has to.
+        """
+        settings = self.settings()
+        asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}
+        asked = {
+            name: (choice, max(first, settings.min_depth), min(last, settings.max_depth))
+            for name, (choice, first, last) in asked.items()
+        }
+        asked = {name: row for name, row in asked.items() if row[0] != "paths" and row[1] <= row[2]}
+        if not asked:
+            return None
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
             reason = why_not(scene, contents.sensor, contents)
         else:
             reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
-        if reason and self.third_bounce == "shared":
-            raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
-        return reason is None
-
-    def _wants(self, bounces: int) -> bool:
-        settings = self.settings()
-        return settings.min_depth <= bounces <= settings.max_depth
+        for name, (choice, _, _) in asked.items():
+            if reason and choice != "auto":
+                raise SceneError(f"transient_nlos_path: {name} is {choice!r}, but {reason}. Set it to 'auto'.")
+        if reason:
+            return None
+        return min(row[1] for row in asked.values()), max(row[2] for row in asked.values())
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        if settings is None and wanted is None and self.shares(scene, contents):
-            settings = replace(self.settings(), left_out=BOUNCES)
+        if settings is None and wanted is None:
+            beside = self.beside_paths(scene, contents)
+            if beside is not None:
+                settings = self.settings()
+                # Paths that have nothing to find beyond end before.
+                most = beside[0] - 1 if beside[1] == settings.max_depth else settings.max_depth
+                settings = replace(settings, left_out=beside, max_depth=max(most, 1))
         return super().world(scene, contents, wanted, window, settings)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
-        if world.left_out != BOUNCES:
+        if world.left_out is None:
             super().add_light(world, sensor, film, job)
             return
-        others = self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(sensor))
-        share = 0.5 if others else 1.0
-        told = job.progress and (lambda done: job.progress(share * done))
+        first, last = world.left_out
+        paths = world.max_depth > last or (world.min_depth < BOUNCES and wall_lights_itself(sensor) and first > BOUNCES - 1)
+        paths |= world.min_depth <= BOUNCES < first
+        parts = []
         spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
-        third = Local(
+        shared = Local(
             light=scan_light(world.scene, sensor, spots, self.capture, self.legs), capture=self.capture,
             elements=elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor)),
         )  # fmt: skip
-        add_third_bounce(third, world.scene, film, job.seed, job.samples, told)
-        if others:
-            told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
-            super().add_light(world, sensor, film, replace(job, progress=told))
+        if first == BOUNCES:
+            parts.append(
+                lambda run: add_third_bounce(shared, world.scene, film, run.seed, run.samples, run.progress)
+            )
+        if last >= FIRST:
+            late = max(first, FIRST), last
+            parts.append(lambda run: add_late_light(shared, world.scene, sensor, film, late, run))
+        if paths:
+            parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
+        for i, part in enumerate(parts):
+            part(replace(job, progress=_share_of(job.progress, i, len(parts))))
 
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
@@ -262,6 +286,18 @@ class TransientNLOSPath(base.TransientIntegrator):
             rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
         rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
         return rays
+
+
+def _choice(props: Any, name: str, shared: str) -> str:
+    value = str(props.get(name, "auto"))
+    if value not in ("auto", shared, "paths"):
+        raise SceneError(f"transient_nlos_path: {name}: expected auto, {shared} or paths, got {value!r}.")
+    return value
+
+
+def _share_of(progress: Any, part: int, count: int) -> Any:
+    """The progress of one of several parts of a job."""
+    return progress and (lambda done: progress((part + done) / count))
 
 
 def _scanned(scene: Any, sensor: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -31,10 +32,11 @@ class HiddenElements:
     """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
     large beside their distance from the wall are several elements (:mod:`.split_triangles`).
 
-    The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
-    (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
-    ``(P, 3)``: wall points, some 5 x 5 over the scan; ``(tiles, P, 3)`` gives each tile of a scan a density of its own,
-    which pays where geometry is nearer than half the scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
+    The probability of an element is its area times the root mean square over wall points of ``(cos cos / r^2) ^ passes``
+    (both cosines, to the wall point and there; 2 ``passes`` for light that comes and goes, 1 where it goes on), mixed
+    with ``defensive`` of plain area. ``points`` and ``normals`` ``(P, 3)``: wall points, some 5 x 5 over the scan;
+    ``(tiles, P, 3)`` gives each tile of a scan a density of its own, which pays where geometry is nearer than half the
+    scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
 
     The albedo does not enter. ``left_out`` names the shapes that are not in the table (copies of shape groups, curves,
     signed distances, ellipsoids): nothing is ever drawn on them, so that whoever samples this density alone has to
@@ -44,7 +46,9 @@ class HiddenElements:
     shapes as they are when it is built. Raises SceneError where nothing has an area, ShapeError, UnitError.
     """
 
-    def __init__(self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE) -> None:
+    def __init__(
+        self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE, passes: int = 2
+    ) -> None:
         if not 0 < defensive <= 1:
             raise UnitError(f"HiddenElements: defensive is a share in (0, 1], got {defensive!r}.")
         points, normals = _tiles_of(points, "points"), _tiles_of(normals, "normals")
@@ -66,23 +70,30 @@ class HiddenElements:
         self.shapes, self.elements = list(shapes), parts.take(order)
         self.tile_count = len(points)
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
-        p = self._probabilities(points, normals, defensive)
-        self._lay_out(p)
-        per_area = p / self.elements.area
-        self._by_primitive = PrimitiveDensity(self.shapes, every, cuts, uncut[order], cell[order], per_area)
+        self._cutting = every, cuts, uncut[order], cell[order]
+        self._defensive = defensive
+        self._lay_out(self._probabilities(points, normals, passes))
+
+    def reweighted(self, weights: np.ndarray) -> HiddenElements:
+        """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of ``elements``;
+        the share of plain area stays.
+        """
+        other = copy(self)
+        other.tile_count = len(weights)
+        other._lay_out(np.array([self._mixed(w) for w in np.asarray(weights, dtype=np.float64)]))
+        return other
 
     # ----------------------------------------------------------------------------------------- tables
 
-    def _probabilities(self, points: np.ndarray, normals: np.ndarray, defensive: float) -> np.ndarray:
+    def _probabilities(self, points: np.ndarray, normals: np.ndarray, passes: int) -> np.ndarray:
         """(tiles, elements)"""
-        area = self.elements.area / self.elements.area.sum()
-        p = []
-        for q, n in zip(points, normals, strict=True):
-            w = facing_weight(self.elements, q, n)
-            total = w.sum()
-            # What faces no wall point at all is drawn by its area.
-            p.append((1 - defensive) * w / total + defensive * area if total > 0 else area)
-        return np.array(p)
+        pairs = zip(points, normals, strict=True)
+        return np.array([self._mixed(facing_weight(self.elements, q, n, passes)) for q, n in pairs])
+
+    def _mixed(self, w: np.ndarray) -> np.ndarray:
+        """Probabilities of weights, with the share of plain area: all of it where nothing has a weight."""
+        area, total = self.elements.area / self.elements.area.sum(), w.sum()
+        return (1 - self._defensive) * w / total + self._defensive * area if total > 0 else area
 
     def _lay_out(self, p: np.ndarray) -> None:
         e = self.elements
@@ -95,6 +106,7 @@ class HiddenElements:
         self._area = mi.Float(e.area.astype(np.float32))
         self._shape, self._primitive = mi.UInt32(e.shape.astype(np.uint32)), mi.UInt32(e.primitive.astype(np.uint32))
         self._count = mi.UInt32(len(e))
+        self._by_primitive = PrimitiveDensity(self.shapes, *self._cutting, p / e.area)
         self._pointers = mi.UInt32([registry_number(shape) for shape in self.shapes])
         dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count, self._pointers)
 

@@ -64,20 +64,26 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = No
         )
     tile = None if tile is None else mi.UInt32(tile)
     seed = mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed) % 2**32)
-    x, y = plane_points(count, seed)
+    samples = samples_at(elements, *plane_points(count, seed), count, tile)
+    dr.eval(samples)
+    return samples
+
+
+def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any = None) -> SharedSamples:
+    """The samples at two numbers in [0, 1) for each lane (``Float64``, ``Float``), ``count`` of which make up the
+    area; not evaluated.
+    """
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
     shape, primitive = elements.surface(element)
     si = _interaction(elements, element, p, n, a, y)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
-    samples = SharedSamples(
+    return SharedSamples(
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
         element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
     )  # fmt: skip
-    dr.eval(samples)
-    return samples
 
 
 def not_diffuse(shapes: list[Any]) -> list[str]:
