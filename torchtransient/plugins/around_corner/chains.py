@@ -39,9 +39,9 @@ LONGEST_TAIL = 1 + (DIMENSIONS - _FURTHER) // 2
 
 @dataclass
 class ChainPlan:
-    """What chains are made of: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f in
-    memory: about where the scan points are), ``size`` chains of a group, ``groups`` of each tile, ``tail`` vertices,
-    ``seed`` (UInt32 of width one, in memory).
+    """What chains are made of: ``elements`` (:class:`..sampling.hidden_elements.HiddenElements`), ``center`` (Point3f
+    in memory: about where the scan points are), ``size`` chains of a group (a power of two), ``groups`` of each tile,
+    ``tail`` vertices, ``seed`` (UInt32 of width one, in memory).
     """
 
     elements: Any
@@ -102,7 +102,7 @@ def _drawn(plan: ChainPlan, numbers: list[Any], place: tuple[int, int], side: in
     return Vertices(
         p=s.p, n=mi.Vector3f(s.n) * turn, geometric_n=mi.Vector3f(s.geometric_n) * turn, albedo=value * dr.pi,
         value=value * s.weight / density, alive=dr.max(value) > 0,
-        shape=s.shape, primitive=s.primitive, uv=s.u,
+        shape=s.shape, primitive=s.primitive, uv=plan.elements.coordinates(s.element, s.u.x, s.u.y),
     )  # fmt: skip
 
 
@@ -176,27 +176,24 @@ def _select(mask: Any, a: Vertices, b: Vertices) -> Vertices:
 class VertexTable:
     """Vertices in memory, loaded by number. A plain class."""
 
-    _FIELDS = ("p", "n", "geometric_n", "value", "length", "alive")
+    _FIELDS = ("p", "n", "value", "length", "alive")
 
     def __init__(self, vertices: Vertices, smooth: bool) -> None:
         self.smooth = smooth
-        for name in ("p", "n", "value", "length", "alive", "shape", "primitive", "uv"):
+        for name in self._FIELDS:
             setattr(self, name, getattr(vertices, name))
         self.geometric_n = vertices.geometric_n if smooth else vertices.n
-        width = dr.width(self.p)
-        self.length = self.length + dr.zeros(mi.Float, width)
-        self.arrays = [getattr(self, n) for n in (*self._FIELDS, "shape", "primitive", "uv")]
-        dr.schedule(*self.arrays)
+        dr.schedule(self.geometric_n, *(getattr(self, name) for name in self._FIELDS))
 
     def take(self, index: Any) -> Local:
         """``p, n, geometric_n, value, length, alive`` of vertices."""
-        taken = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS if name != "geometric_n"})
+        taken = Local(**{name: _gather(getattr(self, name), index) for name in self._FIELDS})
         taken.geometric_n = _gather(self.geometric_n, index) if self.smooth else taken.n
         return taken
 
 
 def _gather(array: Any, index: Any) -> Any:
-    return dr.gather(type(array), array, index)
+    return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0))
 
 
 class Links:
@@ -206,54 +203,53 @@ class Links:
     ``weight``: per colour of the tail what a head makes of it; in monochromatic variants the head's value is in it.
     """
 
-    def __init__(self, scene: Any, plan: ChainPlan, heads: VertexTable, starts: VertexTable) -> None:
+    def __init__(self, scene: Any, plan: ChainPlan, heads: VertexTable, starts: VertexTable, area_density: Any) -> None:
         n = plan.size
-        chains = dr.width(heads.p)
-        lane = dr.arange(mi.UInt32, chains * n)
-        tail = lane // n
-        head = tail - tail % n + lane % n
+        lane = dr.arange(mi.UInt32, dr.width(heads.p) * n)
+        tail, head = _ends(lane, n)
         x, v = heads.take(head), starts.take(tail)
         d = mi.Vector3f(v.p - x.p)
         square = dr.squared_norm(d)
         inverse = dr.rsqrt(square)
-        cos = dr.maximum(dr.dot(x.n, d) * inverse, 0)
-        facing = dr.dot(v.n, d) < 0
-        geometric_cos = dr.abs(dr.dot(v.geometric_n, d)) * inverse
-        q = cos * geometric_cos * inverse * inverse * dr.inv_pi
-        active = x.alive & v.alive & facing & (q > 0) & (square > 0)
         r = square * inverse
-        line = Local(r=r, geometric_cos=dr.dot(x.geometric_n, d) * inverse)
-        active &= ~occluded(scene, x, line, v.p, -_turned(v.geometric_n, d), active)
-        q = dr.select(active, q, 0)
+        cos = dr.maximum(dr.dot(x.n, d) * inverse, 0)
+        q = cos * dr.abs(dr.dot(v.geometric_n, d)) * dr.square(inverse) * inverse * dr.inv_pi
+        active = x.alive & v.alive & (dr.dot(v.n, d) < 0) & (square > 0) & (q > 0)
+        line = Local(r=r, geometric_cos=dr.dot(x.geometric_n, d))
+        facing = mi.Vector3f(dr.mulsign(v.geometric_n, -dr.dot(v.geometric_n, d)))
+        q = dr.select(active & ~occluded(scene, x, line, v.p, facing, active), q, 0)
         # One kernel with rays, not one for each of what follows.
         dr.eval(q, r)
-        own = (1 - AREA_SHARE) * dr.block_sum(q, n) + n * AREA_SHARE * self._area_density(plan, starts)
-        weight = q * dr.pi / dr.gather(mi.Float, own, tail)
-        if len(x.value) == 1:
+        drawn = (1 - AREA_SHARE) * dr.block_sum(q, n) + n * AREA_SHARE * area_density
+        weight = q * dr.pi / dr.gather(mi.Float, drawn, tail)
+        if len(heads.value) == 1:
             weight *= x.value[0]
         dr.eval(weight)
-        kept = dr.compress(weight > 0)
-        counts = dr.block_sum(dr.select(weight > 0, mi.UInt32(1), 0), n * n)
-        self.count = counts
-        self.first = dr.cumsum(counts) - counts
-        chosen = dr.gather(mi.UInt32, lane, kept)
-        tail = chosen // n
-        head = tail - tail % n + chosen % n
-        rows = mi.Vector4f(dr.gather(mi.Float, weight, kept), dr.gather(mi.Float, r, kept), mi.Float(head), mi.Float(tail))
+        some = weight > 0
+        self.count = dr.block_sum(dr.select(some, mi.UInt32(1), 0), n * n)
+        self.first = dr.cumsum(self.count) - self.count
         # Of the group that has most.
-        self.most = int(dr.max(counts)[0])
-        self.flat = dr.empty(mi.Float, max(4, 4 * dr.width(kept)))
+        self.most = int(dr.max(self.count)[0])
+        # A row more, so that there is one: lanes without links load what they do not use.
+        kept = dr.compress(some)
+        self.flat = dr.zeros(mi.Float, 4 * (dr.width(kept) + 1))
         if dr.width(kept):
-            dr.scatter(self.flat, rows, dr.arange(mi.UInt32, dr.width(kept)))
+            tail, head = _ends(kept, n)
+            weight, r = dr.gather(mi.Float, weight, kept), dr.gather(mi.Float, r, kept)
+            row = mi.Vector4f(weight, r, mi.Float(head), mi.Float(tail))
+            dr.scatter(self.flat, row, dr.arange(mi.UInt32, dr.width(kept)))
         dr.eval(self.flat, self.count, self.first)
 
-    @staticmethod
-    def _area_density(plan: ChainPlan, starts: VertexTable) -> Any:
-        per_area = plan.elements.per_area(starts.shape, starts.primitive, starts.p, starts.alive)
-        two_sided = scatters_behind(starts.shape.bsdf())
-        return per_area * _probability_of_front(plan, starts.p, starts.geometric_n, two_sided)
+
+def _ends(lane: Any, size: int) -> tuple[Any, Any]:
+    """(tail, head) of the pairs of groups of a power of two."""
+    bits = size.bit_length() - 1
+    tail = lane >> bits
+    return tail, (tail & ~mi.UInt32(size - 1)) + (lane & (size - 1))
 
 
-def _turned(n: Any, d: Any) -> Any:
-    """The normal on the side that ``d`` points to."""
-    return dr.mulsign(n, dr.dot(n, d))
+def area_density(plan: ChainPlan, starts: Vertices) -> Any:
+    """Density per area with which a tail's first vertex is drawn over the hidden area, on its side of the surface."""
+    per_area = plan.elements.per_area(starts.shape, starts.primitive, starts.p, starts.alive)
+    two_sided = scatters_behind(starts.shape.bsdf())
+    return per_area * _probability_of_front(plan, starts.p, starts.geometric_n, two_sided)

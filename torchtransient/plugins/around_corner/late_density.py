@@ -58,13 +58,13 @@ def _factor(p: Any, n: Any, q: Any, m: Any) -> Any:
 
 
 def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, element: np.ndarray) -> np.ndarray:
-    """Weights ``(1, E)`` of elements from squares at samples, which stand for ``area`` each; elements next to each other
-    in the table are neighbours in space.
+    """Weights ``(1, E)`` of elements from squares at samples, which stand for ``area`` each; elements next to each
+    other in the table are neighbours in space.
     """
     size = len(elements.elements)
     drawn = np.bincount(element, minlength=size)
     bucket = (np.cumsum(drawn) - drawn) // _BUCKET
-    total, whole = (np.bincount(bucket, np.bincount(element, w, size)) for w in (square * area, area))
-    rms = np.sqrt(total / np.where(whole > 0, whole, 1))
+    total, covered = (np.bincount(bucket, np.bincount(element, w, size)) for w in (square * area, area))
+    rms = np.sqrt(total / np.where(covered > 0, covered, 1))
     # As far as numbers of single precision carry it.
     return (rms / max(rms.max(), 1e-300))[bucket][None] * elements.elements.area

@@ -23,7 +23,14 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.chains import LONGEST_TAIL, ChainPlan, Links, VertexTable, trace_chains
+from torchtransient.plugins.around_corner.chains import (
+    LONGEST_TAIL,
+    ChainPlan,
+    Links,
+    VertexTable,
+    area_density,
+    trace_chains,
+)
 from torchtransient.plugins.around_corner.geometry import occluded, span
 from torchtransient.plugins.around_corner.launches import EVENTS
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -94,7 +101,9 @@ class LateLight:
         side: int = TILE, size: int = SIZE,
     ) -> None:  # fmt: skip
         if not FIRST <= bounces[0] <= bounces[1] <= MOST:
-            raise SceneError(f"LateLight: expected bounces in ascending order within {FIRST} and {MOST}, got {bounces}.")
+            raise SceneError(
+                f"LateLight: expected bounces in order, within {FIRST} and {MOST}, got {bounces}."
+            )
         if size < 1 or size & (size - 1):
             raise UnitError(f"LateLight: expected a power of two as the number of chains of a group, got {size}.")
         self.job, self.elements, self.lasers, self.capture = job, elements, lasers, capture
@@ -176,8 +185,7 @@ class GroupBlock:
     class.
 
     ``seen``, ``lit``: ``[g, r]``, of heads and scan points by row of a tile and point (``lit`` of confocal captures as
-    well), of tails and laser spots by chain and spot. ``heads`` and ``tails`` are material points, see
-    :class:`.chains.VertexTable`.
+    well), of tails and laser spots by chain and spot.
     """
 
     def __init__(self, light: LateLight, first: int, groups: int) -> None:
@@ -189,10 +197,10 @@ class GroupBlock:
         row = chain - tile * dr.opaque(mi.UInt32, self.rows) + dr.opaque(mi.UInt32, first * plan.size)
         number = dr.gather(mi.UInt32, light.tiles.rank, tile) * dr.opaque(mi.UInt32, plan.stride)
         heads, tails = trace_chains(job.scene, plan, number + _in_regions(row, plan))
-        smooth = plan.elements.smooth
+        smooth, drawn = plan.elements.smooth, area_density(plan, tails[0])
         self.heads, tails = VertexTable(heads, smooth), [VertexTable(t, smooth) for t in tails]
-        dr.eval()
-        self.links = Links(job.scene, plan, self.heads, tails[0])
+        dr.eval(drawn)
+        self.links = Links(job.scene, plan, self.heads, tails[0], drawn)
         self.colours = len(job.energy)
         # Those with too few bounces are stepping stones.
         self.tails = tails[light.lowest - FIRST :]
@@ -251,9 +259,9 @@ class LateLanes:
         self.factor = value * job.energy * spot_value
         self.opl = leg + spot_leg - job.film.start_opl
         tile = dr.gather(mi.UInt32, light.tiles.of, self.pixel)
-        whole = tile * dr.opaque(mi.UInt32, part.groups) + group
-        first = dr.gather(mi.UInt32, part.links.first, whole)
-        end = first + dr.gather(mi.UInt32, part.links.count, whole)
+        group_of_all = tile * dr.opaque(mi.UInt32, part.groups) + group
+        first = dr.gather(mi.UInt32, part.links.first, group_of_all)
+        end = first + dr.gather(mi.UInt32, part.links.count, group_of_all)
         self.first = first + piece * dr.opaque(mi.UInt32, launch.links)
         self.last = dr.minimum(self.first + dr.opaque(mi.UInt32, launch.links), end)
         # A chain's number counts through all tiles; a row of the tables through those of one.
@@ -282,7 +290,7 @@ class LateLanes:
 
 
 def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
-    """(quotient, rest) of whole numbers, by one in memory."""
+    """(quotient, rest) of group_of_all numbers, by one in memory."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
     return quotient, number - quotient * by

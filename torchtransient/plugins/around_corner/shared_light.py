@@ -63,7 +63,7 @@ def _is_flat_mesh(shape: Any) -> bool:
         return False
     v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
     spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
-    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])  # noqa: PLR2004 (thickness, the least of three)
+    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])
 
 
 @dataclass
@@ -127,8 +127,8 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
 
 
 def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
-    """Add the light of these bounces (first, last) to a film; ``job`` as in :func:`add_third_bounce`, ``run``: ``seed``,
-    ``samples`` and ``progress``.
+    """Add the light of these bounces (first, last) to a film; ``job`` as in :func:`add_third_bounce`, ``run``:
+    ``seed``, ``samples`` and ``progress``.
     """
     elements = late_density(scene, job.elements, *reference_points(scene, sensor))
     film_job = ThirdBounce(scene, film, None, job.light.sensors, job.light.energy, run.progress)

@@ -77,8 +77,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
         which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
         and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
-        can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
-        polarization. Both have the same mean.
+        can be drawn on every hidden shape, an ``nlos_capture_meter`` on a flat wall, and a variant without wavelengths
+        and polarization. Both have the same mean. Where a curved wall lights itself, points of it next to a scanned
+        one weigh without bound, and ``auto`` takes paths.
     ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
         Light of four to seven bounces from chains that scanned points far from each other share
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
@@ -192,6 +193,8 @@ class TransientNLOSPath(base.TransientIntegrator):
             for name, (choice, first, last) in asked.items()
         }
         asked = {name: row for name, row in asked.items() if row[0] != "paths" and row[1] <= row[2]}
+        if wall_lights_itself(contents.sensor):
+            asked = {name: row for name, row in asked.items() if row[0] != "auto"}
         if not asked:
             return None
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
@@ -220,8 +223,8 @@ class TransientNLOSPath(base.TransientIntegrator):
             super().add_light(world, sensor, film, job)
             return
         first, last = world.left_out
-        paths = world.max_depth > last or (world.min_depth < BOUNCES and wall_lights_itself(sensor) and first > BOUNCES - 1)
-        paths |= world.min_depth <= BOUNCES < first
+        paths = world.max_depth > last or world.min_depth <= BOUNCES < first
+        paths |= world.min_depth < BOUNCES and wall_lights_itself(sensor)
         parts = []
         spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
         shared = Local(
@@ -229,9 +232,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             elements=elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor)),
         )  # fmt: skip
         if first == BOUNCES:
-            parts.append(
-                lambda run: add_third_bounce(shared, world.scene, film, run.seed, run.samples, run.progress)
-            )
+            parts.append(lambda run: add_third_bounce(shared, world.scene, film, run.seed, run.samples, run.progress))
         if last >= FIRST:
             late = max(first, FIRST), last
             parts.append(lambda run: add_late_light(shared, world.scene, sensor, film, late, run))

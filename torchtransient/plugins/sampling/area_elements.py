@@ -204,11 +204,9 @@ def morton_order(points: np.ndarray, bits: int = 10) -> np.ndarray:
     return np.argsort(code, kind="stable")
 
 
-def facing_weight(
-    elements: AreaElements, points: np.ndarray, normals: np.ndarray, passes: int = 2, chunk: int = 1 << 16
-) -> np.ndarray:
-    """Area times the root mean square over wall points ``(P, 3)`` of ``(cos cos / r^2) ^ passes``, at both ends: what
-    light weighs that goes between wall and element so often, without visibility and albedo. ``(E,)``.
+def facing_weight(elements: AreaElements, points: np.ndarray, normals: np.ndarray, chunk: int = 1 << 16) -> np.ndarray:
+    """Area times the root mean square over wall points ``(P, 3)`` of ``cos^2 cos^2 / r^4``, at both ends: what
+    single-corner light that is sent and received there weighs, without visibility and albedo. ``(E,)``.
     """
     weight = np.zeros(len(elements))
     flat = elements.kind == TRIANGLE
@@ -223,6 +221,6 @@ def facing_weight(
             there = (n * d).sum(-1)
             there = np.where(elements.two_sided[numbers, None], np.abs(there), np.maximum(there, 0))
             here = np.maximum(-(d * wall_normal).sum(-1), 0)
-            square += (there * here) ** (2 * passes) / r2 ** (4 * passes)
+            square += (there * here) ** 4 / r2**8
         weight[numbers] = np.sqrt(square.mean(1) / len(points))
     return weight * elements.area

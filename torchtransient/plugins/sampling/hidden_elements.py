@@ -32,11 +32,10 @@ class HiddenElements:
     """A density over the area of ``shapes``: uniform within an element, see :mod:`.area_elements`; triangles that are
     large beside their distance from the wall are several elements (:mod:`.split_triangles`).
 
-    The probability of an element is its area times the root mean square over wall points of ``(cos cos / r^2) ^ passes``
-    (both cosines, to the wall point and there; 2 ``passes`` for light that comes and goes, 1 where it goes on), mixed
-    with ``defensive`` of plain area. ``points`` and ``normals`` ``(P, 3)``: wall points, some 5 x 5 over the scan;
-    ``(tiles, P, 3)`` gives each tile of a scan a density of its own, which pays where geometry is nearer than half the
-    scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
+    The probability of an element is its area times the root mean square over wall points of ``cos^2 cos^2 / r^4``
+    (both cosines, to the wall point and there), mixed with ``defensive`` of plain area. ``points`` and ``normals``
+    ``(P, 3)``: wall points, some 5 x 5 over the scan; ``(tiles, P, 3)`` gives each tile of a scan a density of its own,
+    which pays where geometry is nearer than half the scan's width. Arrays, or ``mi.Point3f`` and ``mi.Normal3f``.
 
     The albedo does not enter. ``left_out`` names the shapes that are not in the table (copies of shape groups, curves,
     signed distances, ellipsoids): nothing is ever drawn on them, so that whoever samples this density alone has to
@@ -46,9 +45,7 @@ class HiddenElements:
     shapes as they are when it is built. Raises SceneError where nothing has an area, ShapeError, UnitError.
     """
 
-    def __init__(
-        self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE, passes: int = 2
-    ) -> None:
+    def __init__(self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE) -> None:
         if not 0 < defensive <= 1:
             raise UnitError(f"HiddenElements: defensive is a share in (0, 1], got {defensive!r}.")
         points, normals = _tiles_of(points, "points"), _tiles_of(normals, "normals")
@@ -72,11 +69,11 @@ class HiddenElements:
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
         self._cutting = every, cuts, uncut[order], cell[order]
         self._defensive = defensive
-        self._lay_out(self._probabilities(points, normals, passes))
+        self._lay_out(self._probabilities(points, normals))
 
     def reweighted(self, weights: np.ndarray) -> HiddenElements:
-        """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of ``elements``;
-        the share of plain area stays.
+        """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
+        ``elements``; the share of plain area stays.
         """
         other = copy(self)
         other.tile_count = len(weights)
@@ -85,10 +82,10 @@ class HiddenElements:
 
     # ----------------------------------------------------------------------------------------- tables
 
-    def _probabilities(self, points: np.ndarray, normals: np.ndarray, passes: int) -> np.ndarray:
+    def _probabilities(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(tiles, elements)"""
         pairs = zip(points, normals, strict=True)
-        return np.array([self._mixed(facing_weight(self.elements, q, n, passes)) for q, n in pairs])
+        return np.array([self._mixed(facing_weight(self.elements, q, n)) for q, n in pairs])
 
     def _mixed(self, w: np.ndarray) -> np.ndarray:
         """Probabilities of weights, with the share of plain area: all of it where nothing has a weight."""

@@ -11,9 +11,9 @@ from torchtransient.plugins.sampling.point_sets import scrambled
 
 # Primitive polynomials and first direction numbers of the dimensions after the first one (Joe and Kuo 2008).
 _INITIAL = [
-    (0, (1,)), (1, (1, 3)), (1, (1, 3, 1)), (2, (1, 1, 1)), (1, (1, 1, 3, 3)), (4, (1, 3, 5, 13)), (2, (1, 1, 5, 5, 17)),
-    (4, (1, 1, 5, 5, 5)), (7, (1, 1, 7, 11, 19)), (11, (1, 1, 5, 1, 1)), (13, (1, 1, 1, 3, 11)), (14, (1, 3, 5, 5, 31)),
-    (1, (1, 3, 3, 9, 7, 49)),
+    (0, (1,)), (1, (1, 3)), (1, (1, 3, 1)), (2, (1, 1, 1)), (1, (1, 1, 3, 3)), (4, (1, 3, 5, 13)),
+    (2, (1, 1, 5, 5, 17)), (4, (1, 1, 5, 5, 5)), (7, (1, 1, 7, 11, 19)), (11, (1, 1, 5, 1, 1)), (13, (1, 1, 1, 3, 11)),
+    (14, (1, 3, 5, 5, 31)), (1, (1, 3, 3, 9, 7, 49)),
 ]  # fmt: skip
 DIMENSIONS = 1 + len(_INITIAL)
 _BITS = 32
@@ -39,8 +39,8 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
     """Coordinate ``dimension`` (0 to ``DIMENSIONS - 1``) of the points ``index`` (UInt32): a ``UInt32`` fraction.
 
     ``seed`` (UInt32 of width one, in memory) scrambles every dimension in its own way, so that each point by itself is
-    uniform. Of every block of ``2^m`` indices that starts at a multiple of it the points are evenly spread, and those of
-    neighbouring blocks fill each other's gaps.
+    uniform. Of every block of ``2^m`` indices that starts at a multiple of it the points are evenly spread, and those
+    of neighbouring blocks fill each other's gaps.
     """
     if dimension == 0:
         bits = dr.brev(index)
