@@ -113,6 +113,26 @@ def test_no_ray_slips_between_triangles():
     np.testing.assert_allclose(distance, 3.0, atol=1e-8)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_hits_are_those_of_a_search_over_all_triangles(seed):
+    """Triangles of very different sizes in any place, in any direction."""
+    rng = np.random.default_rng(seed)
+    size = 10 ** rng.uniform(-3, 0.5, (400, 1, 1))
+    corners = rng.normal(size=(400, 1, 3)) + size * rng.normal(size=(400, 3, 3))
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    origins = 1.5 * rng.normal(size=(500, 3)) - 4 * direction
+    found, index = first_hits(origins, direction, corners)
+    expected = np.full(500, np.inf)
+    for a, b, c in corners:
+        # o + t d = a + u (b - a) + v (c - a)
+        t, u, v = np.linalg.solve(np.stack([-direction, b - a, c - a], 1), (origins - a).T)
+        expected = np.where((t > 0) & (u >= 0) & (v >= 0) & (u + v <= 1), np.minimum(expected, t), expected)
+    assert 100 < np.isfinite(expected).sum() < 500
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert ((index >= 0) == np.isfinite(expected)).all()
+
+
 def test_the_first_triangle_counts():
     plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]])
     corners = np.stack([plate, plate + np.array([0, 0, 0.5]), plate - np.array([0, 0, 1.0])])

@@ -62,8 +62,8 @@ def letters(effect):
 MOVES = [
     ("rectangle sphere disk cylinder sdfgrid instance irradiancemeter", "to_world", "LS", "shape"),
     ("area directionalarea diff_directionalarea angulararea", "to_world", "LS", "shape"),
-    ("cube obj ply instance", "vertex_positions vertex_normals", "LS", "shape"),
-    ("cube obj ply instance", "vertex_texcoords", "S", "value"),
+    ("cube obj ply mesh_arrays instance", "vertex_positions vertex_normals", "LS", "shape"),
+    ("cube obj ply mesh_arrays instance", "vertex_texcoords", "S", "value"),
     ("bsplinecurve linearcurve", "control_points", "LS", "shape"),
     ("sdfgrid", "grid", "LS", "shape"),
     ("ellipsoids ellipsoidsmesh", "data", "LS", "shape"),

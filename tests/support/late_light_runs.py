@@ -10,7 +10,7 @@ from support.third_bounce_runs import captured
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.late_density import late_density
 from torchtransient.plugins.around_corner.late_light import LateLight
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 
 ORIGIN = [-0.5, 0.0, 0.25]
 
@@ -74,7 +74,7 @@ def chains(scene, elements, film, sensors, lasers, kind, count, seed=0, bounces=
     """(steady, array) of the late light of a scan of :class:`.WallPoints`."""
 
     def add():
-        job = ThirdBounce(scene, film, None, sensors)
+        job = ScanJob(scene, film, sensors)
         LateLight(job, elements, lasers, CaptureType[kind.upper()], bounces, **choices).add(count, seed)
 
     with dr.suspend_grad():

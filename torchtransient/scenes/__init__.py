@@ -6,6 +6,15 @@ from torchtransient.scenes.cavities import furnace as furnace
 from torchtransient.scenes.cavities import integrating_sphere as integrating_sphere
 from torchtransient.scenes.cavities import parallel_plates as parallel_plates
 from torchtransient.scenes.cornell import cornell_box as cornell_box
+from torchtransient.scenes.meshes import triangle_mesh as triangle_mesh
+from torchtransient.scenes.nlos import bounds as bounds
+from torchtransient.scenes.nlos import nlos_corner as nlos_corner
+from torchtransient.scenes.nlos import nlos_letter as nlos_letter
+from torchtransient.scenes.nlos import nlos_mannequin as nlos_mannequin
+from torchtransient.scenes.nlos import nlos_plates as nlos_plates
+from torchtransient.scenes.nlos import nlos_z as nlos_z
+from torchtransient.scenes.nlos import relay_wall as relay_wall
+from torchtransient.scenes.nlos_room import nlos_room as nlos_room
 from torchtransient.scenes.walls import etalon_slab as etalon_slab
 from torchtransient.scenes.walls import glass_slab_before_wall as glass_slab_before_wall
 from torchtransient.scenes.walls import light_over_plane as light_over_plane

@@ -56,6 +56,11 @@ def shapes(folder: Path) -> dict[str, dict[str, Any]]:
         **{name: {"type": name, "filename": str(curve)} for name in ("bsplinecurve", "linearcurve")},
         "obj": {"type": "obj", "filename": str(obj)},
         "ply": {"type": "ply", "filename": str(ply)},
+        "mesh_arrays": {
+            "type": "mesh_arrays",
+            "vertices": mi.TensorXd(np.ravel(np.eye(3))[None]),
+            "faces": mi.TensorXd([[0, 1, 2]]),
+        },
         "sdfgrid": {"type": "sdfgrid", "grid": mi.TensorXf(ball.astype(np.float32))},
         **{name: {"type": name, **blobs} for name in ("ellipsoids", "ellipsoidsmesh")},
         "instance": {"type": "scene", "group": group, "copy": copy},

@@ -19,6 +19,11 @@ from torchtransient.vis.phasors import domain_colours as domain_colours
 from torchtransient.vis.phasors import phasor_picture as phasor_picture
 from torchtransient.vis.phasors import phasor_video as phasor_video
 from torchtransient.vis.polarization import polarization_picture as polarization_picture
+from torchtransient.vis.scans import peak_time_map as peak_time_map
+from torchtransient.vis.scans import scan_layout as scan_layout
+from torchtransient.vis.scans import transients_grid as transients_grid
+from torchtransient.vis.scans import wall_frames as wall_frames
+from torchtransient.vis.scans import wall_video as wall_video
 from torchtransient.vis.slices import frame_grid as frame_grid
 from torchtransient.vis.slices import histogram as histogram
 from torchtransient.vis.slices import streak as streak

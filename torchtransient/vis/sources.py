@@ -66,9 +66,7 @@ def images_of(
     return *_checked_cube(loaded.gated, None, who, any_channels), "gate"
 
 
-def _checked_cube(
-    cube: Tensor, axis: TimeAxis | None, who: str, any_channels: bool
-) -> tuple[Tensor, TimeAxis | None]:
+def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: bool) -> tuple[Tensor, TimeAxis | None]:
     if cube.ndim == 5 and cube.shape[0] == 4:
         cube = cube[0]
     if cube.ndim != 4 or cube.numel() == 0 or not (any_channels or cube.shape[0] in (1, 3)):

@@ -1,4 +1,4 @@
-"""Meshes that stand in a scene dictionary: the same light as the same mesh in a file, and derivatives by its vertices."""
+"""Meshes that stand in a scene dictionary: the light of the same mesh in a file, and derivatives by vertices."""
 
 import pickle
 
@@ -77,6 +77,8 @@ def test_parameters_are_those_of_meshes():
     np.testing.assert_allclose(vertices.value, expected, atol=1e-6)
     np.testing.assert_allclose(table["body_0.to_world"].value, POSE, atol=1e-6)
     assert "body_0.bsdf.reflectance.value" in table
+    for name in ("vertex_normals", "vertex_texcoords"):
+        assert not table[f"body_0.{name}"].differentiable and table[f"body_0.{name}"].reason == "the mesh has none"
 
 
 def test_derivative_by_a_pose_is_the_slope_of_the_loss():
@@ -146,5 +148,5 @@ def test_what_is_no_mesh(changes, message):
 
 def test_missing_arrays_are_named():
     without = {key: value for key, value in diffuse().items() if key != "faces"}
-    with pytest.raises(SceneError, match="faces.*nothing"):
+    with pytest.raises(SceneError, match=r"faces.*nothing"):
         tt.load(scene_with(without), variant=VARIANT).parameters()

@@ -33,7 +33,7 @@ from torchtransient.plugins.around_corner.chains import (
 )
 from torchtransient.plugins.around_corner.geometry import occluded, span
 from torchtransient.plugins.around_corner.launches import EVENTS
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.sampling.area_elements import morton_order
 
@@ -89,7 +89,7 @@ class LateLaunch:
 class LateLight:
     """Late light of one capture, of ``lowest`` to ``highest`` bounces (within ``FIRST`` and ``MOST``).
 
-    ``job``: a :class:`.third_bounce.ThirdBounce` (its samples are not used); ``elements``: the density of heads, see
+    ``job``: a :class:`.scan_job.ScanJob`; ``elements``: the density of heads, see
     :mod:`.late_density`; ``lasers``: the spots, one each of the scan points in confocal captures. ``side``: scan points
     of a tile along each side of the scan; ``size``: chains of a group, a power of two.
 
@@ -97,13 +97,11 @@ class LateLight:
     """
 
     def __init__(
-        self, job: ThirdBounce, elements: Any, lasers: WallPoints, capture: CaptureType, bounces: tuple[int, int],
+        self, job: ScanJob, elements: Any, lasers: WallPoints, capture: CaptureType, bounces: tuple[int, int],
         side: int = TILE, size: int = SIZE,
     ) -> None:  # fmt: skip
         if not FIRST <= bounces[0] <= bounces[1] <= MOST:
-            raise SceneError(
-                f"LateLight: expected bounces in order, within {FIRST} and {MOST}, got {bounces}."
-            )
+            raise SceneError(f"LateLight: expected bounces in order, within {FIRST} and {MOST}, got {bounces}.")
         if size < 1 or size & (size - 1):
             raise UnitError(f"LateLight: expected a power of two as the number of chains of a group, got {size}.")
         self.job, self.elements, self.lasers, self.capture = job, elements, lasers, capture

@@ -9,11 +9,14 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.attached import Ends
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.late_density import late_density
 from torchtransient.plugins.around_corner.late_light import LateLight
-from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, sensor_targets
+from torchtransient.plugins.around_corner.scan_job import ScanJob
+from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
@@ -28,7 +31,9 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     """What stands against shared samples in a scene, None for nothing."""
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
-    if not hasattr(sensor, "targets"):
+    if sensor.film().exhaustive_scan and sensor.film().measures != "transient":
+        return f"the film of an exhaustive capture is a {sensor.film().plugin}"
+    if not hasattr(sensor, "scanned"):
         return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:
         return "there are participating media"
@@ -81,7 +86,7 @@ class ScanLight:
 def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType, legs: bool) -> ScanLight:
     """Of the scene as it is now."""
     origin = mi.Point3f(sensor.origin)
-    seen = seen_points(scene, sensor, origin)
+    seen = seen_points(scene, sensor)
     looked_at = _points(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     si = dr.copy(spots.si)
     si.wi = si.to_local(-spots.ray.d)
@@ -98,10 +103,9 @@ def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType,
     return ScanLight(looked_at, _points(si, factor * dr.inv_pi, spots.length if legs else mi.Float(0)), energy)
 
 
-def seen_points(scene: Any, sensor: Any, origin: Any) -> Any:
+def seen_points(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet (SurfaceInteraction3f), attached where sensor or shape are."""
-    targets = sensor_targets(sensor)
-    ray = mi.Ray3f(origin, dr.normalize(targets - origin))
+    ray = scan_rays(sensor)
     with dr.suspend_grad():
         pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
         dr.eval(pi)
@@ -127,23 +131,56 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
 
 
 def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
-    """Add the light of these bounces (first, last) to a film; ``job`` as in :func:`add_third_bounce`, ``run``:
-    ``seed``, ``samples`` and ``progress``.
+    """Add the light of these bounces (first, last) to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
+    ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
     """
     elements = late_density(scene, job.elements, *reference_points(scene, sensor))
-    film_job = ThirdBounce(scene, film, None, job.light.sensors, job.light.energy, run.progress)
+    film_job = ScanJob(scene, film, job.light.sensors, job.light.energy, run.progress)
     LateLight(film_job, elements, job.light.spots, job.capture, bounces).add(run.samples, run.seed)
 
 
-def add_third_bounce(job: Any, scene: Any, film: Any, seed: Any, count: int, progress: Any = None) -> None:
-    """Add the light of three bounces of ``count`` samples to a film; ``job``: ``light`` (:class:`ScanLight`),
-    ``elements`` and ``capture``.
+class SharedThirdBounce:
+    """Light of three bounces of one job: its render, and its derivatives beside those of paths (confocal and single).
+
+    ``light``: attached where the scene is; ``draw``: (seed, number of samples).
     """
-    samples = draw_samples(job.elements, count, seed)
-    third = ThirdBounce(scene, film, samples, job.light.sensors, job.light.energy, progress)
-    if job.capture is CaptureType.CONFOCAL:
-        third.add_confocal(job.light.spots)
-    elif job.capture is CaptureType.SINGLE:
-        third.add_single(job.light.spots)
-    else:
-        add_exhaustive(third, job.light.spots)
+
+    def __init__(
+        self,
+        world: Any,
+        film: Any,
+        light: ScanLight,
+        elements: HiddenElements,
+        capture: CaptureType,
+        draw: tuple[Any, int],
+    ) -> None:
+        self.world, self.film, self.light, self.capture = world, film, light, capture
+        self.samples = draw_samples(elements, draw[1], draw[0])
+        self.gradients = None
+        if world.wanted is not None:
+            with dr.resume_grad():
+                ends = Ends.of_samples(elements, self.samples, world.contents.meshes)
+            confocal = capture is CaptureType.CONFOCAL
+            self.gradients = ThirdBounceGradients(world.scene, film, light, ends, confocal)
+
+    def add(self, progress: Any = None) -> None:
+        """Add the light to the film."""
+        third = ThirdBounce(self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress)
+        if self.capture is CaptureType.CONFOCAL:
+            third.add_confocal(self.light.spots)
+        elif self.capture is CaptureType.SINGLE:
+            third.add_single(self.light.spots)
+        else:
+            add_exhaustive(third, self.light.spots)
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters."""
+        return self.gradients.tables()
+
+    def backward(self, incoming: Any) -> None:
+        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        self.gradients.backward(incoming)
+
+    def forward(self) -> None:
+        """Add to the film, along the tangents of the scene."""
+        self.gradients.forward()

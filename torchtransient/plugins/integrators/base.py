@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
@@ -13,15 +12,15 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
+from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
+from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
-from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
-from torchtransient.plugins.polarized import rotation_tangent
+from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
-from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents, tangents_of
+from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents
 from torchtransient.plugins.transport.derivative.reverse import reverse
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.film import FilmSink
@@ -109,7 +108,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
         if beams and not self.aims_lasers:
             raise SceneError(
-                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling sees the light of the "
                 f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
@@ -122,6 +121,10 @@ class TransientIntegrator(mi.CppADIntegrator):
     def parameters(self, scene) -> ParameterTracker:
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
+
+    def silhouettes(self, scene):
+        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
+        return SILHOUETTES
 
     def reference(self, scene):
         """The sphere around the scene as described, which light from and to infinity is timed by."""
@@ -214,6 +217,16 @@ class TransientIntegrator(mi.CppADIntegrator):
             length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
 
+    def walks(self, world):
+        """Whether paths bring some of a job's light."""
+        return True
+
+    def beside(self, world, sensor, film, seed, samples):
+        """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
+        ``backward(incoming)`` and ``forward()``. Raises GradientError where one is needed and cannot be computed.
+        """
+        return []
+
     def _walk(self, world, film, rays, sink):
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
         world.start(rays)
@@ -278,13 +291,17 @@ class TransientIntegrator(mi.CppADIntegrator):
             if g_steady is None and g_transient is None:
                 return
             world = self.world(scene, contents, wanted, film.arrivals())
-            jobs, _ = self.passes(world, sensor, film, seed, int(spp))
+            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
+            incoming = IncomingAdjoint(film, g_steady, g_transient)
+            beside = self.beside(world, sensor, film, seed, samples)
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad(), contents.hidden_from_mitsuba():
-                for job in jobs:
-                    self._backward_pass(world, sensor, film, job, g_steady, g_transient)
+                for job in jobs if self.walks(world) else ():
+                    self._backward_pass(world, sensor, film, job, incoming)
                     dr.eval()
+                for part in beside:
+                    part.backward(incoming)
 
     def _wanted(self, scene, sensor, film):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
@@ -315,39 +332,15 @@ class TransientIntegrator(mi.CppADIntegrator):
         count, store = self._walk(world, film, rays, sink)
         return sink.layout, store, count
 
-    def _backward_pass(self, world, sensor, film, job, g_steady, g_transient):
+    def _backward_pass(self, world, sensor, film, job, incoming):
         rays = self.start(world.scene, world.contents, sensor, film, job)
         match = self.channel_match(film, rays)
-        channels = film.channel_count()
         _, pixel = self.pixel_indices(film, job, rays)
-        steady = [mi.Float(0)] * channels
-        if g_steady is not None:
-            steady = [dr.gather(mi.Float, g_steady.array, pixel * channels + c) for c in range(channels)]
-        transient, base = None, mi.UInt32(0)
-        if g_transient is not None:
-            flat, offset, strides = self._adjoint_layout(film, g_transient)
-            base = rays.row * strides[0] + rays.column * strides[1] + offset
-            if rays.laser is not None:
-                row = rays.laser // film.laser_scan_width
-                base += row * strides[2] + (rays.laser - row * film.laser_scan_width) * strides[3]
-            transient = (flat, *strides[-2:])
-        block = film.create_adjoint_block(transient, base, steady, match)
+        block = incoming.block(rays, pixel, match)
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         with dr.resume_grad():
             if world.wanted.sensor or dr.grad_enabled(rays.η):
-                dr.backward_from(self._objective_of(world, rays, adjoint))
-
-    def _objective_of(self, world, rays, adjoint):
-        """``<adjoint, Carry>`` of the primary rays."""
-        objective = adjoint.η * rays.η
-        if not self.camera_unwarp:
-            objective += adjoint.slope * rays.length()
-        if world.wanted.sensor:
-            objective += dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
-        if world.wanted.sensor and mi.is_polarized:
-            d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-            objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
-        return objective
+                dr.backward_from(objective_of(world, rays, adjoint))
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -360,14 +353,18 @@ class TransientIntegrator(mi.CppADIntegrator):
             sensor, film = self.resolve(scene, sensor)
             contents, wanted = self._wanted(scene, sensor, film)
             world = self.world(scene, contents, wanted, film.arrivals())
-            with dr.resume_grad():
-                propagate_tangents(self.parameters(scene), world)
             jobs, samples = self.passes(world, sensor, film, seed, int(spp))
+            beside = self.beside(world, sensor, film, seed, samples)
+            with dr.resume_grad():
+                tables = [table for part in beside for table in part.tables()]
+                propagate_tangents(self.parameters(scene), world.tables() + tables)
             film.prepare(self.aov_names(), samples)
             with contents.hidden_from_mitsuba():
-                for job in jobs:
+                for job in jobs if self.walks(world) else ():
                     self._forward_pass(world, sensor, film, job)
                     dr.eval(film.bands[job.band][2], film.steady)
+                for part in beside:
+                    part.forward()
             film.finish_render()
             return film.develop() if develop else None
 
@@ -376,40 +373,10 @@ class TransientIntegrator(mi.CppADIntegrator):
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events(), tangents=True)
-        tangent = self._tangent_of(world, rays)
+        tangent = tangent_of(world, rays)
         dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
         film.add_steady(pixel, match.to_channels(dL))
         block.finish()
-
-    def _tangent_of(self, world, rays) -> Carry:
-        """The tangent of the Carry of the primary rays."""
-        tangent = Carry.zeros()
-        with dr.resume_grad():
-            if not (world.wanted.sensor or dr.grad_enabled(rays.η)):
-                return tangent
-            attached = [rays.ray.o, rays.ray.d, rays.length(), rays.η]
-            if mi.is_polarized:
-                attached.append(sensor_rotation(rays.seen, rays.ray).angle())
-            o, d, length, η, *rotation = tangents_of(attached)
-        tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
-        tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
-        tangent.slope = mi.Float(0) if self.camera_unwarp else mi.Float(length)
-        tangent.η = mi.Float(η)
-        if mi.is_polarized:
-            tangent.β = rotation_tangent(rotation[0])
-        return tangent
-
-    @staticmethod
-    def _adjoint_layout(film, g_transient):
-        if isinstance(g_transient, tuple):
-            return g_transient
-        expected = film.cube_shape()
-        if tuple(g_transient.shape) != expected:
-            raise GradientError(
-                f"render_backward: adjoint of shape {expected} expected, got {tuple(g_transient.shape)}."
-            )
-        strides = np.cumprod((1, *expected[:0:-1]))[::-1]
-        return g_transient.array, 0, tuple(int(stride) for stride in strides)
 
     def to_string(self):
         return (

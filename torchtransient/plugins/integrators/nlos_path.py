@@ -12,17 +12,19 @@ from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
+from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
+    aims_of,
+    check_count,
     laser_of,
     origin_of,
-    sensor_targets,
-    targets_of,
+    scan_rays,
 )
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
+    SharedThirdBounce,
     add_late_light,
-    add_third_bounce,
     elements_of,
     scan_light,
     wall_lights_itself,
@@ -83,7 +85,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
         Light of four to seven bounces from chains that scanned points far from each other share
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
-        ``third_bounce``; both have the same mean.
+        ``third_bounce``; both have the same mean, and derivatives come from paths.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -182,40 +184,40 @@ class TransientNLOSPath(base.TransientIntegrator):
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
 
-    def beside_paths(self, scene: Any, contents: Any) -> tuple[int, int] | None:
+    def beside_paths(self, scene: Any, contents: Any, wanted: Any = None) -> tuple[int, int] | None:
         """First and last number of bounces whose light comes from shared samples and chains, None where all comes from
-        paths. Raises SceneError where it may not and a parameter says that it has to.
+        paths. Raises SceneError where it has to come from those and cannot.
         """
         settings = self.settings()
         asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}
-        asked = {
-            name: (choice, max(first, settings.min_depth), min(last, settings.max_depth))
-            for name, (choice, first, last) in asked.items()
-        }
-        asked = {name: row for name, row in asked.items() if row[0] != "paths" and row[1] <= row[2]}
-        if wall_lights_itself(contents.sensor):
-            asked = {name: row for name, row in asked.items() if row[0] != "auto"}
-        if not asked:
+        if wanted is not None:  # chains have no derivatives, nor have exhaustive captures from shared samples
+            asked = {} if self.capture is CaptureType.EXHAUSTIVE else {"third_bounce": asked["third_bounce"]}
+        found = {}
+        for name, (choice, first, last) in asked.items():
+            first, last = max(first, settings.min_depth), min(last, settings.max_depth)
+            unbounded = choice == "auto" and wall_lights_itself(contents.sensor)
+            if choice != "paths" and first <= last and not unbounded:
+                found[name] = (choice, first, last)
+        if not found:
             return None
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
             reason = why_not(scene, contents.sensor, contents)
         else:
             reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
-        for name, (choice, _, _) in asked.items():
+        for name, (choice, _, _) in found.items():
             if reason and choice != "auto":
                 raise SceneError(f"transient_nlos_path: {name} is {choice!r}, but {reason}. Set it to 'auto'.")
-        if reason:
-            return None
-        return min(row[1] for row in asked.values()), max(row[2] for row in asked.values())
+        return None if reason else (min(r[1] for r in found.values()), max(r[2] for r in found.values()))
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        if settings is None and wanted is None:
-            beside = self.beside_paths(scene, contents)
-            if beside is not None:
-                settings = self.settings()
+        if settings is None:
+            settings = self.settings()
+            beside = self.beside_paths(scene, contents, wanted)
+            most = settings.max_depth
+            if beside is not None and wanted is None and beside[1] == most:
                 # Paths that have nothing to find beyond end before.
-                most = beside[0] - 1 if beside[1] == settings.max_depth else settings.max_depth
-                settings = replace(settings, left_out=beside, max_depth=max(most, 1))
+                most = max(beside[0] - 1, 1)
+            settings = replace(settings, left_out=beside, max_depth=most)
         return super().world(scene, contents, wanted, window, settings)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
@@ -223,20 +225,14 @@ class TransientNLOSPath(base.TransientIntegrator):
             super().add_light(world, sensor, film, job)
             return
         first, last = world.left_out
-        paths = world.max_depth > last or world.min_depth <= BOUNCES < first
-        paths |= world.min_depth < BOUNCES and wall_lights_itself(sensor)
         parts = []
-        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
-        shared = Local(
-            light=scan_light(world.scene, sensor, spots, self.capture, self.legs), capture=self.capture,
-            elements=elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor)),
-        )  # fmt: skip
         if first == BOUNCES:
-            parts.append(lambda run: add_third_bounce(shared, world.scene, film, run.seed, run.samples, run.progress))
+            parts.append(lambda run: self._shared(world, sensor, film, run.seed, run.samples).add(run.progress))
         if last >= FIRST:
-            late = max(first, FIRST), last
-            parts.append(lambda run: add_late_light(shared, world.scene, sensor, film, late, run))
-        if paths:
+            bounces = max(first, FIRST), last
+            late = Local(light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture)
+            parts.append(lambda run: add_late_light(late, world.scene, sensor, film, bounces, run))
+        if self.walks(world):
             parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
         for i, part in enumerate(parts):
             part(replace(job, progress=_share_of(job.progress, i, len(parts))))
@@ -245,11 +241,15 @@ class TransientNLOSPath(base.TransientIntegrator):
         guides = self._guides(contents)
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
+        scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
+        return self._segment(contents)(), scattering, self._connections(contents)
+
+    def _segment(self, contents: Any) -> type:
+        if contents.media is not None:
+            return Media
         # Instances, and what Mitsuba leaves detached, are attached along rays alone.
         along_rays = contents.instances is not None or contents.detached_hits is not None
-        vacuum = Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
-        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (vacuum(), surface(guides))
-        return segment, scattering, self._connections(contents)
+        return Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
 
     def _connections(self, contents: Any) -> list[Any]:
         if not self.laser_sampling:
@@ -258,8 +258,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
 
         def read_spots(scene: Any) -> LaserSpots:
-            targets = targets_of(scene, sensor, capture, fov)
-            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
+            aims = aims_of(scene, sensor, capture, fov)
+            check_count(aims, sensor, capture)
+            return LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
 
         return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
@@ -276,17 +277,70 @@ class TransientNLOSPath(base.TransientIntegrator):
     # ----------------------------------------------------------------------------------- primary rays
 
     def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
-        if hasattr(sensor, "targets"):  # a scan looks at points
+        if hasattr(sensor, "scanned"):  # a scan looks at points
             return mi.Point2f(0), None
         return super().offset_in_pixel(film, sensor, sampler)
 
     def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
         rays = super().start(scene, contents, sensor, film, job)
-        pixel = rays.row * int(film.crop_size()[0]) + rays.column
-        if hasattr(sensor, "targets") and contents.media is None:
+        # A pilot run has a smaller film than the sensor, and one laser position a path.
+        width, height = (int(n) for n in sensor.film().crop_size())
+        columns, rows = (int(n) for n in film.crop_size())
+        row, column = rays.row, rays.column
+        if (columns, rows) != (width, height):
+            row, column = (2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns)
+        pixel = row * width + column
+        if hasattr(sensor, "scanned") and contents.media is None:
             rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
-        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
+        laser = rays.laser
+        if self.capture is CaptureType.EXHAUSTIVE and laser is None:
+            count = sensor.film().laser_count()
+            laser = dr.minimum(mi.UInt32(rays.sampler.next_1d() * count), count - 1)
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, laser)
         return rays
+
+    # ----------------------------------------------------------------------------------- derivatives
+
+    def walks(self, world: Any) -> bool:
+        if world.left_out is None:
+            return True
+        (first, last), settings = world.left_out, self.settings()
+        shortest = settings.min_depth < BOUNCES and wall_lights_itself(world.contents.sensor)
+        return settings.max_depth > last or settings.min_depth <= BOUNCES < first or shortest
+
+    def silhouettes(self, scene: Any) -> str:
+        sensors = scene.sensors()
+        contents = self.contents(scene, sensors[0]) if sensors else None
+        if contents is None or not follows_outlines(self._segment(contents), contents):
+            return super().silhouettes(scene)
+        settings = self.settings()
+        return silhouettes(settings.min_depth, settings.max_depth, self.capture is CaptureType.EXHAUSTIVE)
+
+    def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
+        if not self.laser_sampling:
+            return []
+        shared = [self._shared(world, sensor, film, seed, samples)] if self._shares(world) else []
+        ray = dr.detach(scan_rays(sensor))
+        scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
+        return shared if edges is None else [*shared, edges]
+
+    @staticmethod
+    def _shares(world: Any) -> bool:
+        """Whether light of three bounces comes from shared samples."""
+        return world.left_out is not None and world.left_out[0] == BOUNCES
+
+    def _light(self, world: Any, sensor: Any) -> Any:
+        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+        with dr.resume_grad():
+            return scan_light(world.scene, sensor, spots, self.capture, self.legs)
+
+    def _elements(self, world: Any, sensor: Any) -> HiddenElements:
+        return elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+
+    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        light, elements = self._light(world, sensor), self._elements(world, sensor)
+        return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
 
 
 def _choice(props: Any, name: str, shared: str) -> str:
@@ -303,9 +357,7 @@ def _share_of(progress: Any, part: int, count: int) -> Any:
 
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    origin = mi.Point3f(dr.detach(sensor.origin))
-    targets = dr.detach(sensor_targets(sensor))
-    found = scene.ray_intersect_preliminary(mi.Ray3f(origin, dr.normalize(targets - origin)), coherent=True)
+    found = scene.ray_intersect_preliminary(dr.detach(scan_rays(sensor)), coherent=True)
     dr.eval(found)
     return found
 

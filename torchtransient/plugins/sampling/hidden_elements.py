@@ -65,19 +65,18 @@ class HiddenElements:
         order = np.flatnonzero(parts.area > 0)
         order = order[morton_order(parts.centers()[order])]
         self.shapes, self.elements = list(shapes), parts.take(order)
-        self.tile_count = len(points)
+        self.tile_count, self.region = len(points), None
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
-        self._cutting = every, cuts, uncut[order], cell[order]
-        self._defensive = defensive
-        self._lay_out(self._probabilities(points, normals))
+        self._cutting, self._defensive = (every, cuts, uncut[order], cell[order]), defensive
+        self._lay_out_densities(self._probabilities(points, normals))
 
     def reweighted(self, weights: np.ndarray) -> HiddenElements:
         """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
-        ``elements``; the share of plain area stays.
+        ``elements``; the share of plain area stays. Before :meth:`put_first` alone.
         """
         other = copy(self)
         other.tile_count = len(weights)
-        other._lay_out(np.array([self._mixed(w) for w in np.asarray(weights, dtype=np.float64)]))
+        other._lay_out_densities(np.array([self._mixed(w) for w in np.asarray(weights, dtype=np.float64)]))
         return other
 
     # ----------------------------------------------------------------------------------------- tables
@@ -92,8 +91,23 @@ class HiddenElements:
         area, total = self.elements.area / self.elements.area.sum(), w.sum()
         return (1 - self._defensive) * w / total + self._defensive * area if total > 0 else area
 
-    def _lay_out(self, p: np.ndarray) -> None:
+    def _lay_out_densities(self, p: np.ndarray) -> None:
+        self.probabilities = p
+        self._lay_out(p, 0)
+        self._by_primitive = PrimitiveDensity(self.shapes, *self._cutting, p / self.elements.area)
+
+    def put_first(self, clear: np.ndarray, region: Any) -> None:
+        """Put those elements first, ``(E,)`` of booleans, whose samples need no visibility rays to points that
+        ``region.holds``. The density stays what it is.
+        """
+        self.region = region
+        order = np.argsort(~clear, kind="stable")
+        self.elements, self.probabilities = self.elements.take(order), self.probabilities[:, order]
+        self._lay_out(self.probabilities, int(clear.sum()))
+
+    def _lay_out(self, p: np.ndarray, clear: int) -> None:
         e = self.elements
+        self.has_clear, self.clear_count = clear > 0, dr.opaque(mi.UInt32, clear)
         self.kinds = tuple(int(k) for k in np.unique(e.kind))
         cdf = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
         self._cdf = mi.Float64((cdf / cdf[:, -1:]).ravel())
@@ -103,7 +117,6 @@ class HiddenElements:
         self._area = mi.Float(e.area.astype(np.float32))
         self._shape, self._primitive = mi.UInt32(e.shape.astype(np.uint32)), mi.UInt32(e.primitive.astype(np.uint32))
         self._count = mi.UInt32(len(e))
-        self._by_primitive = PrimitiveDensity(self.shapes, *self._cutting, p / e.area)
         self._pointers = mi.UInt32([registry_number(shape) for shape in self.shapes])
         dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count, self._pointers)
 

@@ -12,6 +12,8 @@ from torchtransient.errors import SceneError, UnitError, VariantError
 from torchtransient.plugins.node_walk import objects_of
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.point_sets import plane_points
+from torchtransient.plugins.transport.scattering.geometry_terms import material_point
+from torchtransient.plugins.transport.strategy import Local
 
 # A launch has a lane per sample, and chunks of it are numbered in 32 bits.
 MAX_SAMPLES = 2**26
@@ -19,13 +21,16 @@ MAX_SAMPLES = 2**26
 
 @dataclass
 class SharedSamples:
-    """``count`` points, in the order of the elements of ``HiddenElements`` (neighbours stand together).
+    """``count`` points for each of ``tiles`` tiles of the scan, one tile after the other, in the order of the elements
+    of ``HiddenElements`` (neighbours stand together).
 
     ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
     false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
     and of the other one; ``weight`` (``Float``): one over ``count`` times the density per area, so that a mean over the
     area is a sum over samples; ``element`` (``UInt32``): number in the table; ``shape``, ``primitive``, ``u``
-    (``Point2f``): the material point, the same for other positions of the shape.
+    (``Point2f``): the material point, the same for other positions of the shape. ``clear`` (``UInt32``, one for each
+    tile): how many of its samples, the first ones, nothing hides from any point that ``region.holds``; ``has_clear``:
+    whether there are elements of that kind.
     """
 
     count: int
@@ -40,17 +45,22 @@ class SharedSamples:
     primitive: Any
     u: Any
     smooth: bool
+    tiles: int
+    clear: Any
+    has_clear: bool
+    region: Any
 
 
-def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = None) -> SharedSamples:
-    """``count`` samples of the hidden geometry's density; ``seed``: UInt32 of width one, in memory, or a whole number.
-    ``tile``: number of the tile whose density is drawn from.
+def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSamples:
+    """``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width one, in
+    memory, or a whole number.
 
     Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
     and VariantError in spectral and polarized variants, where a sample has no colour of its own.
     """
-    if not 1 <= count <= MAX_SAMPLES:
-        raise UnitError(f"draw_samples: expected 1 to {MAX_SAMPLES} samples, got {count!r}.")
+    sets = elements.tile_count
+    if not 1 <= count <= MAX_SAMPLES // sets:
+        raise UnitError(f"draw_samples: expected 1 to {MAX_SAMPLES // sets} samples, got {count!r}.")
     if mi.is_spectral or mi.is_polarized:
         raise VariantError(
             f"draw_samples: shared samples hold a colour, which variant {mi.variant()} has not; expected a mono or RGB "
@@ -62,16 +72,19 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = No
             "draw_samples: expected surfaces of 'diffuse', or of 'twosided' around it, got "
             f"{'; '.join(others)}. Use the general path integrator."
         )
-    tile = None if tile is None else mi.UInt32(tile)
     seed = mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed) % 2**32)
-    samples = samples_at(elements, *plane_points(count, seed), count, tile)
+    x, y = plane_points(count, seed, sets)
+    tile = dr.arange(mi.UInt32, count * sets) // dr.opaque(mi.UInt32, count) if sets > 1 else None
+    samples = samples_at(elements, x, y, count, tile)
+    clear = dr.select(samples.element < elements.clear_count, mi.UInt32(1), 0)
+    samples.tiles, samples.clear = sets, dr.block_sum(clear, count)
     dr.eval(samples)
     return samples
 
 
 def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any = None) -> SharedSamples:
     """The samples at two numbers in [0, 1) for each lane (``Float64``, ``Float``), ``count`` of which make up the
-    area; not evaluated.
+    area; not evaluated, and without ``clear``.
     """
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
@@ -83,7 +96,22 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
         element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
+        tiles=1, clear=None, has_clear=elements.has_clear, region=elements.region,
     )  # fmt: skip
+
+
+def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: Any) -> Local:
+    """Samples as points that follow their shapes, attached where these are: ``p``, ``n``, ``geometric_n``, and
+    ``front`` and ``back``, albedo over pi of the sides times the area that a sample stands for. ``meshes``
+    (:class:`~..pointer_table.PointerTable`): the shapes with vertices of their own.
+    """
+    a, y = samples.u.x, samples.u.y
+    pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)
+    si, area = material_point(pi, ray, mi.Mask(True), meshes)
+    weight = samples.weight * dr.relative_grad(area)
+    n = mi.Vector3f(si.sh_frame.n if samples.smooth else si.n)
+    front, back = (_scattered(si, side) * weight for side in (1.0, -1.0))
+    return Local(p=mi.Point3f(si.p), n=n, geometric_n=mi.Vector3f(si.n), front=front, back=back)
 
 
 def not_diffuse(shapes: list[Any]) -> list[str]:
@@ -105,13 +133,19 @@ def _held(bsdf: Any) -> list[Any]:
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
     """What Mitsuba says of the points: shading frame, texture coordinates."""
+    pi, ray = _preliminary(elements, element, p, n, a, y)
+    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:
+    """(the points as they would be found, by a ray from a metre before them)."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
     pi.shape, pi.prim_index = elements.surface(element)
     pi.valid, pi.t = mi.Mask(True), mi.Float(1)
     pi.prim_uv = elements.coordinates(element, a, y)
     ray = dr.zeros(mi.Ray3f, dr.width(p))
     ray.o, ray.d = mi.Point3f(p + mi.Vector3f(n)), -mi.Vector3f(n)
-    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    return pi, ray
 
 
 def _scattered(si: Any, side: float) -> Any:

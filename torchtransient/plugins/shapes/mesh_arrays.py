@@ -16,10 +16,10 @@ def mesh_arrays(props: Any) -> Any:
     """A Mitsuba mesh of arrays, with one normal a triangle.
 
     ``vertices``: (V, 3), metres, before ``to_world``; ``faces``: (F, 3), whole numbers, wound against the clock as seen
-    from outside. ``to_world``, ``flip_normals`` and children (BSDF,
-    emitter, sensor, media) as Mitsuba's meshes have them. Parameters are those of every mesh, ``vertex_positions`` in
-    world space among them. Raises SceneError for missing arrays, sizes that are no multiples of three, numbers that are
-    not finite and faces of vertices that are not there. Not supported: normals and texture coordinates at vertices.
+    from outside. ``to_world``, ``flip_normals`` and children (BSDF, emitter, sensor, media) as Mitsuba's meshes have
+    them. Parameters are those of every mesh, ``vertex_positions`` in world space among them. Raises SceneError for
+    missing arrays, sizes that are no multiples of three, numbers that are not finite and faces of vertices that are not
+    there. Not supported: normals and texture coordinates at vertices.
     """
     vertices = _rows(props, "vertices")
     faces = _rows(props, "faces")

@@ -62,6 +62,12 @@ def write_curve(path: Path) -> Path:
     return path
 
 
+def _in_place(to_world: np.ndarray) -> Description:
+    """The square of the mesh files, without normals and texture coordinates."""
+    vertices, _, _, faces = grid_mesh()
+    return {"type": "mesh_arrays", "vertices": vertices, "faces": faces, "to_world": to_world}
+
+
 def _sdf_slab() -> Description:
     """A slab of signed distances, a metre thick and 20 m wide. Mitsuba's cannot be rotated."""
     z = np.linspace(-1.0, 1.0, 8, dtype=np.float32)
@@ -91,6 +97,7 @@ def shapes() -> dict[str, Maker]:
         "cylinder": lambda _: {"type": "cylinder", "p0": [0.1, -_HALF, -3.0], "p1": [0.0, _HALF, -3.0], "radius": 3.0},
         "obj": lambda folder: {"type": "obj", "filename": str(write_obj(folder / "plate.obj")), "to_world": flat},
         "ply": lambda folder: {"type": "ply", "filename": str(write_ply(folder / "plate.ply")), "to_world": flat},
+        "mesh_arrays": lambda _: _in_place(flat),
         "sdfgrid": lambda _: _sdf_slab(),
         "bsplinecurve": lambda folder: {"type": "bsplinecurve", "filename": str(write_curve(folder / "fibre.txt"))},
         "linearcurve": lambda folder: {"type": "linearcurve", "filename": str(write_curve(folder / "fibre.txt"))},

@@ -15,10 +15,12 @@ from torchtransient.plugins.transport.derivative.vertex import attached_carry, v
 from torchtransient.plugins.transport.sinks.record import RecordedVertex
 
 
-def propagate_tangents(parameters, world):
-    """Bring the tangents of the scene's ``parameters`` to where the loop meets them, outside of its isolated scope."""
+def propagate_tangents(parameters, tables):
+    """Bring the tangents of the scene's ``parameters`` to where the loop meets them, outside of its isolated scope;
+    ``tables``: what has been computed of them.
+    """
     attached = parameters.attached_values()
-    attached += [table for table in world.tables() if dr.grad_enabled(table)]
+    attached += [table for table in tables if dr.grad_enabled(table)]
     if not attached:
         return
     dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)

@@ -1,0 +1,210 @@
+"""Captures as YAML files: what the entries mean, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from torchtransient import scenes
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Scan, Wall
+from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+from torchtransient.nlos.description import read_description
+from torchtransient.nlos.hidden_shapes import SCENES
+from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.sensing import Device
+
+SHORT = """
+hidden: {letter: {scene: nlos_letter}}
+scan: {kind: confocal, size: 8}
+"""
+
+
+def read(**entries):
+    """`SHORT` with other entries."""
+    given = {
+        "hidden": {"letter": {"scene": "nlos_letter"}}, "scan": {"kind": "confocal", "size": 8}, **entries,
+    }  # fmt: skip
+    return read_description("\n" + json.dumps(given))  # JSON is YAML
+
+
+def test_the_shortest_description():
+    found = read_description(SHORT)
+    assert found.scan == Scan.grid(Wall.plane(), 8, kind="confocal")
+    assert repr(found.hidden) == repr(scenes.nlos_letter())
+    assert found.axis == found.scan.default_axis(scenes.bounds(scenes.nlos_letter()), 0.01)
+    assert (found.spp, found.bounces, found.seed, found.sensor) == (4096, (3,), 0, None)
+    assert found.frequencies is None and found.variant is None and found.name == "capture"
+
+
+def test_the_example_of_the_documentation():
+    import torchtransient.nlos.description as module
+
+    example = module.__doc__.split("\n\n")[1].replace("    sensor: device.yaml", "    # sensor: device.yaml")
+    found = read_description(example + "\n")
+    assert set(found.hidden) == {"letter", "ball"} and found.scan.shape == (32, 32) and found.variant == "llvm_ad_mono"
+    np.testing.assert_allclose(scenes.bounds({"b": found.hidden["ball"]}), [[0.2, -0.2, 0.6], [0.6, 0.2, 1.0]])
+
+
+def test_files_lie_beside_the_description(tmp_path):
+    vertices, faces = scenes.meshes.ellipsoid([0, 0, 1], 0.3, 1)
+    np.savez(tmp_path / "ball.npz", vertices=vertices, faces=faces)
+    (tmp_path / "letter.obj").write_text("v 0 0 1\nv 1 0 1\nv 0 1 1\nf 1 3 2\n")
+    wall, wall_faces = scenes.meshes.plate(2.0, 1.0)
+    np.savez(tmp_path / "wall.npz", vertices=wall, faces=wall_faces[:, ::-1])
+    device = Device("d", "a detector", ("assumed: all of it",), ({"kind": "GaussianResponse", "fwhm_s": 5e-11},))
+    device.to_yaml(tmp_path / "device.yaml")
+    path = tmp_path / "office.yaml"
+    path.write_text(
+        "hidden:\n  ball: {file: ball.npz, albedo: [0.1, 0.2, 0.3]}\n  letter: {file: letter.obj}\n"
+        "wall: {file: wall.npz, albedo: 0.9}\n"
+        "scan: {kind: single, size: [4, 2], laser: [0.25, 0.5]}\n"
+        "time_axis: {start_opl: 1.5, bin_width_opl: 3e-3, num_bins: 512}\nsensor: device.yaml\n"
+        "spp: 1_024\nbounces: [4, 3, 3]\nseed: 7\nname: test\n"
+    )
+    found = read_description(path)
+    assert found.hidden["ball"]["type"] == "mesh_arrays"
+    assert found.hidden["ball"]["bsdf"]["reflectance"] == {"type": "rgb", "value": [0.1, 0.2, 0.3]}
+    assert found.hidden["letter"]["filename"] == str(tmp_path / "letter.obj")
+    assert found.scan.wall["type"] == "mesh_arrays" and found.scan.wall["bsdf"]["reflectance"] == 0.9
+    np.testing.assert_allclose(found.scan.laser_points, [-0.5, 0, 0], atol=1e-12)
+    assert found.axis == TimeAxis(1.5, 0.003, 512), "YAML 1.1 reads 3e-3 as a text"
+    assert found.sensor == device
+    assert (found.spp, found.bounces, found.seed, found.name) == (1024, (3, 4), 7, "test")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_can_be_hidden(name):
+    found = read(hidden={"thing": {"scene": name}}, time_axis={"bin_width_opl": 0.02}).hidden
+    made = SCENES[name]()
+    expected = ["thing"] if len(made) == 1 else [f"thing_{part}" for part in made]
+    assert list(found) == expected
+
+
+def test_arguments_of_scenes():
+    given = {"scene": "nlos_letter", "letter": "K", "depth": 0.7, "thickness": 0.1, "albedo": [0.1, 0.2, 0.3]}
+    found = read(hidden={"k": given}).hidden["k"]
+    assert repr(found) == repr(scenes.nlos_letter("K", 1.0, 0.7, (0.1, 0.2, 0.3), 0.1)["letter"])
+
+
+def test_places():
+    turns = [[[1, 0, 0], 10], [[0, 1, 0], 20]]
+    found = read(hidden={
+        "a": {"shape": "cube", "scale": [1, 2, 3], "rotate": turns, "translate": [0, 0, 5], "albedo": 0.3},
+        "b": {"shape": "rectangle", "rotate": [[0, 1, 0], 180], "translate": [0, 0, 1], "flip_normals": True},
+        "c": {"shape": "sphere", "to_world": np.diag([0.1, 0.1, 0.1, 1]).tolist(), "bsdf": {"type": "conductor"}},
+        "d": {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]},
+    }).hidden  # fmt: skip
+    expected = translate([0, 0, 5]) @ rotate([0, 1, 0], 20) @ rotate([1, 0, 0], 10) @ scale([1, 2, 3])
+    np.testing.assert_allclose(found["a"]["to_world"], expected)
+    assert found["a"]["bsdf"]["reflectance"] == 0.3 and "flip_normals" not in found["a"]
+    np.testing.assert_allclose(found["b"]["to_world"], translate([0, 0, 1]) @ rotate([0, 1, 0], 180))
+    assert found["b"]["flip_normals"] is True
+    assert found["c"]["to_world"][0, 0] == 0.1 and found["c"]["bsdf"] == {"type": "conductor"}
+    assert found["d"]["vertices"].shape == (3, 3) and "to_world" not in found["d"]
+
+
+def test_walls_and_scans():
+    wall = {"width": 1.0, "height": 3.0, "center": [0, 1, 0], "normal": [0, 0, 2], "up": [0, 1, 0.0], "albedo": 0.7}
+    scan = {
+        "kind": "exhaustive", "size": [4, 3], "laser_grid": 2, "sensor_origin": [0, 0, 1], "laser_origin": [0, 1, 1],
+        "extent": [0, 0, 0.5, 1], "cell_centers": False, "first_and_last_leg": True,
+    }  # fmt: skip
+    found = read(wall=wall, scan=scan).scan
+    surface = Wall.plane(1.0, 3.0, center=(0, 1, 0), albedo=0.7)
+    assert found == Scan.grid(
+        surface, (4, 3), kind="exhaustive", laser_grid=(2, 2), sensor_origin=(0, 0, 1), laser_origin=(0, 1, 1),
+        extent=(0, 0, 0.5, 1), cell_centers=False, first_and_last_leg=True,
+    )  # fmt: skip
+
+
+def test_axes_and_bounces():
+    seconds = read(time_axis={"start_s": 0.0, "bin_width_s": 1.6e-11, "num_bins": 512})
+    assert seconds.axis == TimeAxis.from_seconds(0.0, 1.6e-11, 512)
+    listed = read(frequencies=[1.0, 2, "3e0"])
+    assert listed.axis is None and listed.frequencies == FrequencyAxis((1.0, 2.0, 3.0))
+    uniform = read(frequencies={"first": 1.0, "step": 0.5, "count": 4, "start_opl": 2.0})
+    assert uniform.frequencies == FrequencyAxis.uniform(1.0, 0.5, 4, 2.0)
+    assert read(bounces="all").bounces is None and read(bounces=4).bounces == (4,)
+
+
+def test_a_sensor_in_place():
+    entries = Device("d", "a detector", ("assumed: all of it",), ({"kind": "ShotNoise"},)).to_dict()
+    assert read(sensor=entries).sensor == Device.from_dict(entries)
+
+
+MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
+
+
+@pytest.mark.parametrize(
+    ("entries", "error", "message"),
+    [
+        ({"samples": 3}, SceneError, "unknown entry 'samples'"),
+        ({"hidden": None}, SceneError, "an entry 'hidden'"),
+        ({"hidden": {}}, SceneError, "things by name"),
+        ({"hidden": {"a": {}}}, SceneError, "one of scene, file, shape, vertices"),
+        ({"hidden": {"a": {"scene": "nlos_z", "shape": "cube"}}}, SceneError, "one of scene, file"),
+        ({"hidden": {"a.b": {"shape": "cube"}}}, SceneError, "without dots"),
+        ({"hidden": {"a": {"scene": "cornell_box"}}}, SceneError, "nlos_z, nlos_letter"),
+        ({"hidden": {"a": {"scene": "nlos_letter", "leter": "K"}}}, SceneError, "Did you mean 'letter'"),
+        ({"hidden": {"a": {"scene": "nlos_letter", "letter": "A"}}}, SceneError, "hidden: a: letter: expected one of"),
+        ({"hidden": {"a": {"scene": "nlos_letter", "size": "big"}}}, SceneError, "expected arguments of nlos_letter"),
+        ({"hidden": {"a": {"scene": "nlos_letter", "size": -1}}}, UnitError, "hidden: a: size"),
+        ({"hidden": {"a": {"file": "none.obj"}}}, SceneError, "no file 'none.obj'"),
+        ({"hidden": {"a": {"shape": "torus"}}}, SceneError, "rectangle, disk, cube, sphere"),
+        ({"hidden": {"a": {"shape": "cube", "albedo": 2}}}, UnitError, "between 0 and 1"),
+        ({"hidden": {"a": {"shape": "cube", "albedo": 0.5, "bsdf": {}}}}, SceneError, "exclude each other"),
+        ({"hidden": {"a": {"shape": "cube", "rotate": [10, 20]}}}, SceneError, "rotate: expected"),
+        ({"hidden": {"a": {"shape": "cube", "to_world": [[1]]}}}, SceneError, "four rows"),
+        ({"hidden": {"a": {"shape": "cube", "to_world": [[1]] * 4}}}, SceneError, "a list of 4 numbers"),
+        (
+            {"hidden": {"a": {"shape": "cube", "scale": 2, "to_world": np.eye(4).tolist()}}},
+            SceneError,
+            "excludes scale",
+        ),
+        ({"hidden": {"a": {**MESH, "faces": [[0, 1, 5]]}}}, ShapeError, "hidden: a: .*0 to 2"),
+        ({"hidden": {"a": {**MESH, "vertices": [[0, 0], [1]]}}}, SceneError, "rows of three"),
+        ({"wall": {"widht": 1}}, SceneError, "Did you mean 'width'"),
+        ({"wall": {"width": -1}}, UnitError, "width > 0"),
+        ({"wall": {"file": "wall.npz"}}, SceneError, "no file 'wall.npz'"),
+        ({"scan": {"kind": "biaxial", "size": 8}}, SceneError, "single, confocal, exhaustive"),
+        ({"scan": {"kind": "confocal"}}, SceneError, "an entry 'size'"),
+        ({"scan": {"kind": "confocal", "size": [8, 8, 8]}}, SceneError, "one number or"),
+        ({"scan": {"kind": "confocal", "size": 0}}, SceneError, "at least 1"),
+        ({"scan": {"kind": "confocal", "size": 8, "laser": [0.5, 0.5]}}, SceneError, "laser has no meaning"),
+        ({"scan": {"kind": "single", "size": 8, "laser": [0.0, 0.0, 0.5]}}, SceneError, "0.5 m off"),
+        ({"scan": {"kind": "exhaustive", "size": 1}}, SceneError, "grid of one point"),
+        ({"time_axis": {"start_opl": 1.0}}, SceneError, "together, or neither"),
+        ({"time_axis": {"bin_width_opl": -1.0}}, UnitError, "bin_width_opl > 0"),
+        ({"time_axis": {"bin_width_s": 1e-11}}, SceneError, "expected start_s"),
+        ({"time_axis": {"num_bins": 4}, "frequencies": [1.0]}, SceneError, "exclude each other"),
+        ({"frequencies": {"first": 1.0}}, SceneError, "an entry 'step'"),
+        ({"spp": 0}, SceneError, "spp: expected a whole number of at least 1"),
+        ({"bounces": [2.5]}, SceneError, "bounces: expected"),
+        ({"bounces": []}, SceneError, "bounces: expected"),
+        ({"seed": -1}, SceneError, "at least 0"),
+        ({"sensor": "none.yaml"}, SceneError, "no file 'none.yaml'"),
+        ({"sensor": {"name": "d"}}, StorageError, "sensor: Device"),
+        ({"sensor": 3}, SceneError, "the file of a device"),
+        ({"variant": 3}, SceneError, "variant: expected a text"),
+    ],
+)
+def test_what_is_refused(entries, error, message):
+    with pytest.raises(error, match=message):
+        read(**entries)
+
+
+def test_bins_of_a_mesh_file_have_to_be_given(tmp_path):
+    (tmp_path / "letter.obj").write_text("v 0 0 1\nv 1 0 1\nv 0 1 1\nf 1 3 2\n")
+    path = tmp_path / "a.yaml"
+    path.write_text("hidden: {letter: {file: letter.obj}}\nscan: {kind: confocal, size: 2}\n")
+    with pytest.raises(SceneError, match=r"bins can be found for shapes alone.*'obj' at letter"):
+        read_description(path)
+    (tmp_path / "broken.npz").write_bytes(b"no archive")
+    path.write_text("hidden: {letter: {file: broken.npz}}\nscan: {kind: confocal, size: 2}\n")
+    with pytest.raises(StorageError, match="'vertices' and 'faces' in"):
+        read_description(path)
+    (tmp_path / "mesh.stl").write_bytes(b"")
+    path.write_text("hidden: {letter: {file: mesh.stl}}\nscan: {kind: confocal, size: 2}\n")
+    with pytest.raises(SceneError, match="expected a mesh"):
+        read_description(path)

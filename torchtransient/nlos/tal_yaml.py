@@ -1,0 +1,260 @@
+"""Scene files of y-tal's renderer (`tal render`, versions 0.20 and 0.21) as plain settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Scan, Wall
+from torchtransient.capture.scan import KINDS
+from torchtransient.errors import SceneError
+from torchtransient.nlos.tal_materials import material, spectrum
+from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
+from torchtransient.plugins.films.phasor_grid import transform_bins
+from torchtransient.scenes.transforms import rotate, scale, translate
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+_KNOWN = (
+    "name", "mitsuba_variant", "integrator_max_depth", "integrator_filter_bounces", "integrator_discard_direct_paths",
+    "integrator_nlos_laser_sampling", "integrator_nlos_hidden_geometry_sampling",
+    "integrator_nlos_hidden_geometry_sampling_do_rroulette",
+    "integrator_nlos_hidden_geometry_sampling_includes_relay_wall", "sample_count",
+    "integrator_force_equal_illumination_scanning", "integrator_illumination_scan_fov", "simultaneous_scan",
+    "account_first_and_last_bounces", "num_bins", "bin_width_opl", "start_opl", "auto_detect_bins", "histogram_mode",
+    "wl_mean", "wl_sigma", "scan_type", "sensor_x", "sensor_y", "sensor_z", "laser_x", "laser_y", "laser_z",
+    "sensor_width", "sensor_height", "laser_lookat_x", "laser_lookat_y", "laser_width", "laser_height",
+    "laser_aperture_start_x", "laser_aperture_start_y", "laser_aperture_end_x", "laser_aperture_end_y",
+    "laser_emission_mode", "laser_emission", "geometry", "relay_wall",
+)  # fmt: skip
+_GEOMETRY = (
+    "name", "description", "mesh", "displacement_x", "displacement_y", "displacement_z", "rot_degrees_x",
+    "rot_degrees_y", "rot_degrees_z", "scale_x", "scale_y", "scale_z", "material",
+)  # fmt: skip
+_ANALYTIC = ("rectangle", "sphere")
+
+
+@dataclass(frozen=True)
+class TalSettings:
+    """What a scene file of y-tal asks for. Lengths in metres.
+
+    ``hidden``: shapes by name, Mitsuba dictionaries with absolute names of mesh files. ``scan``: with the wall, in the
+    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: those that a
+    phasor film keeps of a transform of these bins, None for histograms. ``spp``: samples a sensor point.
+
+    ``max_depth``, ``filter_bounces``, ``discard_direct_paths``: as the parameters of that name of `transient_nlos_path`
+    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: how its
+    estimator samples, which changes noise alone. ``laser_emission``: irradiance of the projector, a number, a linear
+    sRGB triple or a spectrum. ``entries``: all that stood in the file.
+    """
+
+    name: str
+    scan: Scan
+    hidden: Mapping[str, Any]
+    axis: TimeAxis
+    spp: int
+    variant: str
+    frequencies: FrequencyAxis | None = None
+    max_depth: int = -1
+    filter_bounces: int = -1
+    discard_direct_paths: bool = False
+    hidden_geometry_sampling: bool = False
+    rroulette: bool = False
+    includes_relay_wall: bool = True
+    laser_emission: Any = (1.0, 1.0, 1.0)
+    entries: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_tal_yaml(source: str | Path) -> TalSettings:
+    """Read a scene file of y-tal: a path, the folder of an experiment, or YAML text. Nothing is executed.
+
+    Entries that are missing or null have y-tal's defaults. Mesh files are looked up from the file's folder, the folder
+    above it (where `tal render FOLDER` is called) and the current one. The relay wall may be turned, which y-tal does
+    not support. Raises StorageError for files that cannot be read, SceneError for unknown entries, wrong values, and
+    what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
+    a field of view, walls that are no rectangle.
+    """
+    data, folder = read_yaml(source, "y-tal scene")
+    section = Section(data, "y-tal scene", _KNOWN)
+    _refuse_unsupported(section)
+    wall, hidden = _geometry(section, (folder, folder.parent, Path.cwd()))
+    axis = TimeAxis(
+        section.number("start_opl", 0.0), section.number("bin_width_opl", 0.003), section.whole("num_bins", 4096)
+    )
+    return TalSettings(
+        name=section.text("name", ""),
+        scan=_scan(section, wall),
+        hidden=hidden,
+        axis=axis,
+        spp=section.whole("sample_count", 1_000_000),
+        variant=section.text("mitsuba_variant", DEFAULT_VARIANT),
+        frequencies=_frequencies(section, axis),
+        max_depth=section.whole("integrator_max_depth", -1, least=-1),
+        filter_bounces=section.whole("integrator_filter_bounces", -1, least=-1),
+        discard_direct_paths=section.flag("integrator_discard_direct_paths", False),
+        hidden_geometry_sampling=section.flag("integrator_nlos_hidden_geometry_sampling", False),
+        rroulette=section.flag("integrator_nlos_hidden_geometry_sampling_do_rroulette", False),
+        includes_relay_wall=section.flag("integrator_nlos_hidden_geometry_sampling_includes_relay_wall", True),
+        laser_emission=_emission(section),
+        entries=data,
+    )
+
+
+def _refuse_unsupported(section: Section) -> None:
+    if not section.flag("integrator_nlos_laser_sampling", True):
+        raise SceneError(
+            "y-tal scene: integrator_nlos_laser_sampling: false is not supported: the laser lights a point of the "
+            "wall, which paths are connected to. Leave the entry out."
+        )
+    section.flag("simultaneous_scan", True)  # of some scans alone, and never anything else
+    if section.flag("auto_detect_bins", False):
+        raise SceneError(
+            "y-tal scene: auto_detect_bins: true is not supported (y-tal's renderer leaves it out too). Give start_opl "
+            "and num_bins; Scan.default_axis suggests some."
+        )
+
+
+def _frequencies(section: Section, axis: TimeAxis) -> FrequencyAxis | None:
+    if section.choice("histogram_mode", ("time", "frequency"), "time") == "time":
+        return None
+    mean, sigma = section.number("wl_mean"), section.number("wl_sigma")
+    found = transform_bins(mean, sigma, axis.num_bins, axis.bin_width_opl)
+    return FrequencyAxis(tuple(found.tolist()), axis.start_opl)
+
+
+def _emission(section: Section) -> Any:
+    mode = section.choice("laser_emission_mode", ("mono", "rgb", "spectrum"), "rgb")
+    given, where = section.get("laser_emission", "1.0, 1.0, 1.0"), "y-tal scene: laser_emission"
+    if mode == "spectrum":
+        return spectrum(str(given), where)
+    words = given if isinstance(given, list) else str(given).replace(",", " ").split()
+    numbers = [as_number(word, where) for word in words]
+    wanted = 3 if mode == "rgb" else 1
+    if mode == "mono" and "laser_emission" not in section:
+        return 1.0
+    if len(numbers) != wanted:
+        raise SceneError(f"{where}: expected {wanted} numbers for laser_emission_mode: {mode}, got {given!r}.")
+    return tuple(numbers) if mode == "rgb" else numbers[0]
+
+
+# ---------------------------------------------------------------------------------------------------------- geometry
+
+
+def _geometry(section: Section, folders: Sequence[Path]) -> tuple[Wall, dict[str, Any]]:
+    given = section.get("geometry")
+    if not isinstance(given, list) or not given:
+        raise SceneError(f"y-tal scene: geometry: expected a list of things with a name and a mesh, got {given!r}.")
+    parts = [Section(part, f"y-tal scene: geometry {number}", _GEOMETRY) for number, part in enumerate(given)]
+    names = [part.text("name") for part in parts]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise SceneError(f"y-tal scene: geometry: {', '.join(twice)} stands there more than once; names must differ.")
+    wall_name = section.text("relay_wall")
+    if wall_name not in names:
+        raise SceneError(f"y-tal scene: relay_wall: expected one of {', '.join(names)}, got {wall_name!r}.")
+    shapes = {name: _shape(part, name, folders) for name, part in zip(names, parts, strict=True)}
+    wall = shapes.pop(wall_name)
+    if wall["type"] != "rectangle":
+        raise SceneError(
+            f"y-tal scene: the relay wall {wall_name!r} is of type {wall['type']}; only a rectangle is supported here. "
+            "tt.nlos.Scan.grid((vertices, faces), ...) scans curved walls."
+        )
+    if not shapes:
+        raise SceneError("y-tal scene: geometry: expected a hidden shape beside the relay wall, got none.")
+    return Wall.of(wall), shapes
+
+
+def _shape(part: Section, name: str, folders: Sequence[Path]) -> dict[str, Any]:
+    where = f"y-tal scene: geometry {name!r}"
+    part.where = where
+    kind = part.get("mesh").get("type") if isinstance(part.get("mesh"), Mapping) else None
+    if kind not in ("obj", *_ANALYTIC):
+        raise SceneError(f"{where}: mesh: expected type obj, rectangle or sphere, got {kind!r}.")
+    shape: dict[str, Any] = {"type": kind}
+    mesh = Section(part.get("mesh"), f"{where}: mesh", ("type", "filename") if kind == "obj" else ("type",))
+    if kind == "obj":
+        shape["filename"] = str(file_beside(mesh.text("filename"), folders, f"{where}: mesh"))
+    shape["to_world"] = _placed(part)
+    shape["bsdf"] = material(part.get("material"), f"{where}: material")
+    return shape
+
+
+def _placed(part: Section) -> Any:
+    """Scaled, turned about x, y and z in this order, then moved."""
+    matrix = scale([part.number(f"scale_{axis}", 1.0) for axis in "xyz"])
+    for axis, direction in zip("xyz", ([1, 0, 0], [0, 1, 0], [0, 0, 1]), strict=True):
+        matrix = rotate(direction, part.number(f"rot_degrees_{axis}", 0.0)) @ matrix
+    return translate([part.number(f"displacement_{axis}", 0.0) for axis in "xyz"]) @ matrix
+
+
+# -------------------------------------------------------------------------------------------------------------- scan
+
+
+def _scan(section: Section, wall: Wall) -> Scan:
+    kind = section.choice("scan_type", KINDS, "single")
+    size = section.whole("sensor_width", 256), section.whole("sensor_height", 256)
+    origins: dict[str, Any] = {f"{who}_origin": _origin(section, who) for who in ("sensor", "laser")}
+    legs = section.flag("account_first_and_last_bounces", False)
+    if kind == "single":
+        laser = _looked_at(section, "x", size[0]), _looked_at(section, "y", size[1])
+        return Scan.grid(wall, size, kind=kind, laser=laser, first_and_last_leg=legs, **origins)
+    aperture, laser_size = _aperture(section), _laser_size(section)
+    if kind == "confocal" or _equal_grids(section):
+        if aperture != (0.0, 0.0, 1.0, 1.0) or (laser_size and laser_size != size):
+            raise SceneError(
+                f"y-tal scene: a {kind} scan lights its own sensor points here, {size[0]} x {size[1]} of the whole "
+                f"wall; expected laser_width and laser_height to be the same and no laser_aperture, got {laser_size} "
+                f"over {aperture}. Leave them out, or give an exhaustive scan with simultaneous_scan: false."
+            )
+        return Scan.grid(wall, size, kind=kind, first_and_last_leg=legs, **origins)
+    sensor_points, _ = wall.grid(size)
+    laser_points, _ = wall.grid(laser_size or (32, 32), aperture)
+    return Scan.points(
+        torch.from_numpy(sensor_points), kind=kind, laser_points=torch.from_numpy(laser_points), wall=wall,
+        first_and_last_leg=legs, **origins,
+    )  # fmt: skip
+
+
+def _origin(section: Section, who: str) -> list[float]:
+    return [section.number(f"{who}_{axis}", default) for axis, default in (("x", -0.5), ("y", 0.0), ("z", 0.25))]
+
+
+def _looked_at(section: Section, axis: str, pixels: int) -> float:
+    """Coordinate of the spot on the wall; given in sensor points, which may have decimals, null for the middle."""
+    name = f"laser_lookat_{axis}"
+    value = section.number(name, pixels / 2)
+    if not 0 < value <= pixels:
+        raise SceneError(
+            f"y-tal scene: {name}: expected null, or a number above 0 and at most {pixels}, got {value:g} (y-tal "
+            "takes 0 for null)."
+        )
+    return float(value / pixels)
+
+
+def _laser_size(section: Section) -> tuple[int, int] | None:
+    if "laser_width" not in section and "laser_height" not in section:
+        return None
+    return section.whole("laser_width", 32), section.whole("laser_height", 32)
+
+
+def _aperture(section: Section) -> tuple[float, float, float, float]:
+    names = (("start_x", 0.0), ("start_y", 0.0), ("end_x", 1.0), ("end_y", 1.0))
+    u0, v0, u1, v1 = (float(section.number(f"laser_aperture_{name}", default)) for name, default in names)
+    return u0, v0, u1, v1
+
+
+def _equal_grids(section: Section) -> bool:
+    """Whether an exhaustive scan lights its sensor points, as mitransient does in one launch."""
+    if not section.flag("simultaneous_scan", True):
+        return False
+    if not section.flag("integrator_force_equal_illumination_scanning", True):
+        raise SceneError(
+            "y-tal scene: integrator_force_equal_illumination_scanning: false with simultaneous_scan lays spots out by "
+            "the field of view of the laser, which is not supported. Give simultaneous_scan: false for a grid of "
+            "laser_width x laser_height spots over laser_aperture."
+        )
+    return True

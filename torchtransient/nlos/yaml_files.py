@@ -1,0 +1,168 @@
+"""YAML files as checked plain data: sections whose entries are asked for by name and kind."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchtransient.errors import SceneError, StorageError
+
+_MISSING = object()
+
+
+def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
+    """The mapping of a YAML file, and the folder that it lies in. A text with a line break is YAML itself, in the
+    current folder.
+
+    Read by PyYAML's safe loader: plain data only, nothing is executed. A name that stands twice in a mapping is an
+    error. Raises StorageError for a missing package or file and for what is no YAML, SceneError for what is no mapping.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise StorageError(f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'.") from error
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # the package has no types
+        """Says so where a later entry would silently replace an earlier one."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+            names = [self.construct_object(key, deep=True) for key in own]
+            twice = [str(name) for number, name in enumerate(names) if name in names[:number]]
+            if twice:
+                line = node.start_mark.line + 1
+                raise SceneError(f"{who}: {', '.join(twice)} stands twice in the mapping at line {line}; keep one.")
+            return super().construct_mapping(node, deep)
+
+    text, folder = _text(source, who)
+    try:
+        data = yaml.load(text, Loader=Loader)
+    except yaml.YAMLError as error:
+        raise StorageError(f"{who}: expected YAML, got what cannot be read: {error}.") from error
+    if not isinstance(data, dict):
+        raise SceneError(f"{who}: expected names and values, 'name: value' in each line, got {type(data).__name__}.")
+    return data, folder
+
+
+def _text(source: str | Path, who: str) -> tuple[str, Path]:
+    if isinstance(source, str) and "\n" in source:
+        return source, Path.cwd()
+    path = Path(source)
+    if path.is_dir():
+        # y-tal's experiments are folders that hold a file of their name.
+        path = path / f"{path.resolve().name}.yaml"
+    try:
+        return path.read_text(encoding="utf-8"), path.resolve().parent
+    except (OSError, UnicodeDecodeError) as error:
+        raise StorageError(f"{who}: '{path}' cannot be read: {error}.") from error
+
+
+class Section:
+    """A mapping whose entries are taken out by name. What is wrong is a SceneError that names the entry.
+
+    `known`: all names that may stand there; others are an error that names the nearest one.
+    """
+
+    def __init__(self, data: Any, where: str, known: Iterable[str]):
+        self.where = where
+        if not isinstance(data, Mapping):
+            raise SceneError(f"{where}: expected names and values, got {_shown(data)}.")
+        names = list(known)
+        for name in data:
+            if name not in names:
+                close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
+                hint = f"Did you mean {close[0]!r}? " if close else ""
+                raise SceneError(f"{where}: unknown entry {name!r}. {hint}Known ones are {', '.join(names)}.")
+        self.data = data
+
+    def __contains__(self, name: str) -> bool:
+        return self.data.get(name) is not None
+
+    def get(self, name: str, default: Any = _MISSING) -> Any:
+        """An entry as it is; `default` where it is missing or null. Raises SceneError where there is no default."""
+        value = self.data.get(name)
+        if value is not None:
+            return value
+        if default is _MISSING:
+            raise SceneError(f"{self.where}: expected an entry '{name}', which is missing.")
+        return default
+
+    def number(self, name: str, default: Any = _MISSING) -> Any:
+        """A finite number; `default` as it is."""
+        value = self.get(name, default)
+        return value if name not in self else as_number(value, self._at(name))
+
+    def whole(self, name: str, default: Any = _MISSING, least: int | None = 1) -> Any:
+        """A whole number, at least `least`; `default` as it is."""
+        value = self.get(name, default)
+        if name not in self:
+            return value
+        number = as_number(value, self._at(name))
+        if number != round(number) or (least is not None and number < least):
+            bound = "" if least is None else f" of at least {least}"
+            raise SceneError(f"{self._at(name)}: expected a whole number{bound}, got {_shown(value)}.")
+        return int(number)
+
+    def flag(self, name: str, default: bool) -> bool:
+        """true or false."""
+        value = self.get(name, default)
+        if not isinstance(value, bool):
+            raise SceneError(f"{self._at(name)}: expected true or false, got {_shown(value)}.")
+        return value
+
+    def text(self, name: str, default: Any = _MISSING) -> Any:
+        """A text; `default` as it is."""
+        value = self.get(name, default)
+        if name in self and not isinstance(value, str):
+            raise SceneError(f"{self._at(name)}: expected a text, got {_shown(value)}.")
+        return value
+
+    def choice(self, name: str, choices: Sequence[str], default: Any = _MISSING) -> Any:
+        """One of some texts."""
+        value = self.get(name, default)
+        if value not in choices:
+            raise SceneError(f"{self._at(name)}: expected one of {', '.join(choices)}, got {_shown(value)}.")
+        return value
+
+    def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
+        """A list of finite numbers, as many as one of `counts` says; `default` as it is."""
+        value = self.get(name, default)
+        if name not in self:
+            return value
+        if not isinstance(value, list) or len(value) not in counts:
+            words = " or ".join(map(str, counts))
+            raise SceneError(f"{self._at(name)}: expected a list of {words} numbers, got {_shown(value)}.")
+        return [as_number(entry, self._at(name)) for entry in value]
+
+    def _at(self, name: str) -> str:
+        return f"{self.where}: {name}"
+
+
+def as_number(value: Any, where: str) -> float:
+    """A finite number. YAML 1.1 reads 1e-3 as a text: it counts too. Raises SceneError for others."""
+    number = math.nan
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        with contextlib.suppress(ValueError):
+            number = float(value)
+    if not math.isfinite(number):
+        raise SceneError(f"{where}: expected a finite number, got {_shown(value)}.")
+    return number
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:
+    """The first of `folders` that has a file of that name. Raises SceneError where none does."""
+    for folder in folders:
+        path = folder / name
+        if path.is_file():
+            return path.resolve()
+    looked = ", ".join(f"'{folder}'" for folder in dict.fromkeys(folders))
+    raise SceneError(f"{where}: no file '{name}' in {looked}. Give a path from the folder of the YAML file.")

@@ -1,0 +1,221 @@
+r"""What the derivative of single-corner light gains where hidden things begin to hide each other.
+
+With hidden points ``y`` that follow their shapes, the light of a pixel is an integral over material area,
+
+    I = int  f(y) V(Q, y) ...  dA(y),
+
+and what its interior derivative leaves out is the motion of the outlines: the jumps of the visibility ``V`` from a
+viewpoint ``Q``, a scanned point or a laser spot. An outline is a piece of an edge, and what it hides begins at the
+point ``y`` behind a point ``p`` of it. Seen from ``Q`` the edge moves outwards against ``y`` by the angle
+
+    outwards = n . ((dp - dQ) / |p - Q| - (dy - dQ) / |y - Q|),
+
+with ``n`` across the edge and the line of sight, out of what hides. An angle across is an area of ``y`` times
+``cos_y / |y - Q|^2``, and the length ``dl`` of the edge spans ``|d x t| / |p - Q| dl`` along, so that
+
+    dI = - int  f(y) |y - Q|^2 / cos_y  |d x t| / |p - Q|  outwards  dl
+
+over the outlines seen from ``Q``. Where a spot and the scanned point differ, both are viewpoints, each with the
+visibility from the other one as a factor. (The boundary term of differentiable rendering, Li et al. 2018, in the
+measure of the hidden area.)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.plugins.around_corner.edges import EdgeTable
+from torchtransient.plugins.integrators.launch import Pass
+from torchtransient.plugins.polarized import (
+    light_type,
+    product,
+    rotate_mueller,
+    rotation_from_light,
+    rotation_to_sensor,
+)
+from torchtransient.plugins.sampling.point_sets import plane_point
+from torchtransient.plugins.transport.carry import total_of
+from torchtransient.plugins.transport.derivative.forward import tangents_of
+from torchtransient.plugins.transport.strategy import Local
+
+# How far beside an edge one looks past it, and by how much what is seen may be nearer than the edge: parts of the
+# distance.
+BESIDE, BEFORE = 1e-4, 1e-5
+# Cosines under which a surface is seen edge-on.
+EDGE_ON = 1e-4
+BOUNCES = 3
+
+
+class MutualOcclusion:
+    """The boundary term of a job, to be added by ``backward`` or ``forward``.
+
+    ``integrator``: of the job, for its primary rays; ``edges``: where outlines can be; ``spots``: the connection to the
+    laser's spots; ``jobs``: launches with as many edge samples a pixel and viewpoint as they say. All lanes of a launch
+    are one kernel without a loop, whose memory does not grow with their number.
+
+    Light of three bounces alone; hidden surfaces scatter by their BSDF's smooth lobes.
+    """
+
+    def __init__(self, integrator: Any, world: Any, sensor: Any, film: Any, edges: EdgeTable, spots: Any, jobs: Any):
+        self.integrator, self.world, self.sensor, self.film = integrator, world, sensor, film
+        self.edges, self.spots, self.jobs = edges, spots, jobs
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters."""
+        return [end for end in self.edges.ends if dr.grad_enabled(end)]
+
+    # ------------------------------------------------------------------------------------------ both modes
+
+    def backward(self, incoming: Any) -> None:
+        """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
+        for job in self.jobs:
+            rays = self._start(job)
+            match = self.integrator.channel_match(self.film, rays)
+            _, pixel = self.integrator.pixel_indices(self.film, job, rays)
+            block = incoming.block(rays, pixel, match)
+            with dr.resume_grad():
+                objective = mi.Float(0)
+                for term in self._terms(rays, pixel, job):
+                    A, _ = block.read(term.opl, term.active)
+                    objective += dr.select(term.active, total_of(A, term.value) * term.outwards, 0)
+                if dr.grad_enabled(objective):
+                    dr.backward_from(objective)
+            dr.eval()
+
+    def forward(self) -> None:
+        """Add to the film, along the tangents of the tables and of the scene."""
+        film = self.film
+        for job in self.jobs:
+            rays = self._start(job)
+            match = self.integrator.channel_match(film, rays)
+            base, pixel = self.integrator.pixel_indices(film, job, rays)
+            block = film.create_block(job, base, match, 2, tangents=True)
+            with dr.resume_grad():
+                terms = self._terms(rays, pixel, job)
+                tangents = tangents_of([term.outwards for term in terms])
+            events, total = block.begin(), light_type()(0)
+            for term, outwards in zip(terms, tangents, strict=True):
+                value = dr.select(term.active, term.value * outwards, 0)
+                block.put_slope(events, term.opl, value, light_type()(0), term.active)
+                total += value
+            block.end(events)
+            film.add_steady(pixel, match.to_channels(total))
+            block.finish()
+            dr.eval(film.bands[job.band][2], film.steady)
+
+    def _start(self, job: Pass) -> Any:
+        world = self.world
+        rays = self.integrator.start(world.scene, world.contents, self.sensor, self.film, job)
+        world.start(rays)
+        return rays
+
+    # --------------------------------------------------------------------------------------------- the terms
+
+    def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
+        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl``, ``active``."""
+        world = self.world
+        ray = dr.detach(rays.ray)
+        leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
+        seen = leg.compute_surface_interaction(rays.ray, mi.RayFlags.All)
+        found = seen.is_valid()
+        lit = self.spots.spot(ray.wavelengths, found)
+        found &= lit.is_valid()
+        place = Local(seen=dr.detach(seen), lit=dr.detach(lit), seen_at=seen.p, lit_at=lit.p, ray=ray, found=found)
+        place.before = self.integrator.first_opl(self.film, rays)
+        if not world.camera_unwarp:
+            place.before += mi.Float64(dr.norm(place.seen.p - ray.o) * dr.detach(rays.η))
+        place.before += mi.Float64(dr.detach(self.spots.leg(found)))
+        place.η = dr.detach(rays.η)
+        edge = self._edge_point(pixel, job)
+        views = [self._term(place, edge, from_spot=False)]
+        if not self.spots.confocal:
+            views.append(self._term(place, edge, from_spot=True))
+        return views
+
+    def _edge_point(self, pixel: Any, job: Pass) -> Local:
+        """A point of an edge: ``p`` (attached), ``t`` (the edge's direction), ``sides`` (third corners of its faces),
+        ``weight`` (one over the density by length).
+        """
+        lane = dr.arange(mi.UInt32, dr.width(pixel))
+        number = lane - lane // dr.opaque(mi.UInt32, job.spp) * dr.opaque(mi.UInt32, job.spp)
+        # Every pixel has points of its own.
+        seed, _ = mi.sample_tea_32(mi.UInt32(job.seed), pixel)
+        x, u = plane_point(number, job.spp, seed)
+        index, per_edge = self.edges.sample(x)
+        a, b = self.edges.end_points(index)
+        along = dr.detach(b) - dr.detach(a)
+        length = dr.norm(along)
+        p, sides = dr.lerp(a, b, u), self.edges.third_corners(index)
+        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length * per_edge)
+
+    def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
+        """The boundary term of one viewpoint."""
+        scene = self.world.scene
+        viewer, Q = (place.lit, place.lit_at) if from_spot else (place.seen, place.seen_at)
+        with dr.suspend_grad():
+            d = edge.at - viewer.p
+            distance = dr.norm(d)
+            d /= distance
+            across = dr.cross(edge.t, d)
+            spans = dr.norm(across)
+            n = across / spans
+            here, there = (dr.dot(n, side - edge.at) for side in edge.sides)
+            active = place.found & (spans > 0) & (here * there > 0)
+            n = dr.select(here > 0, -n, n)
+            past = viewer.spawn_ray(dr.normalize(d + n * BESIDE))
+            behind = scene.ray_intersect_preliminary(past, active=active)
+        y = behind.compute_surface_interaction(past, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+        with dr.suspend_grad():
+            si = dr.detach(y)
+            beyond = dr.norm(si.p - viewer.p)
+            active &= si.is_valid() & (beyond > distance * (1 - BEFORE))
+            value, opl, active = self._light(place, si, from_spot, active)
+            weight = -edge.weight * spans / distance
+            if not self.spots.confocal:
+                weight *= self._seen_otherwise(
+                    place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active
+                )
+            value *= dr.select(active, weight, 0)
+        outwards = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
+        return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
+
+    def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
+        """(light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some)."""
+        world, seen, lit = self.world, dr.copy(place.seen), place.lit
+        to_hidden, to_spot = si.p - seen.p, lit.p - si.p
+        r_seen, r_spot = dr.norm(to_hidden), dr.norm(to_spot)
+        d_seen, d_spot = to_hidden / r_seen, to_spot / r_spot
+        cos_seen, cos_spot = dr.abs_dot(si.n, d_seen), dr.abs_dot(si.n, d_spot)
+        active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
+        at_wall = self._scattered(seen, place.ray.d, d_seen, active)
+        hidden = self._scattered(si, d_seen, d_spot, active)
+        light = self.spots.light(lit, d_spot, active)
+        value = product(at_wall, product(hidden, light))
+        # The cosine towards the spot is in the BSDF's value.
+        measure = dr.rcp(dr.square(r_spot)) if not from_spot else cos_seen / (cos_spot * dr.square(r_seen))
+        opl = place.before + mi.Float64((r_seen + r_spot) * place.η)
+        active = world.counted(active, opl)
+        return dr.select(active, value * measure, 0), opl, active
+
+    def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
+        """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).
+
+        The mean of both sides of the outline, ``d`` pointing to the one that is hidden: where a spot, a scanned point
+        and an edge lie in one plane, both viewpoints have the same outline, which counts once and not twice.
+        """
+        hidden = dr.copy(si)
+        hidden.p = mi.Point3f(viewer.p + d * (dr.dot(si.n, si.p - viewer.p) / dr.dot(si.n, d)))
+        tests = [self.world.scene.ray_test(at.spawn_ray_to(other.p), active) for at in (si, hidden)]
+        return sum(dr.select(hit, mi.Float(0), 0.5) for hit in tests)
+
+    def _scattered(self, si: Any, into: Any, out: Any, active: Any) -> Any:
+        """Value of the BSDF between the frames of the segments: the ray of direction ``into`` goes on by ``out``."""
+        si.wi = si.to_local(-into)
+        wo = si.to_local(out)
+        bsdf = si.bsdf()
+        value = bsdf.eval(mi.BSDFContext(), si, wo, active)
+        value = self.world.scattering.correct_two_sided(self.world, bsdf, si, wo, value)
+        return rotate_mueller(value, rotation_to_sensor(si, into), rotation_from_light(si, wo, out, out))

@@ -1,0 +1,151 @@
+"""Whether a job of derivatives needs the boundary term of mutual occlusion, and what of it cannot be computed."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.errors import GradientError, TorchTransientWarning
+from torchtransient.plugins.around_corner.edges import EdgeTable
+from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
+from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
+from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.parameter_effect import CORRECT
+from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.transport.segment.material import MaterialVacuum
+
+# Edge samples of a pixel and viewpoint, as a share of its paths.
+SHARE = 4
+# Viewpoints that the density of edges is made for.
+MOST_REFERENCES = 25
+_SEED = 0x85EBCA6B
+
+
+def follows_outlines(segment: type, contents: Any) -> bool:
+    """Whether outlines are followed in derivatives: where hidden points are points of their shapes (``segment``), and
+    nothing scatters late.
+    """
+    return issubclass(segment, MaterialVacuum) and contents.delays is None
+
+
+def silhouettes(least: int, most: int, exhaustive: bool) -> str:
+    """What the table of parameters says of moving silhouettes where outlines are followed, for light of ``least`` to
+    ``most`` bounces.
+    """
+    lacking = []
+    if least <= BOUNCES <= most and not exhaustive:
+        lacking = ["behind shapes without triangles", "where bodies run into each other"]
+    if least <= BOUNCES <= most and exhaustive:
+        lacking = ["where one hidden part may hide another (refused)"]
+    if most > BOUNCES:
+        lacking += ["in light of more than three bounces where one part hides another"]
+    return f"correct except {', '.join(lacking)} (no boundary term)" if lacking else CORRECT
+
+
+class Viewpoints:
+    """Where hidden things are seen from: the scanned points and the laser's spots that there are, ``p, n`` (P, 3), of
+    the former and of the latter; ``shapes``: registry numbers of what they lie on.
+    """
+
+    def __init__(self, scanned: Any, spots: Any, confocal: bool) -> None:
+        found = [_visible(scanned)] + ([] if confocal else [_visible(spots)])
+        self.p, self.n = (np.concatenate([one[i] for one in found]) for i in range(2))
+        # As many times as there are scanned points that stand for a scan, a single spot counts.
+        few = [np.unique(np.linspace(0, len(one[0]) - 1, MOST_REFERENCES).astype(int)) for one in found if len(one[0])]
+        picked = [np.resize(rows, MOST_REFERENCES) for rows in few]
+        first = np.cumsum([0, *(len(one[0]) for one in found if len(one[0]))])
+        index = np.concatenate([rows + start for rows, start in zip(picked, first, strict=False)]) if few else []
+        self.references = np.asarray(index, dtype=int)
+        self.shapes = set(np.unique(np.concatenate([one[2] for one in found])).tolist())
+
+
+def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places, normals towards the viewer and shapes of those interactions that hit something."""
+    valid = np.array(si.is_valid())
+    n = dr.select(si.wi.z < 0, -si.n, si.n)
+    numbers = np.array(dr.reinterpret_array(mi.UInt32, si.shape))
+    return np.array(si.p, dtype=np.float64).T[valid], np.array(n, dtype=np.float64).T[valid], numbers[valid]
+
+
+def mutual_occlusion(
+    integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
+) -> MutualOcclusion | None:
+    """The boundary term of a job, None where nothing that moves can change what hides what, or where outlines are not
+    followed.
+
+    ``scanned``: preliminary intersections of the scanned points. ``spp``: of the job, 0 for the sampler's own; there
+    is an edge sample for every ``SHARE`` paths. Raises GradientError in exhaustive captures, where every pair of
+    positions would have outlines of its own; warns where something that has no edges may hide another thing.
+    """
+    wanted = world.wanted
+    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)):
+        return None
+    if not world.min_depth <= BOUNCES <= world.max_depth:
+        return None
+    moves_viewpoints = wanted.sensor or wanted.light
+    if not (moves_viewpoints or wanted.shapes):
+        return None
+    (spots,) = world.connections
+    viewpoints = Viewpoints(scanned, dr.detach(spots.spots.si), spots.confocal)
+    shapes = list(world.scene.shapes())
+    moving = {k for k, shape in enumerate(shapes) if shape.ptr in wanted.shapes}
+    moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
+    parts, triangles = parts_of(shapes)
+
+    def of_interest(i: int, j: int) -> bool:
+        return bool(moves_viewpoints or moving & parts[i].shapes or moving & parts[j].shapes)
+
+    pairs = hiding_pairs(parts, viewpoints.p, of_interest)
+    if not pairs:
+        return None
+    if film.exhaustive_scan:
+        raise GradientError(_refusal(shapes, parts, pairs))
+    _warn_of_limbs(shapes, parts, pairs)
+    hiders = sorted({i for i, _ in pairs if parts[i].edges is not None and len(parts[i].edges.ends)})
+    if not hiders:
+        return None
+    rows = viewpoints.references
+    edges = EdgeTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
+    sampler = sensor.sampler().clone()
+    count = spp or sampler.sample_count()
+    own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
+    jobs, _ = passes_of(sampler, film, own_seed, max(1, count // SHARE), 2)
+    return MutualOcclusion(integrator, world, sensor, film, edges, spots, jobs)
+
+
+def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:
+    """Up to three of the pairs in words."""
+
+    def name(part: Part) -> str:
+        return " and ".join(repr(shapes[k].id() or shapes[k].class_name()) for k in sorted(part.shapes))
+
+    words = [
+        f"{name(parts[i])} hides another part of itself" if name(parts[i]) == name(parts[j])
+        else f"{name(parts[i])} hides {name(parts[j])}"
+        for i, j in pairs
+    ]  # fmt: skip
+    words = list(dict.fromkeys(words))
+    return ", ".join(words[:3]) + (f", and {len(words) - 3} more" if len(words) > 3 else "")
+
+
+def _refusal(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> str:
+    return (
+        "transient_nlos_path: the derivative by geometry of an exhaustive capture lacks the boundary term of outlines, "
+        f"and some may move over what they hide ({_names(shapes, parts, pairs)}). Take the derivative of a single or "
+        "confocal capture, or of a scene in which nothing can hide another thing from the relay wall."
+    )
+
+
+def _warn_of_limbs(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -> None:
+    limbs = [(i, j) for i, j in pairs if parts[i].edges is None]
+    if limbs:
+        warnings.warn(
+            "transient_nlos_path: outlines of shapes without triangles have no edges, and the derivative lacks what "
+            f"changes behind them ({_names(shapes, parts, limbs)}). Use a mesh in place of the shape that hides.",
+            TorchTransientWarning,
+            stacklevel=2,
+        )

@@ -1,0 +1,181 @@
+"""Triangle meshes as arrays: vertices float64 (V, 3) in metres and faces int64 (F, 3), against the clock as seen from
+outside. `triangle_mesh` makes shapes of scene dictionaries of them; nothing is written to disk.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.scenes.parts import SceneDict, count, diffuse, positive
+from torchtransient.scenes.transforms import Matrix, Triple
+
+Vertices = NDArray[np.float64]
+Faces = NDArray[np.int64]
+Mesh = tuple[Vertices, Faces]
+
+
+def triangle_mesh(
+    vertices: Any, faces: Any, reflectance: float | tuple[float, float, float] = 0.5, to_world: Matrix | None = None
+) -> SceneDict:
+    """A diffuse shape of a scene dictionary, `mesh_arrays`, made of `vertices` (V, 3) and `faces` (F, 3).
+
+    Its key `<name>.vertex_positions` is a parameter of the scene, (V, 3) in world space. Raises ShapeError for other
+    shapes and for faces of vertices that are not there.
+    """
+    points, triangles = np.array(vertices, dtype=np.float64), np.array(faces)
+    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise ShapeError(
+            f"triangle_mesh: expected vertices (V, 3) and faces (F, 3), got {points.shape} and {triangles.shape}"
+        )
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(points):
+        raise ShapeError(f"triangle_mesh: expected faces of vertices 0 to {len(points) - 1}, got others or none")
+    shape: SceneDict = {
+        "type": "mesh_arrays",
+        "vertices": points,
+        "faces": triangles.astype(np.int64),
+        "bsdf": diffuse(reflectance),
+    }
+    if to_world is not None:
+        shape["to_world"] = to_world
+    return shape
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    """Several meshes as one; their triangles keep their order."""
+    vertices, faces, start = [], [], 0
+    for points, triangles in meshes:
+        vertices.append(points)
+        faces.append(triangles + start)
+        start += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def plate(width: float, height: float, center: Triple = (0.0, 0.0, 0.0), cells: int = 1) -> Mesh:
+    """A rectangle across z that faces -z, of `cells` x `cells` pairs of triangles."""
+    n = count("cells", cells)
+    x = np.linspace(-0.5, 0.5, n + 1) * positive("width", width)
+    y = np.linspace(-0.5, 0.5, n + 1) * positive("height", height)
+    rows, columns = np.meshgrid(y, x, indexing="ij")
+    vertices = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3) + np.asarray(center)
+    i = np.arange(n * (n + 1)).reshape(n, n + 1)[:, :n].ravel()
+    lower, upper = np.stack([i, i + n + 1, i + 1], axis=1), np.stack([i + 1, i + n + 1, i + n + 2], axis=1)
+    return vertices, np.concatenate([lower, upper])
+
+
+def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
+    """A closed ellipsoid along the axes: an icosahedron whose triangles are split in four `level` times, 20 4^level of
+    them, with all vertices on the surface.
+    """
+    golden = (1 + 5**0.5) / 2
+    a, b = 1.0, golden
+    corners = [[-a, b, 0], [a, b, 0], [-a, -b, 0], [a, -b, 0], [0, -a, b], [0, a, b], [0, -a, -b], [0, a, -b],
+               [b, 0, -a], [b, 0, a], [-b, 0, -a], [-b, 0, a]]  # fmt: skip
+    vertices = np.array(corners, dtype=np.float64)
+    edge = np.linalg.norm(vertices[0] - vertices[1])
+    faces = _triangles_of_edges(vertices, edge)
+    for _ in range(level):
+        vertices, faces = subdivided((vertices, faces))
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices * np.asarray(radii, dtype=np.float64) + np.asarray(center, dtype=np.float64), faces
+
+
+def subdivided(mesh: Mesh, times: int = 1) -> Mesh:
+    """Every triangle as four, with a vertex in the middle of every edge; neighbours keep sharing theirs."""
+    vertices, faces = mesh
+    for _ in range(times):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        unique, place = np.unique(edges, axis=0, return_inverse=True)
+        ab, bc, ca = len(vertices) + place.reshape(3, -1)
+        vertices = np.concatenate([vertices, vertices[unique].mean(1)])
+        a, b, c = faces.T
+        parts = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+        faces = np.concatenate([np.stack(part, axis=1) for part in parts])
+    return vertices, faces
+
+
+def sheet(outline: Any, z: float = 0.0) -> Mesh:
+    """A flat polygon across z that faces -z. `outline` (N, 2): its corners (x, y) against the clock, x to the right and
+    y up; simple, not crossing itself. Raises SceneError for others.
+    """
+    points = np.asarray(outline, dtype=np.float64)
+    faces = triangulated(points)[:, ::-1]
+    return np.column_stack([points, np.full(len(points), float(z))]), faces.copy()
+
+
+def solid(outline: Any, z: float, thickness: float) -> Mesh:
+    """The closed body between `sheet` at `z` and the same polygon at `z + thickness`. Errors as `sheet`."""
+    front, faces = sheet(outline, z)
+    n = len(front)
+    back = front + np.array([0.0, 0.0, positive("thickness", thickness)])
+    here, there = np.arange(n), (np.arange(n) + 1) % n
+    sides = [np.stack([here, there, there + n], axis=1), np.stack([here, there + n, here + n], axis=1)]
+    return np.concatenate([front, back]), np.concatenate([faces, faces[:, ::-1] + n, *sides])
+
+
+def triangulated(outline: Vertices) -> Faces:
+    """Triangles (N - 2, 3) of a simple polygon (N, 2) given against the clock, by cutting ears (Meisters 1975)."""
+    if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3:
+        raise ShapeError(f"outline: expected at least three corners (N, 2), got shape {outline.shape}")
+    x, y = outline.T
+    if not float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) > 0:
+        raise SceneError("outline: expected corners against the clock, with x to the right and y up")
+    if _crosses_itself(outline):
+        raise SceneError("outline: expected a polygon that does not cross or touch itself")
+    left, triangles = list(range(len(outline))), []
+    while len(left) > 3:
+        for k in range(len(left)):
+            before, corner, after = left[k - 1], left[k], left[(k + 1) % len(left)]
+            others = outline[[i for i in left if i not in (before, corner, after)]]
+            if _is_ear(*outline[[before, corner, after]], others):
+                triangles.append((before, corner, after))
+                del left[k]
+                break
+        else:
+            raise SceneError("outline: expected corners that are not all in a row, got some without an area")
+    return np.array([*triangles, tuple(left)], dtype=np.int64)
+
+
+def _crosses_itself(outline: Vertices) -> bool:
+    """Whether two edges that are not neighbours meet."""
+    n = len(outline)
+    starts, ends = outline, np.roll(outline, -1, axis=0)
+    for i in range(n):
+        j = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=np.int64)
+        a, b, c, d = starts[i], ends[i], starts[j], ends[j]
+        apart = _turn(a, b, c) * _turn(a, b, d) > 0
+        # How the edge's own ends lie to each of the others.
+        first = (d - c)[:, 0] * (a - c)[:, 1] - (d - c)[:, 1] * (a - c)[:, 0]
+        second = (d - c)[:, 0] * (b - c)[:, 1] - (d - c)[:, 1] * (b - c)[:, 0]
+        beside = np.minimum(a, b) > np.maximum(c, d)
+        before = np.maximum(a, b) < np.minimum(c, d)
+        if bool(np.any(~apart & ~(first * second > 0) & ~(beside | before).any(1))):
+            return True
+    return False
+
+
+def _is_ear(a: Vertices, b: Vertices, c: Vertices, others: Vertices) -> bool:
+    if not _turn(a, b, c) > 0:
+        return False
+    inside = (_turn(a, b, others) >= 0) & (_turn(b, c, others) >= 0) & (_turn(c, a, others) >= 0)
+    return not bool(np.any(inside))
+
+
+def _turn(a: Vertices, b: Vertices, c: Vertices) -> Any:
+    return (b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0])
+
+
+def _triangles_of_edges(vertices: Vertices, edge: float) -> Faces:
+    """All triples of vertices that are one edge apart, wound outward about the origin."""
+    near = np.abs(np.linalg.norm(vertices[:, None] - vertices, axis=-1) - edge) < 1e-9 * edge
+    n = len(vertices)
+    triples = [(i, j, k) for i in range(n) for j in range(i + 1, n) for k in range(j + 1, n)]
+    found = np.array([t for t in triples if near[t[0], t[1]] and near[t[1], t[2]] and near[t[2], t[0]]])
+    a, b, c = (vertices[found[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * a).sum(1) < 0
+    found[inward] = found[inward][:, ::-1]
+    return found.astype(np.int64)
