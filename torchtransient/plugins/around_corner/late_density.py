@@ -15,6 +15,8 @@ from torchtransient.plugins.transport.strategy import Local
 # Points of the pilot, and how many of them a weight is the mean of.
 _POINTS, _BUCKET = 2**15, 64
 _SEED = 0x70696C6F
+# Share of the density before: light of more bounces comes from elsewhere, too, and must not weigh much.
+_BEFORE = 0.4
 
 
 def late_density(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> HiddenElements:
@@ -66,5 +68,6 @@ def _smoothed(elements: HiddenElements, square: np.ndarray, area: np.ndarray, el
     bucket = (np.cumsum(drawn) - drawn) // _BUCKET
     total, covered = (np.bincount(bucket, np.bincount(element, w, size)) for w in (square * area, area))
     rms = np.sqrt(total / np.where(covered > 0, covered, 1))
-    # As far as numbers of single precision carry it.
-    return (rms / max(rms.max(), 1e-300))[bucket][None] * elements.elements.area
+    learned = (rms / max(rms.max(), 1e-300))[bucket] * elements.elements.area
+    before = elements.probabilities[0]
+    return (learned * ((1 - _BEFORE) / max(learned.sum(), 1e-300)) + _BEFORE * before / before.sum())[None]
