@@ -1,4 +1,4 @@
-"""Third-bounce light of a whole scan from shared samples: what it needs of a scene, and when it is possible."""
+"""Light of a whole scan from shared samples and chains: what it needs of a scene, and when it is possible."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ import numpy as np
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.attached import ends_of_points, ends_of_samples
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
+from torchtransient.plugins.around_corner.late_density import late_density
+from torchtransient.plugins.around_corner.late_light import LateLight
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -144,6 +147,15 @@ def moves_scan(world: Any, hidden: list[Any]) -> bool:
 def _rows(vectors: Any, width: int) -> np.ndarray:
     """(width, 3), detached."""
     return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
+
+
+def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
+    """Add the light of these bounces (first, last) to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
+    ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
+    """
+    elements = late_density(scene, job.elements, *reference_points(scene, sensor))
+    film_job = ScanJob(scene, film, job.light.sensors, job.light.energy, run.progress)
+    LateLight(film_job, elements, job.light.spots, job.capture, bounces).add(run.samples, run.seed)
 
 
 class SharedThirdBounce:
