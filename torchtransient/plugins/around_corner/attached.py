@@ -36,8 +36,8 @@ class Ends:
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
     def detached(self) -> Ends:
-        """The same without derivatives. A virtual call attaches what it returns as soon as any plugin is attached that it
-        could have gone to: fields may be attached that nothing moves.
+        """The same without derivatives. A virtual call attaches what it returns as soon as any plugin is attached that
+        it could have gone to: fields may be attached that nothing moves.
         """
         return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
