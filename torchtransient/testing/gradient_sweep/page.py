@@ -36,10 +36,10 @@ differences, in scenes in which no silhouette moves but in captures around a cor
 outline of what is hidden. Written by `make sweep`
 (`torchtransient/testing/gradient_sweep`); the numbers are in [{DATA}]({DATA}) too.
 
-- The loss is the transient of 4 x 4 pixels (exhaustive captures: 2 x 2, with 2 x 2 laser positions) weighed by a sine of the optical path length. What is differentiated is the
-  loss along one fixed direction in the entries of a parameter: a change by its own size (textures and grids: another
-  one in each entry; normals: by a fifth); poses and positions along two directions, a metre and a fifth of a radian,
-  inside others along one of the two.
+- The loss is the transient of 4 x 4 pixels (exhaustive captures: 2 x 2, with 2 x 2 laser positions) weighed by a sine
+  of the optical path length. What is differentiated is the loss along one fixed direction in the entries of a
+  parameter: a change by its own size (textures and grids: another one in each entry; normals: by a fifth); poses and
+  positions along two directions, a metre and a fifth of a radian, inside others along one of the two.
 - Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
 - *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
   and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.

@@ -64,9 +64,7 @@ def panel() -> Description:
 # ------------------------------------------------------------------------------------------------------------ scans
 
 
-def scan(
-    kind: str, hidden: Description, legs: bool = True, tabulated: bool = False, **integrator: Any
-) -> Description:
+def scan(kind: str, hidden: Description, legs: bool = True, tabulated: bool = False, **integrator: Any) -> Description:
     """A capture of ``hidden``, shapes by name. ``legs``: the ways from the laser and to the sensor count.
     ``tabulated``: points, laser points and the laser's origin are given, in place of a grid over the wall.
     """
