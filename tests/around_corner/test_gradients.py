@@ -110,6 +110,18 @@ def test_shared_samples(case, kind):
         assert abs(reverse) > 1e-3 * scale
 
 
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_pose_of_the_laser(kind):
+    """It moves the spot of a single capture, and the first leg of any."""
+    scene = scan_scene(plate(), kind, film(3, **SMOOTH), account_first_and_last_bounces=True)
+    capture = Capture(scene, "laser.to_world", move(1, 0, 0))
+    spp = 2**14
+    reverse = capture.reverse(0, spp)
+    assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
+    assert reverse == pytest.approx(np.mean([capture.difference(4e-3, seed, spp) for seed in range(3)]), rel=2e-3)
+    assert abs(reverse) > 1e-3 * abs(capture.loss(0.0, 0, spp))
+
+
 @pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
 @pytest.mark.parametrize("case", ["depth", "sideways", "albedo", "albedo of the wall", "the wall"])
 def test_general_paths(case, kind):
