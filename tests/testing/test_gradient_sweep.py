@@ -174,6 +174,10 @@ def test_verdicts(reverse, differences, noise, expected):
     assert compare.verdict(runs(reverse, differences, noise), reverse, reverse) == expected
 
 
+def test_a_black_picture_proves_nothing():
+    assert compare.verdict(runs(0.0, 0.0, scale=0.0), 0.0, 0.0) == "no effect"
+
+
 def test_modes_that_differ():
     assert compare.verdict(runs(1.0, 1.0, 1e-3), 1.01, 1.0) == "modes differ"
 

@@ -128,7 +128,7 @@ class Runs:
     def is_nothing(self) -> bool:
         """Whether there is no effect, up to a small part of the scale."""
         error = self.error_of(self.differences)
-        small = max(abs(float(self.reverse.mean())), error) < RESOLVED * self.scale
+        small = max(abs(float(self.reverse.mean())), error) <= RESOLVED * self.scale
         return small and abs(float(self.differences.mean())) <= 3 * error + ROUNDING * RESOLVED * self.scale
 
     @property

@@ -155,11 +155,11 @@ def _other_light() -> Iterator[Capture]:
     yield Capture("confocal", "", _of("confocal", plate), variant="llvm_ad_spectral")
     fog = {
         "type": "cube",
-        "to_world": move(z=0.7) @ stretch(3.0, 3.0, 0.1),
+        "to_world": move(z=0.76) @ stretch(3.0, 3.0, 0.04),
         "bsdf": {"type": "null"},
-        "interior": {"type": "homogeneous", "sigma_t": 0.5, "albedo": 0.6, "phase": {"type": "hg", "g": 0.3}},
+        "interior": {"type": "homogeneous", "sigma_t": 4.0, "albedo": 0.6, "phase": {"type": "hg", "g": 0.3}},
     }
-    # Outlines are not followed in media.
+    # Between the plate and what stands before the wall. Outlines are not followed in media.
     thick = _of("single", plate, {"fog": fog}, max_depth=4)
     yield Capture("single", "fog", thick, ("fog.interior_medium.", "laser.energy.", "wall.bsdf.", "plate.bsdf."))
     projector = {"type": "projector", "irradiance": rgb(10.0, 8.0, 6.0), "fov": 0.2}
