@@ -267,13 +267,35 @@ def test_wrong_parameters(name):
         captures(scan_scene({"a": plane()}, film=film(), **settings), 4, 1)
 
 
-def test_what_cannot_be_shared_says_why():
-    for hidden, words in (
-        ({"a": plane() | {"bsdf": {"type": "conductor"}}}, "diffuse"),
-        ({"a": plane(), "c": {"type": "bsplinecurve", "control_points": []}}, ""),
-    )[:1]:
-        with pytest.raises(SceneError, match=words):
-            captures(scan_scene(hidden, third_bounce="shared"), 4, 1)
+FOG = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+INSTANCE = {
+    "group": {"type": "shapegroup", "inner": {"type": "rectangle"}},
+    "copy": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
+}
+NOT_SHARED = {
+    "metal": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "conductor"}}}, "not all surfaces are diffuse"),
+    "glass": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "thindielectric"}}}, "not all surfaces are diffuse"),
+    "a mask": (lambda: {"b": plane() | {"bsdf": {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}}}, "mixtures"),
+    "fog": (lambda: {"b": FOG}, "media"),
+    "instances": (lambda: INSTANCE, "cannot be drawn on copy"),
+    "delays": (lambda: {"b": plane() | {"bsdf": {"type": "delayed", "lifetime": 0.3, "b": {"type": "diffuse"}}}}, "late"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOT_SHARED)
+def test_what_cannot_be_shared_says_why(name):
+    """It is an error where it was asked for, and otherwise comes from paths."""
+    make, words = NOT_SHARED[name]
+    with pytest.raises(SceneError, match=words):
+        captures(scan_scene({"a": plane()} | make(), third_bounce="shared"), 4, 1)
+    assert captures(scan_scene({"a": plane()} | make()), 64, 1).sum() > 0
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_variants_that_cannot_be_shared(variant):
+    mi.set_variant(variant)
+    with pytest.raises(SceneError, match=variant):
+        captures(scan_scene({"a": plane()}, third_bounce="shared"), 4, 1)
 
 
 def test_a_beam_is_seen_by_its_own_integrator_alone():

@@ -97,6 +97,9 @@ class TransientNLOSPath(base.TransientIntegrator):
     confocal ones, whose spots lie at pixel centres).
 
     Gradients in both modes as in :class:`TransientIntegrator`.
+
+    Not supported: light that comes from the spot through smooth glass or by way of a mirror, which no connection finds
+    (as that of point lights elsewhere).
     """
 
     walks_through_media = True
