@@ -20,6 +20,7 @@ from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBou
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.sampling.area_elements import AreaElements
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -42,17 +43,20 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     others = [bsdf.id() or bsdf.class_name() for bsdf in contents.bsdfs if not is_lambertian(bsdf)]
     if others:
         return f"not all surfaces are diffuse ({', '.join(others[:3])})"
-    table = elements_of(scene, sensor, includes_wall=False)
-    if table.left_out:
-        return f"points cannot be drawn on {', '.join(table.left_out[:3])}"
+    left_out = AreaElements.of(_hidden(scene, sensor, includes_wall=False)).left_out
+    if left_out:
+        return f"points cannot be drawn on {', '.join(left_out[:3])}"
     return None
 
 
 def elements_of(scene: Any, sensor: Any, includes_wall: bool) -> HiddenElements:
     """The table of hidden elements; of the relay wall as well where it is asked for."""
+    return HiddenElements(_hidden(scene, sensor, includes_wall), *reference_points(scene, sensor))
+
+
+def _hidden(scene: Any, sensor: Any, includes_wall: bool) -> list[Any]:
     wall = None if includes_wall else sensor.get_shape()
-    hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-    return HiddenElements(hidden, *reference_points(scene, sensor))
+    return [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
 
 
 def wall_lights_itself(sensor: Any) -> bool:
