@@ -69,7 +69,8 @@ class DampedMotion(Local):
         return self.drag - self.fixed * dr.dot(n, self.drag) * self.per_cos
 
     def longer(self, n=None):
-        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point."""
+        """Zero with the derivative of the length: what is due to the vertex, and with ``n`` to the slide of the point.
+        """
         if n is None:
             return -dr.dot(self.δ, self.fixed)
         return -dr.dot(self.δ, self.stays * self.fixed + (1 - self.stays) * self.per_cos * n)
