@@ -55,9 +55,12 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
 
 def elements_of(scene: Any, sensor: Any, includes_wall: bool) -> HiddenElements:
     """The table of hidden elements; of the relay wall as well where it is asked for."""
+    return HiddenElements(_hidden(scene, sensor, includes_wall), *reference_points(scene, sensor))
+
+
+def _hidden(scene: Any, sensor: Any, includes_wall: bool) -> list[Any]:
     wall = None if includes_wall else sensor.get_shape()
-    hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-    return HiddenElements(hidden, *reference_points(scene, sensor))
+    return [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
 
 
 def wall_lights_itself(sensor: Any) -> bool:
