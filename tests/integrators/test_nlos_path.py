@@ -37,11 +37,19 @@ HIDDEN = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("hidden", HIDDEN)
+QUICK = {("a corner", "confocal"), ("a ball before a plane", "single"), ("plastic", "confocal")}
+MATRIX = [
+    pytest.param(hidden, kind, marks=[] if (hidden, kind) in QUICK else [pytest.mark.slow])
+    for hidden in HIDDEN
+    for kind in ("confocal", "single")
+]
+
+
+@pytest.mark.parametrize(("hidden", "kind"), MATRIX)
 def test_hidden_geometry_sampling_is_unbiased(hidden, kind):
     """Paths that draw points over the hidden area, against paths that follow the BSDFs alone."""
-    guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, third_bounce="paths"), 1024, 8)
+    paths = {"third_bounce": "paths", "late_light": "paths"}
+    guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, **paths), 1024, 8)
     brute = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, nlos_hidden_geometry_sampling=False), 4096, 8)
     agree(guided, brute, 0.02)
 
@@ -272,13 +280,15 @@ INSTANCE = {
     "group": {"type": "shapegroup", "inner": {"type": "rectangle"}},
     "copy": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
 }
+HALF = {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}
+LATE = {"type": "delayed", "lifetime": 0.3, "b": {"type": "diffuse"}}
 NOT_SHARED = {
     "metal": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "conductor"}}}, "not all surfaces are diffuse"),
     "glass": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "thindielectric"}}}, "not all surfaces are diffuse"),
-    "a mask": (lambda: {"b": plane() | {"bsdf": {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}}}, "mixtures"),
+    "a mask": (lambda: {"b": plane() | {"bsdf": HALF}}, "mixtures"),
     "fog": (lambda: {"b": FOG}, "media"),
     "instances": (lambda: INSTANCE, "cannot be drawn on copy"),
-    "delays": (lambda: {"b": plane() | {"bsdf": {"type": "delayed", "lifetime": 0.3, "b": {"type": "diffuse"}}}}, "late"),
+    "delays": (lambda: {"b": plane() | {"bsdf": LATE}}, "late"),
 }  # fmt: skip
 
 
