@@ -230,9 +230,9 @@ def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> t
     shift, turn = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
     # Adam's steps are as long as its rate: 1 % of the scan's width, for shifts and for what turns do to the letter.
     rate, radius = 0.01 * WALL_M, float((vertices - vertices.mean(0)).norm(dim=1).mean())
-    groups = [{"params": [shift], "lr": rate}, {"params": [turn], "lr": rate / radius}]
-    optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, steps))
+    rates = {shift: rate, turn: rate / radius}
+    # One for each loss: what Adam remembers of the slopes of one says nothing about the other.
+    optimizers = [torch.optim.Adam([{"params": [p]} for p in rates], betas=(0.8, 0.9)) for _ in range(2)]
     true_shift, true_turn = true_pose(seed)
 
     def note() -> str:
@@ -249,8 +249,10 @@ def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> t
         return misfit.running_sums(light) if step < steps // 2 else misfit.likelihood(light)
 
     def move(step: int) -> None:
+        optimizer = optimizers[step >= steps // 2]
+        for group, longest in zip(optimizer.param_groups, rates.values(), strict=True):
+            group["lr"] = longest * rate_at(step, steps)
         optimizer.step()
-        schedule.step()
         optimizer.zero_grad()
 
     descend(fit, steps, loss_of, move, note)
@@ -287,9 +289,12 @@ def fit_shape(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> 
         kernel = kernel / kernel.sum(1, keepdim=True)
         assert vertices.grad is not None
         slope = kernel @ (kernel.T @ vertices.grad)
+        since = step if step < steps // 2 else step - steps // 2
+        if since == 0:  # the slopes of one loss say nothing about those of the other
+            momentum, square = torch.zeros_like(slope), 0.0
         momentum = 0.8 * momentum + 0.2 * slope
-        square = 0.95 * square + 0.05 * float(slope.square().sum(1).mean())
-        unbiased = (momentum / (1 - 0.8 ** (step + 1))) / math.sqrt(square / (1 - 0.95 ** (step + 1)))
+        square = 0.9 * square + 0.1 * float(slope.square().sum(1).mean())
+        unbiased = (momentum / (1 - 0.8 ** (since + 1))) / math.sqrt(square / (1 - 0.9 ** (since + 1)))
         with torch.no_grad():
             vertices.sub_(rate * rate_at(step, steps) * unbiased)
         vertices.grad = None
