@@ -114,7 +114,7 @@ def true_pose(seed: int) -> tuple[Tensor, Tensor]:
 
 def bent(vertices: Tensor) -> Tensor:
     """The letter 15 % wider, slanted by 15 %, and bent around an upright cylinder that the wall looks at."""
-    center, radius = vertices.mean(0), 0.8 * SIZE_M
+    center, radius = vertices.mean(0), SIZE_M
     x, y, z = (vertices - center).unbind(1)
     angle = (1.15 * x + 0.15 * y) / radius
     return torch.stack([radius * angle.sin(), y, z + radius * (1 - angle.cos())], 1) + center
@@ -268,7 +268,7 @@ def fit_shape(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> 
     apart = torch.cdist(fit.start, fit.start)
     corners = fit.start[fit.faces]
     longest, shortest = 0.5 * SIZE_M, float((corners - corners.roll(1, 1)).norm(dim=2).mean())
-    rate, momentum, square = 0.004 * WALL_M, torch.zeros_like(fit.start), 0.0
+    rate, momentum, square = 0.01 * WALL_M, torch.zeros_like(fit.start), 0.0
 
     def note() -> str:
         found = vertices.detach()
