@@ -272,8 +272,9 @@ def fit_shape(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> 
 
     def note() -> str:
         found = vertices.detach()
-        surface = 1000 * surface_distance(found, fit.measurement.vertices, fit.faces)
-        points = 1000 * float((found - fit.measurement.vertices).norm(dim=1).mean())
+        truth = fit.measurement.vertices
+        surface = 1000 * float(tt.losses.surface_distance(found, fit.faces, truth, fit.faces))
+        points = 1000 * float((found - truth).norm(dim=1).mean())
         fit.errors.setdefault("surface, mm", []).append(surface)
         fit.errors.setdefault("vertices, mm", []).append(points)
         return f"{surface:.1f} mm"
@@ -320,36 +321,6 @@ def descend(
     fit.seconds_a_step = (time.perf_counter() - began) / max(1, steps - 1)
 
 
-def surface_distance(first: Tensor, second: Tensor, faces: Tensor) -> float:
-    """Mean distance of two surfaces (V, 3), metres: from points of each to the nearest of the other, both ways."""
-
-    def one_way(a: Tensor, b: Tensor) -> Tensor:
-        n = 4
-        grid = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
-        u, v = torch.tensor(grid, dtype=a.dtype).T / n
-        weights = torch.stack([1 - u - v, u, v], 1)
-        corners = a[faces]
-        area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1)
-        points = torch.einsum("kc,fcd->fkd", weights, corners)
-        distance = point_triangle_distance(points.reshape(-1, 3), b[faces]).reshape(points.shape[:2])
-        return (distance.mean(1) * area).sum() / area.sum()
-
-    return float(0.5 * (one_way(first, second) + one_way(second, first)))
-
-
-def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
-    """(N,): distance of points (N, 3) to the nearest of triangles (F, 3, 3)."""
-    a, edges = triangles, triangles.roll(-1, 1) - triangles
-    normal = functional.normalize(torch.linalg.cross(edges[:, 0], edges[:, 1]), dim=1)
-    from_corner = points[:, None, None] - a
-    along = ((from_corner * edges).sum(-1) / edges.square().sum(-1)).clamp(0, 1)
-    to_edges = (from_corner - along[..., None] * edges).norm(dim=-1).amin(-1)
-    height = (from_corner[:, :, 0] * normal).sum(-1)
-    inwards = torch.linalg.cross(normal[:, None].expand_as(edges), edges)
-    inside = ((from_corner * inwards).sum(-1) >= 0).all(-1)
-    return torch.where(inside, height.abs(), to_edges).amin(1)
-
-
 # ------------------------------------------------------------------------------------------------------ the example
 
 
@@ -392,7 +363,9 @@ def run(what: str, kind: str, seed: int, settings: Settings, folder: Path) -> Fi
 def summary(fits: Sequence[Fit]) -> dict[str, Any]:
     """Errors before and after of each fit, and their medians."""
     names = list(fits[0].errors)
-    rows = {f.name: {n: [f.errors[n][0], f.errors[n][-1]] for n in names} | {"s_a_step": f.seconds_a_step} for f in fits}
+    rows: dict[str, Any] = {f.name: {n: [f.errors[n][0], f.errors[n][-1]] for n in names} for f in fits}
+    for fit in fits:
+        rows[fit.name] |= {"steps": len(fit.losses), "s_a_step": fit.seconds_a_step}
     return {"fits": rows, "median": {n: statistics.median(f.errors[n][-1] for f in fits) for n in names}}
 
 
@@ -409,7 +382,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--shape-steps", type=int, default=80, help="steps of each shape (%(default)s)")
     parser.add_argument("--late", action="store_true", help="measure light of up to five bounces, too")
     parser.add_argument("--quick", action="store_true", help="few points and steps: seconds, and coarse")
-    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder of what is written (%(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder (%(default)s)")
     options = parser.parse_args(argv)
     settings = Settings(
         points=options.points, spp=options.spp, pose_steps=options.pose_steps, shape_steps=options.shape_steps,
@@ -423,8 +396,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             fits = [run(what, kind, seed, settings, options.output) for seed in options.seeds]
             found[f"{what}, {kind}"] = made = summary(fits)
             for name, row in made["fits"].items():
-                words = [f"{key} {v[0]:.1f} -> {v[1]:.3f}" for key, v in row.items() if key != "s_a_step"]
-                print(f"{name}: {'; '.join(words)}; {row['s_a_step']:.2f} s a step")
+                words = [f"{key} {v[0]:.1f} -> {v[1]:.2f}" for key, v in row.items() if isinstance(v, list)]
+                print(f"{name}: {'; '.join(words)}; {row['steps']} steps of {row['s_a_step']:.2f} s")
             medians = ", ".join(f"{key} {value:.3f}" for key, value in made["median"].items())
             print(f"{what}, {kind}: median of {len(fits)}: {medians}")
     (options.output / "nlos_letter.json").write_text(json.dumps(found, indent=1))

@@ -40,7 +40,9 @@ def plot_shape_fit(
     figure when `path` is given. Raises ShapeError, SceneError for a scan without a wall, StorageError.
     """
     if scan.wall is None or len(scan.sensor_shape) != 2:
-        raise SceneError("plot_shape_fit: expected a scan with a grid of sensor points and a wall. Scan.grid makes one.")
+        raise SceneError(
+            "plot_shape_fit: expected a scan with a grid of sensor points and a wall. Scan.grid makes one."
+        )
     if not meshes or not losses:
         raise ShapeError(f"plot_shape_fit: expected a mesh and a step, got {len(meshes)} and {len(losses)}.")
     for name, cube in transients.items():
@@ -74,8 +76,9 @@ def _draw_views(
     points = local(_numbers(scan.sensor_points).reshape(-1, 3))
     for panel, (i, j) in ((front, (0, 1)), (above, (0, 2))):
         panel.scatter(points[:, i], points[:, j], s=1.5, color="0.8", linewidths=0)
-        for name, vertices in meshes.items():
-            _draw_mesh(panel, local(vertices)[:, [i, j]], faces, colours[name], name)
+        # The truth first and broad, so that what was found shows on it.
+        for n, name in enumerate(sorted(meshes, key=list(meshes)[-1].__ne__)):
+            _draw_mesh(panel, local(meshes[name])[:, [i, j]], faces, (colours[name], 1.3 if n else 3.5), name)
         panel.set_aspect("equal")
         panel.set_xlabel("along the wall (m)")
     front.set_ylabel("up (m)")
@@ -85,21 +88,20 @@ def _draw_views(
     above.set_title("seen from above", fontsize=10)
 
 
-def _draw_mesh(panel: Any, points: Any, faces: Any, colour: str, label: str) -> None:
+def _draw_mesh(panel: Any, points: Any, faces: Any, style: tuple[str, float], label: str) -> None:
     """Triangles (F, 3) of points (V, 2), transparent, and the edges that belong to one of them alone."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
+    colour, width = style
     rims = unique[count == 1] if (count == 1).any() else unique
     panel.add_collection(PolyCollection(list(points[faces]), facecolor=colour, edgecolor="none", alpha=0.15))
-    panel.add_collection(LineCollection(list(points[rims]), color=colour, linewidth=1.3, label=label))
+    panel.add_collection(LineCollection(list(points[rims]), color=colour, linewidth=width, label=label))
     panel.autoscale_view()
 
 
-def _draw_transients(
-    panels: Any, transients: Mapping[str, Tensor], axis: TimeAxis, colours: Mapping[str, str]
-) -> None:
+def _draw_transients(panels: Any, transients: Mapping[str, Tensor], axis: TimeAxis, colours: Mapping[str, str]) -> None:
     together = -(-axis.num_bins // MOST_BINS)
     whole = axis.num_bins // together * together
     edges = _numbers(axis.edges_opl)[: whole + 1 : together]
