@@ -37,8 +37,7 @@ from tqdm import tqdm
 import torchtransient as tt
 from torchtransient import sensing
 
-KEY = "letter.vertex_positions"
-VARIANT = "llvm_ad_mono"
+KEY, VARIANT = "letter.vertex_positions", "llvm_ad_mono"
 LETTER = "F"  # looks like itself in one pose alone
 SIZE_M, DEPTH_M, WALL_M = 0.6, 0.9, 1.5
 OFF_M, OFF_DEG = 0.1, 20.0
@@ -50,7 +49,8 @@ MEASURED_SEED, SHAPE_SEED = 1_000_003, 500_009
 
 @dataclass(frozen=True)
 class Settings:
-    """How much is computed. `subdivide`: of the letter's triangles, for its shape. `late`: measure light of 3 to 5
+    """How much is computed. `points`: of the scan, a side. `spp`, `measured_spp`: hidden samples of a step, paths of a
+    point of what is measured. `subdivide`: of the letter's triangles, for its shape. `late`: measure light of 3 to 5
     bounces, of which the model knows the first 3.
     """
 
@@ -58,7 +58,7 @@ class Settings:
     spp: int = 256
     measured_spp: int = 8192
     pose_steps: int = 80
-    shape_steps: int = 80
+    shape_steps: int = 100
     subdivide: int = 2
     late: bool = False
 
@@ -224,7 +224,7 @@ def rate_at(step: int, steps: int) -> float:
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
-def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> tuple[Tensor, Tensor]:
+def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> None:
     """Shift and turn: running sums first, then the likelihood. Moves `fit.found`."""
     vertices = fit.found
     shift, turn = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
@@ -239,10 +239,9 @@ def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> t
         left = rotation(turn.detach()) @ rotation(true_turn).T
         sine = torch.stack([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]]).norm()
         degrees = math.degrees(math.atan2(float(sine), float(left.trace()) - 1))
-        millimetres = 1000 * float((shift.detach() - true_shift).norm())
-        fit.errors.setdefault("position, mm", []).append(millimetres)
+        fit.errors.setdefault("position, mm", []).append(1000 * float((shift.detach() - true_shift).norm()))
         fit.errors.setdefault("rotation, degrees", []).append(degrees)
-        return f"{millimetres:.1f} mm, {degrees:.2f} deg"
+        return f"{fit.errors['position, mm'][-1]:.1f} mm, {degrees:.2f} deg"
 
     def loss_of(step: int) -> Tensor:
         light = model(placed(vertices, shift, turn), seed * 100_000 + step)
@@ -257,26 +256,22 @@ def fit_pose(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> t
 
     descend(fit, steps, loss_of, move, note)
     fit.found = placed(vertices, shift.detach(), turn.detach())
-    return shift.detach(), turn.detach()
 
 
 def fit_shape(fit: Fit, model: Model, misfit: Misfit, steps: int, seed: int) -> None:
     """All vertices of `fit.found`. Their gradient is smoothed over a length on the letter that shrinks from half the
     letter to the edge of a triangle; Adam with one scale for all of them, so that smooth stays smooth.
     """
-    vertices = fit.found.clone().requires_grad_()
-    apart = torch.cdist(fit.start, fit.start)
-    corners = fit.start[fit.faces]
+    vertices, truth = fit.found.clone().requires_grad_(), fit.measurement.vertices
+    apart, corners = torch.cdist(fit.start, fit.start), fit.start[fit.faces]
     longest, shortest = 0.5 * SIZE_M, float((corners - corners.roll(1, 1)).norm(dim=2).mean())
     rate, momentum, square = 0.01 * WALL_M, torch.zeros_like(fit.start), 0.0
 
     def note() -> str:
         found = vertices.detach()
-        truth = fit.measurement.vertices
         surface = 1000 * float(tt.losses.surface_distance(found, fit.faces, truth, fit.faces))
-        points = 1000 * float((found - truth).norm(dim=1).mean())
         fit.errors.setdefault("surface, mm", []).append(surface)
-        fit.errors.setdefault("vertices, mm", []).append(points)
+        fit.errors.setdefault("vertices, mm", []).append(1000 * float((found - truth).norm(dim=1).mean()))
         return f"{surface:.1f} mm"
 
     def loss_of(step: int) -> Tensor:
@@ -342,7 +337,7 @@ def run(what: str, kind: str, seed: int, settings: Settings, folder: Path) -> Fi
     look("start")
     fit_pose(fit, model, misfit, settings.pose_steps, seed)
     if what == "shape":
-        # A bent letter has no pose: its errors are those of its surface. Losses begin anew with running sums.
+        # A bent letter has no pose: its errors are those of its surface.
         look("after pose")
         misfit, fit.start, fit.losses, fit.errors = Misfit(measurement.counts), fit.found, [], {}
         fit_shape(fit, model, misfit, settings.shape_steps, seed)
@@ -363,9 +358,9 @@ def run(what: str, kind: str, seed: int, settings: Settings, folder: Path) -> Fi
 def summary(fits: Sequence[Fit]) -> dict[str, Any]:
     """Errors before and after of each fit, and their medians."""
     names = list(fits[0].errors)
-    rows: dict[str, Any] = {f.name: {n: [f.errors[n][0], f.errors[n][-1]] for n in names} for f in fits}
+    rows: dict[str, Any] = {f.name: {"steps": len(f.losses), "s_a_step": f.seconds_a_step} for f in fits}
     for fit in fits:
-        rows[fit.name] |= {"steps": len(fit.losses), "s_a_step": fit.seconds_a_step}
+        rows[fit.name] |= {n: [fit.errors[n][0], fit.errors[n][-1]] for n in names}
     return {"fits": rows, "median": {n: statistics.median(f.errors[n][-1] for f in fits) for n in names}}
 
 
@@ -376,18 +371,15 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--fit", nargs="+", choices=["pose", "shape"], default=["pose", "shape"], help="what is fitted")
     parser.add_argument("--kind", nargs="+", choices=both, default=both, help="kinds of scans (both)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="true poses and noise (%(default)s)")
-    parser.add_argument("--points", type=int, default=32, help="scan points a side (%(default)s)")
-    parser.add_argument("--spp", type=int, default=256, help="paths of a point and step (%(default)s)")
-    parser.add_argument("--pose-steps", type=int, default=80, help="steps of each pose (%(default)s)")
-    parser.add_argument("--shape-steps", type=int, default=80, help="steps of each shape (%(default)s)")
+    numbers = ("points", "spp", "pose_steps", "shape_steps")
+    for name in numbers:
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(option, type=int, default=getattr(Settings, name), help="(%(default)s)")
     parser.add_argument("--late", action="store_true", help="measure light of up to five bounces, too")
     parser.add_argument("--quick", action="store_true", help="few points and steps: seconds, and coarse")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder (%(default)s)")
     options = parser.parse_args(argv)
-    settings = Settings(
-        points=options.points, spp=options.spp, pose_steps=options.pose_steps, shape_steps=options.shape_steps,
-        late=options.late,
-    )  # fmt: skip
+    settings = Settings(late=options.late, **{name: getattr(options, name) for name in numbers})
     if options.quick:
         settings = replace(settings, points=8, spp=256, measured_spp=1024, pose_steps=24, shape_steps=24)
     found: dict[str, Any] = {}

@@ -35,7 +35,7 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
 def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
     """(N,): distance of points (N, 3) to the nearest of triangles (F, 3, 3), exact and differentiable."""
     size = max(1, _MOST // (9 * len(triangles)))
-    return torch.cat([_distance(part, triangles) for part in points.split(size)])
+    return torch.cat([_distance(part, triangles) for part in torch.split(points, size)])
 
 
 def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
@@ -44,7 +44,8 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     points = torch.einsum("kc,fcd->fkd", weights, triangles)
     distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
     area = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).norm(dim=1)
-    return (distance.mean(1) * area).sum() / area.sum()
+    mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
+    return mean
 
 
 def _middles(cells: int) -> Tensor:
