@@ -12,7 +12,7 @@ shape   first the pose, then every vertex on its own, of a letter that is bent, 
 
     python training_examples/nlos_letter.py --output demo_output
 
-What is measured is rendered by path tracing, with other random numbers, other filters and more samples than the model.
+What is measured is rendered by path tracing, with other random numbers, filter and more samples than the model.
 Settings of the fits follow from the size of scan and start and are the same for all seeds and both kinds of scans.
 """
 
