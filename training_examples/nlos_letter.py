@@ -39,8 +39,7 @@ from torchtransient import sensing
 
 KEY, VARIANT = "letter.vertex_positions", "llvm_ad_mono"
 LETTER = "F"  # looks like itself in one pose alone
-SIZE_M, DEPTH_M, WALL_M = 0.6, 0.9, 1.5
-OFF_M, OFF_DEG = 0.1, 20.0
+SIZE_M, DEPTH_M, WALL_M, OFF_M, OFF_DEG = 0.6, 0.9, 1.5, 0.1, 20.0
 START_OPL, BIN_S, BINS = 1.2, 16e-12, 512
 JITTER_S = 60e-12
 SIGNAL, BACKGROUND, CYCLES = 100.0, 10.0, 100_000  # counts of a scan point, mean over the scan; laser cycles
