@@ -57,7 +57,7 @@ class Settings:
     spp: int = 256
     measured_spp: int = 8192
     pose_steps: int = 80
-    shape_steps: int = 100
+    shape_steps: int = 200
     subdivide: int = 2
     late: bool = False
 
