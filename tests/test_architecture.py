@@ -242,7 +242,7 @@ def test_every_package_has_a_level():
         ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
         ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
         ("render", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("nlos", "from torchtransient.data import result_file", "imports 'data'"),
+        ("data", "from torchtransient.nlos import scene", "imports 'nlos'"),
         ("toolbox", "import os", "has no level"),
     ],
 )

@@ -170,5 +170,5 @@ def test_parts_that_do_not_fit_together(tmp_path):
     with np.load(path) as file:
         changed = {name: file[name] for name in file.files} | {"num_bins": np.array(3)}
     np.savez(path, **changed)
-    with pytest.raises(StorageError, match="damaged.*axis"):
+    with pytest.raises(StorageError, match=r"damaged.*axis"):
         read_capture(path)

@@ -11,10 +11,13 @@ from torch import nn
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
+from torchtransient.nlos.scene_scan import check_scan_is_seen
+from torchtransient.render.build import BuildOptions
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import load
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.variant import active_variant
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
@@ -56,6 +59,7 @@ class CaptureRenderer(nn.Module):
         self.renderer = TransientRenderer(scene, {**wanted, **own}, **settings)
         for key in own:
             self.renderer.values[key].requires_grad_(requires_grad=False)
+        check_scan(self.renderer.scene, scan, self.renderer._options)
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
@@ -80,6 +84,15 @@ class CaptureRenderer(nn.Module):
         return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
 
 
+def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
+    """Raise SceneError where sensor or laser of a capture's scene look at something else than the points of its scan:
+    a hidden thing in their way, a wall that is elsewhere.
+    """
+    with active_variant(scene.variant):
+        built = scene.built(BuildOptions(transient=True) if options is None else options)
+        check_scan_is_seen(built.scene, scan)
+
+
 def _attached(scan: Scan) -> dict[str, torch.Tensor]:
     """The points of a scan that require gradients, by their keys in the scene."""
     points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin, LASER_ORIGIN: scan.laser_origin}
@@ -93,6 +106,7 @@ def as_capture(
     out: RenderOutput, scan: Scan, sensor: nn.Module | None = None, generator: torch.Generator | None = None
 ) -> Capture:
     """What a render of a capture's scene measured, in the scan's shape; views of its tensors."""
+
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
 
@@ -114,6 +128,12 @@ def as_capture(
     )  # fmt: skip
 
 
+def in_film_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
+    """From the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film."""
+    laser = laser_size(scan) if scan.kind == "exhaustive" else ()
+    return tensor.reshape(*tensor.shape[: tensor.ndim - len(scan.shape)], *laser, *film_size(scan))
+
+
 def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
     """From (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T."""
     film = 4 if scan.kind == "exhaustive" else 2
@@ -125,9 +145,7 @@ def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)
 
 
-def measured(
-    transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None
-) -> torch.Tensor:
+def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
     """What ``sensor`` makes of (..., T, [Lh, Lw,] H, W): each pair is a pixel of its own."""
     if scan.kind == "exhaustive":
         (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)

@@ -41,7 +41,9 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy
     shapes = hidden_shapes(hidden)
     taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
     if taken:
-        raise SceneError(f"capture: the names {', '.join(taken)} belong to the capture itself; rename the hidden nodes.")
+        raise SceneError(
+            f"capture: the names {', '.join(taken)} belong to the capture itself; rename the hidden nodes."
+        )
     rows, columns = film_size(scan)
     film: dict[str, Any] = {
         "type": "transient_hdr_film", "width": columns, "height": rows, "rfilter": {"type": "box"}, "temporal_bins": 1,
@@ -84,7 +86,8 @@ def hidden_shapes(hidden: Any) -> dict[str, Any]:
         plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
         if plugin is None:
             raise SceneError(
-                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got {hidden!r}."
+                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got "
+                f"{str(hidden)!r}."
             )
         return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
     if isinstance(hidden, Mapping):
@@ -93,7 +96,7 @@ def hidden_shapes(hidden: Any) -> dict[str, Any]:
             _check_shapes(shapes)
             return shapes
         return {"hidden": dict(hidden)}
-    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:  # noqa: PLR2004 (vertices and faces)
+    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
         return {"hidden": _mesh(*hidden)}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
         return {"hidden": _mesh(hidden.vertices, hidden.faces)}
@@ -136,7 +139,7 @@ def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
 
 def _range(bounces: Sequence[int]) -> tuple[int, int]:
     numbers = sorted(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in numbers)  # noqa: PLR2004
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in numbers)
     if not numbers or not whole or list(numbers) != list(range(numbers[0], numbers[0] + len(numbers))):
         raise SceneError(
             f"bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), got {bounces!r}. "
@@ -151,9 +154,9 @@ def _numbers(values: Any) -> np.ndarray:
     return np.asarray(values, dtype=np.float64)
 
 
-def hidden_bounds(hidden: Any) -> np.ndarray:
+def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
     """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
-    scene = load({"type": "scene", **hidden_shapes(hidden)})
+    scene = load({"type": "scene", **hidden_shapes(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()
         return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)

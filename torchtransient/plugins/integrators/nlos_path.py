@@ -57,7 +57,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
-        corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+        corner. -1 keeps all. (In mitransient 1.x, ``filter_bounces = b`` keeps paths of ``b + 1`` bounces with
+        ``nlos_laser_sampling``, and of ``b + 2`` without it.)
     ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
         ``filter_bounces + 1``, as in mitransient.
@@ -182,13 +183,32 @@ class TransientNLOSPath(base.TransientIntegrator):
         """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
         if self.third_bounce == "paths" or not self._wants(BOUNCES):
             return False
-        if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
-            reason = why_not(scene, contents.sensor, contents)
-        else:
-            reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+        reason = self._why_not_shared(scene, contents)
         if reason and self.third_bounce == "shared":
             raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
         return reason is None
+
+    def _why_not_shared(self, scene: Any, contents: Any) -> str | None:
+        if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
+            return why_not(scene, contents.sensor, contents)
+        return "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+
+    def explanation(self, scene: Any, contents: Any) -> str:
+        """How light of three bounces and of more is found in a scene, and why, in words."""
+        settings = self.settings()
+        most = settings.max_depth - (0 if self.laser_sampling else 1)
+        if not self._wants(BOUNCES):
+            third = "light of three bounces is not asked for"
+        elif self.third_bounce == "paths":
+            third = "light of three bounces from paths, as third_bounce asks for"
+        elif self.shares(scene, contents):
+            third = "light of three bounces from hidden samples that all scanned points share"
+        else:
+            third = f"light of three bounces from paths, since {self._why_not_shared(scene, contents)}"
+        if most == BOUNCES:
+            return f"{third}; no later light"
+        later = "without a limit" if settings.max_depth == base.UNLIMITED else f"up to {most} bounces"
+        return f"{third}; later light, {later}, from paths"
 
     def _wants(self, bounces: int) -> bool:
         settings = self.settings()
