@@ -128,7 +128,7 @@ def _plain(value: Any, parts: list[NDArray[Any]], where: str) -> Any:
     if array.dtype.kind not in "biufc":
         raise StorageError(
             f"capture file: {where} is a {type(value).__name__}, which no file can hold; expected numbers, texts, "
-            "lists, dictionaries and arrays. Write the capture with a scan whose wall is None or described by plain data."
+            "lists, dictionaries and arrays. Write the capture with a scan whose wall is None or of plain data."
         )
     parts.append(array)
     return {_ARRAY: f"wall_{len(parts) - 1}"}

@@ -26,7 +26,7 @@ Rows = NDArray[np.float32]
 
 
 class PartFile:
-    """Finished rows of the simulation that ``key`` stands for. To be used in a ``with`` block, which holds the lock.
+    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with`` block, which holds the lock.
 
     ``about``: plain data that was kept with them, empty at first. Raises StorageError where ``path`` is something else,
     belongs to another simulation, is damaged, or is worked on by another process.
@@ -72,6 +72,8 @@ class PartFile:
                 f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: {error!r}. "
                 "Give another name, or delete it to start anew."
             ) from error
+        if form == FORMAT and not self._key:
+            return
         if form != FORMAT or key != self._key:
             raise StorageError(
                 f"part file: '{self.path}' belongs to another simulation: another scene, scan, axis, spp, seed or "
@@ -195,6 +197,17 @@ class PartFile:
                 f"part file: '{self.path}' and '{self._data.name}' could not be read or written: {error}. What was "
                 "finished before is kept: with room on the disk the same call goes on."
             ) from error
+
+
+def delete_part_file(path: Path) -> None:
+    """Delete the files of a simulation's parts, if there are any.
+
+    Raises StorageError for a file that is something else, or is worked on by another process.
+    """
+    if not path.exists():
+        return
+    with PartFile(path, "") as kept:
+        kept.remove()
 
 
 class _Lock:

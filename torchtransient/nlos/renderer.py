@@ -43,7 +43,7 @@ class CaptureRenderer(nn.Module):
         scan: Scan,
         parameters: Sequence[str] | Mapping[str, Any] = (),
         *,
-        bounces: Sequence[int] = (3,),
+        bounces: Sequence[int] | str = (3,),
         energy: Any = 1.0,
         sensor: nn.Module | None = None,
         variant: str | None = None,
@@ -51,7 +51,7 @@ class CaptureRenderer(nn.Module):
     ):
         super().__init__()
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
-        self.scan, self.sensor, self.bounces = scan, sensor, tuple(bounces)
+        self.scan, self.sensor, self.bounces = scan, sensor, bounces
         self._followed = _attached(scan)
         own = {key: None for key in self._followed if key not in parameters}
         wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)

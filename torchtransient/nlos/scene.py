@@ -18,16 +18,19 @@ from torchtransient.render.variant import active_variant
 # Names of a capture's own nodes: those of hidden things must be others.
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
+ALL_BOUNCES = "all"
 _MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
 _CHAIN = ("sensor", "integrator", "emitter")
 
 
-def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy: Any = 1.0) -> dict[str, Any]:
+def capture_scene(
+    hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0
+) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
     ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
     object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
-    numbers of bounces that count, without gaps; 3 is light around one corner. ``energy``: joules of the laser, a number
+    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the laser, a number
     or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor ``wall.sensor``.
 
     Raises SceneError for what is no shape, for names that the capture needs itself, and for a scan without a wall.
@@ -137,13 +140,17 @@ def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
     return {"type": "mesh_arrays", "vertices": _numbers(vertices), "faces": _numbers(faces)}
 
 
-def _range(bounces: Sequence[int]) -> tuple[int, int]:
-    numbers = sorted(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in numbers)
-    if not numbers or not whole or list(numbers) != list(range(numbers[0], numbers[0] + len(numbers))):
+def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
+    """The first and the last number that counts; -1 for no limit."""
+    if isinstance(bounces, str) and bounces == ALL_BOUNCES:
+        return 0, -1
+    given: list[Any] = list(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in given)
+    numbers = sorted(given) if whole else []
+    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise SceneError(
-            f"bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), got {bounces!r}. "
-            "The laser's spot is the first bounce, so light around one corner has 3."
+            "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
+            f"got {bounces!r}. The laser's spot is the first bounce, so light around one corner has 3."
         )
     return int(numbers[0]), int(numbers[-1])
 

@@ -48,13 +48,14 @@ def simulate(
     time_axis: TimeAxis | None = None,
     frequencies: FrequencyAxis | Sequence[float] | None = None,
     spp: int | None = None,
-    bounces: Sequence[int] | None = None,
+    bounces: Sequence[int] | str | None = None,
     energy: Any = None,
     sensor: torch.nn.Module | None = None,
     seed: int = 0,
     variant: str | None = None,
     part: str | Path | None = None,
     tiles: int | None = None,
+    keep_part: bool = False,
     progress: bool = True,
     generator: torch.Generator | None = None,
 ) -> Capture:
@@ -74,7 +75,7 @@ def simulate(
     ``seed``: same seed and parts, same capture.
 
     ``part``: name of a file that keeps finished parts (16, or ``tiles``): with it a simulation that was killed goes on
-    when it is called again. It is deleted at the end, when the capture is returned. ``progress``: say memory and time
+    when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it. ``progress``: say memory and time
     before it starts, and show a bar.
 
     ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
@@ -96,7 +97,7 @@ def simulate(
         capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
         if sensor is not None and capture.transient is not None:
             capture = replace(capture, transient=_through(capture.transient, capture.scan, sensor, generator))
-        if kept is not None:
+        if kept is not None and not keep_part:
             kept.remove()
     return replace(capture, metadata=_metadata(work, forecast, seed, seconds))
 
@@ -114,7 +115,7 @@ def forecast(
     there.
     """
     given = {name: settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")}
-    unknown = sorted(set(settings) - {"seed", "sensor", "progress", "generator"})
+    unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
     if unknown:
         raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
     of_light = given.pop("bounces"), given.pop("energy")

@@ -20,7 +20,7 @@ class VariantChoice:
 
 def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     """``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is
-    grey, on the device of the variant that :func:`tt.load` would take; else that variant.
+    grey, on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
 
     Raises VariantError for a variant that cannot be used, SceneError for a scene that cannot be read.
     """
@@ -37,6 +37,5 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     if not coloured:
         device = name.split("_")[0]
         return VariantChoice(f"{device}_ad_mono", "every spectrum is grey, so that one channel carries all of it")
-    if name.endswith("_mono"):
-        return VariantChoice(name, f"the active one; it makes one number of {some(coloured)}")
-    return VariantChoice(name, f"colour: {some(coloured)}")
+    # One channel may have been chosen for the scene before.
+    return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {some(coloured)}")
