@@ -148,14 +148,15 @@ def _ends(scene: Any, ray: Any) -> Ends:
         shapes = [shape.id() or shape.class_name() for shape in scene.shapes()]
         addresses = {shape.ptr: name for shape, name in zip(scene.shapes(), shapes, strict=True)}
         dr.eval(si, behind, normals)
-    if bool(dr.any(behind)):
-        raise SceneError(
-            f"scan: {int(dr.count(behind)[0])} of {dr.width(si.p)} rays end on the back of a wall, which scatters "
-            "nothing there: an origin stands behind it. Move sensor_origin or laser_origin to the side that its "
-            "normals point to, turn the wall (flip_normals), or make it twosided."
-        )
     valid = np.array(si.is_valid())
     hit = [addresses.get(shape.ptr, "a part of a group") if shape is not None else "" for shape in _shapes(si, valid)]
+    dark = np.flatnonzero(np.array(behind))
+    if len(dark):
+        raise SceneError(
+            f"scan: {len(dark)} of {len(hit)} rays end on the back of {hit[dark[0]]!r}, which scatters nothing there. "
+            "Move sensor_origin or laser_origin to the side that its normals point to, in front of the wall and of "
+            "what is hidden; or turn it (flip_normals), or make it twosided."
+        )
     count = len(valid)
     origins = np.broadcast_to(_array(ray.o), (count, 3))
     return Ends(_array(si.p), _array(normals), hit, origins, _array(ray.d))
