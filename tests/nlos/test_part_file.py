@@ -68,7 +68,7 @@ def test_a_part_in_the_place_of_another(path):
 def test_another_simulation(path):
     with PartFile(path, "key") as kept:
         keep(kept, 0)
-    with pytest.raises(StorageError, match="belongs to another simulation.*delete it"), PartFile(path, "other"):
+    with pytest.raises(StorageError, match=r"belongs to another simulation.*delete it"), PartFile(path, "other"):
         pass
     with PartFile(path, "key") as kept:
         assert kept.has(0)
@@ -89,7 +89,7 @@ def test_rows_that_are_cut_off(path, cut):
         keep(kept, 2)
     data = path.with_name(path.name + ".npy")
     data.write_bytes(data.read_bytes()[:cut])
-    with pytest.raises(StorageError, match="damaged or cut off|could not be read"), PartFile(path, "key"):
+    with pytest.raises(StorageError, match=r"damaged or cut off|could not be read"), PartFile(path, "key"):
         pass
 
 

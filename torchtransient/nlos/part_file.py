@@ -26,7 +26,8 @@ Rows = NDArray[np.float32]
 
 
 class PartFile:
-    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with`` block, which holds the lock.
+    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with``
+    block, which holds the lock.
 
     ``about``: plain data that was kept with them, empty at first. Raises StorageError where ``path`` is something else,
     belongs to another simulation, is damaged, or is worked on by another process.

@@ -23,15 +23,14 @@ _MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
 _CHAIN = ("sensor", "integrator", "emitter")
 
 
-def capture_scene(
-    hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0
-) -> dict[str, Any]:
+def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
     ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
     object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
-    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the laser, a number
-    or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor ``wall.sensor``.
+    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the
+    laser, a number or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor
+    ``wall.sensor``.
 
     Raises SceneError for what is no shape, for names that the capture needs itself, and for a scan without a wall.
     """

@@ -45,8 +45,8 @@ def read_setup(path: str | Path, **xml_parameters: str) -> dict[str, Any]:
         return _of_tal(read_tal_yaml(source))
     if "hidden" not in entries:
         raise SceneError(
-            f"{source.name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of y-tal), "
-            f"got {', '.join(map(str, entries))}."
+            f"{source.name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of "
+            f"y-tal), got {', '.join(map(str, entries))}."
         )
     found = read_description(source)
     return {

@@ -75,8 +75,8 @@ def simulate(
     ``seed``: same seed and parts, same capture.
 
     ``part``: name of a file that keeps finished parts (16, or ``tiles``): with it a simulation that was killed goes on
-    when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it. ``progress``: say memory and time
-    before it starts, and show a bar.
+    when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it. ``progress``: say memory
+    and time before it starts, and show a bar.
 
     ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
     light was found), ``parts``.

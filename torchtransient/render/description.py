@@ -325,7 +325,7 @@ def _scan_points(value: Any, key: str) -> Any:
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.ndim < 1 or array.shape[-1] != 3:
         got = f"shape {array.shape} of {array.dtype}"
-        raise SceneError(f"{_SCAN}: expected {key} as points of three numbers, an array (N, 3) or (H, W, 3), got {got}.")
+        raise SceneError(f"{_SCAN}: expected {key} as points, an array (N, 3) or (H, W, 3), got {got}.")
     return mi.TensorXf(np.ascontiguousarray(array, dtype=np.float32).reshape(1, -1, 3))
 
 
