@@ -115,12 +115,20 @@ class FilmInterface(abc.ABC):
 
     @abc.abstractmethod
     def create_block(
-        self, job: Any, base: Any, match: Any, most_events: int, tangents: bool = False, exclusive: bool = False
+        self,
+        job: Any,
+        base: Any,
+        match: Any,
+        most_events: int,
+        tangents: bool = False,
+        exclusive: bool = False,
+        origin: Any = None,
     ) -> Any:
         """How the samples of one pass write (``FilmBlock``). ``job``: the pass, with the number of its band; ``base``:
         index of each sample's first entry in it; ``match``: from spectra to channels; ``most_events`` of
         a path; ``tangents``: events are derivatives (``put_slope``) instead of contributions (``put``); ``exclusive``:
-        as in ``put``.
+        as in ``put``; ``origin`` (``Float64``, for each sample, or None for zero): path length that those of the events
+        are counted from, which then may come in single precision.
         """
 
     @abc.abstractmethod
@@ -249,6 +257,10 @@ class IntegratorInterface(abc.ABC):
     @abc.abstractmethod
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
         """What the walks of one job are told (``World``); ``settings``: other than the integrator's own."""
+
+    @abc.abstractmethod
+    def silhouettes(self, scene: Any) -> str:
+        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
 
     @abc.abstractmethod
     def reference(self, scene: Any) -> Any:

@@ -122,6 +122,25 @@ def test_legs_are_path_length(body):
     assert moved < 0.01 * cubes[0].sum()
 
 
+@pytest.mark.parametrize("vertex_normals", [False, True])
+def test_colours(vertex_normals):
+    """Every channel of a single and a confocal capture is one of its own albedo and energy."""
+
+    def captures(albedo, energy, variant):
+        with mi.variant_context(variant):
+            shapes = [mesh("a", mannequin(1), albedo, two_sided=True, vertex_normals=vertex_normals)]
+            scene, samples = scene_of(*shapes), draw_samples(table_of(shapes), 128, 2)
+            points, normals = wall_grid(GRID, 0.4)
+            sensors, laser, film = wall_of(points, normals), wall_of(points[:1], normals[:1]), histogram()
+            job = lambda: ThirdBounce(scene, film, samples, sensors, mi.UnpolarizedSpectrum(energy))  # noqa: E731
+            return [captured(film, lambda: job().add_confocal())[1], captured(film, lambda: job().add_single(laser))[1]]
+
+    rgb = captures({"type": "rgb", "value": [0.2, 0.5, 0.8]}, [1.0, 2.0, 3.0], "llvm_ad_rgb")
+    for channel, (albedo, energy) in enumerate(((0.2, 1.0), (0.5, 2.0), (0.8, 3.0))):
+        for found, expected in zip(rgb, captures(albedo, energy, "llvm_ad_mono"), strict=True):
+            assert found[..., channel] == pytest.approx(expected[..., 0], rel=1e-5, abs=1e-7 * expected.max())
+
+
 def test_arguments_are_checked(body):
     points, normals = wall_grid(GRID, 0.4)
     sensors = wall_of(points, normals)

@@ -143,9 +143,11 @@ def test_direct_paths_are_left_out():
     settings = {"nlos_laser_sampling": False, "nlos_hidden_geometry_sampling": False, "max_depth": 4, "laser": lamp}
     with_direct = captures(scan_scene({"a": plane()}, "single", film(start=0.0, bins=300), **settings), 512, 1)
     without = captures(
-        scan_scene({"a": plane()}, "single", film(start=0.0, bins=300), discard_direct_paths=True, **settings), 512, 1)
+        scan_scene({"a": plane()}, "single", film(start=0.0, bins=300), discard_direct_paths=True, **settings), 512, 1
+    )
     direct = captures(
-        scan_scene({"a": plane()}, "single", film(start=0.0, bins=300), filter_bounces=1, **settings), 512, 1)
+        scan_scene({"a": plane()}, "single", film(start=0.0, bins=300), filter_bounces=1, **settings), 512, 1
+    )
     assert direct.sum() > 0
     assert (with_direct - direct).sum() == pytest.approx(without.sum(), rel=1e-3)
 
@@ -168,7 +170,9 @@ def test_a_projector_is_a_laser():
     projector = {"type": "projector", "irradiance": 2.0, "fov": 0.2}
     spot = np.array([-0.2, 0.1, 0.0])
     for how in ("shared", "paths"):
-        lit = captures(scan_scene({"a": plane()}, "single", spot=tuple(spot), laser=projector, third_bounce=how), 4096, 1)
+        lit = captures(
+            scan_scene({"a": plane()}, "single", spot=tuple(spot), laser=projector, third_bounce=how), 4096, 1
+        )
         beam = captures(scan_scene({"a": plane()}, "single", spot=tuple(spot), third_bounce=how), 4096, 1)
         to = spot - np.array([-0.5, 0.0, 0.25])
         d = np.linalg.norm(to)

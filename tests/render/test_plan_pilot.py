@@ -231,8 +231,10 @@ def test_every_scene_of_the_library_is_listed():
     functions = {
         n for n, f in vars(tt.scenes).items() if callable(f) and f.__module__.startswith("torchtransient.scenes")
     }
-    # The bottle needs a place for its mesh and holds a medium: it has a test of its own.
-    assert functions == {*SCENES, "milk_bottle"}
+    # The bottle needs a place for its mesh and holds a medium: it has a test of its own. What is hidden behind a corner
+    # is no scene yet.
+    parts = {"relay_wall", "bounds", "triangle_mesh"}
+    assert {name for name in functions if not name.startswith("nlos_")} - parts == {*SCENES, "milk_bottle"}
 
 
 def test_the_plan_of_the_bottle_sees_its_milk(tmp_path):

@@ -61,6 +61,7 @@ _TRANSIENT_PROPERTIES = (
 _STEADY_FILMS = ("hdrfilm", "specfilm")
 _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
+    "exhaustive_scan", "laser_scan_width", "laser_scan_height",
 )  # fmt: skip
 
 

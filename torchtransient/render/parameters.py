@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import SceneError, UnknownKeyError
+from torchtransient.interfaces import IntegratorInterface
 from torchtransient.plugins.node_walk import ShownValue
-from torchtransient.plugins.parameters import ParameterEffect, ParameterTracker
+from torchtransient.plugins.parameters import SILHOUETTES, ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
 from torchtransient.render.build import BuiltScene
 
@@ -122,7 +123,10 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
         entries.append(_placed(_describe(built, tracker, key, node), tracker, node))
         if key.endswith(".vertex_positions"):
             entries.append(_placed(_mesh_to_world(built, tracker, key, node), tracker, node))
-    return ParameterTable(entries)
+    # Some integrators follow some silhouettes.
+    integrator = built.scene.integrator()
+    here = integrator.silhouettes(built.scene) if isinstance(integrator, IntegratorInterface) else SILHOUETTES
+    return ParameterTable([replace(entry, reason=entry.reason.replace(SILHOUETTES, here)) for entry in entries])
 
 
 def _placed(info: ParameterInfo, tracker: ParameterTracker, node: Any) -> ParameterInfo:

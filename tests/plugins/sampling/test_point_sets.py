@@ -40,3 +40,19 @@ def test_other_seeds_are_other_points():
     a, b = points(64, 1), points(64, 2)
     # The strata stay where they are; what is random is where in them, and the order of the second coordinate.
     assert not np.array_equal(a[0], b[0]) and not np.array_equal(a[1].argsort(), b[1].argsort())
+
+
+def test_several_sets_are_each_a_net_of_its_own():
+    x, y = (np.array(a) for a in plane_points(64, dr.opaque(mi.UInt32, 3), 3))
+    assert sorted(np.floor(x * 64)) == sorted(list(range(64)) * 3)
+    for k in range(3):
+        assert sorted(np.floor(y[64 * k : 64 * (k + 1)] * 64)) == list(range(64))
+    assert not np.array_equal(y[:64], y[64:128])
+
+
+def test_seeds_that_follow_each_other_are_independent():
+    """Kolmogorov's test of both coordinates of one point, over consecutive seeds: 1 % of all exceed 1.63."""
+    count = 2048
+    drawn = np.array([points(1, seed) for seed in range(count)])[..., 0]
+    for x in (*drawn.T, (drawn[:, 0] + drawn[:, 1]) % 1, (drawn[1:, 0] - drawn[:-1, 0]) % 1):
+        assert np.abs(np.sort(x) - np.arange(len(x)) / len(x)).max() * len(x) ** 0.5 < 1.63

@@ -52,7 +52,7 @@ def test_weights_sum_to_the_area():
     total = [dr.sum(draw_samples(table, 1 << 12, seed).weight)[0] for seed in range(16)]
     area, error = table.elements.area.sum(), np.std(total, ddof=1) / 4
     # One over the density varies from element to element: the strata leave little of that.
-    assert error < 2e-3 * area and abs(np.mean(total) - area) < 4 * error
+    assert error < 5e-3 * area and abs(np.mean(total) - area) < 4 * error
 
 
 def test_both_sides_and_both_albedos():

@@ -23,7 +23,7 @@ class Ends:
 
     def __init__(self, fields: dict[str, Any]) -> None:
         self.fields = fields
-        self.width = max(dr.width(value) for value in fields.values())
+        self.width = max((dr.width(value) for value in fields.values()), default=0)
 
     @staticmethod
     def of_samples(elements: Any, samples: Any, meshes: Any) -> Ends:

@@ -16,82 +16,140 @@ import numpy as np
 
 # Creases flatter than this are no outline: 1 minus the cosine of 1.4e-3 radians.
 FLAT = 1e-6
+# Rims that are nearer than this to each other, in parts of the largest coordinate, are one.
+APART = 8e-6
 # Share of the samples that goes by length alone: outlines that the reference points do not see are found all the same.
 DEFENSIVE = 0.1
 
 
 @dataclass
 class Triangles:
-    """A mesh with its vertices joined by position. ``vertices`` (V, 3), as in the mesh; ``faces`` (F, 3), numbers of
-    vertices; ``joined`` (F, 3), numbers of places. Faces without area are left out.
+    """The triangles of several ``meshes``, their vertices joined by position, of one mesh and of different ones.
+
+    ``vertices`` (V, 3), of all meshes in their order; ``first`` (M,), number of each one's first; ``faces`` (F, 3),
+    numbers of vertices; ``joined`` (F, 3), numbers of places; ``mesh`` (F,), number of the mesh. Faces without area are
+    left out.
     """
 
+    meshes: list[Any]
     vertices: np.ndarray
+    first: np.ndarray
     faces: np.ndarray
     joined: np.ndarray
+    mesh: np.ndarray
 
     @staticmethod
-    def of(mesh: Any) -> Triangles:
-        """Those of a Mitsuba mesh, as it is now."""
-        positions = np.array(dr.detach(mesh.vertex_positions_buffer()), dtype=np.float32).reshape(-1, 3)
-        faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-        # Adding zero makes one of the two zeros.
-        keys = np.ascontiguousarray(positions + np.float32(0)).view("V12").ravel()
-        place = np.unique(keys, return_inverse=True)[1].ravel()
-        v = positions.astype(np.float64)
-        twice = np.linalg.norm(np.cross(v[faces[:, 1]] - v[faces[:, 0]], v[faces[:, 2]] - v[faces[:, 0]]), axis=1)
-        faces = faces[twice > 0]
-        return Triangles(v, faces, place[faces])
+    def of(meshes: list[Any]) -> Triangles:
+        """Those of Mitsuba meshes, as they are now."""
+        v = [np.array(dr.detach(m.vertex_positions_buffer()), dtype=np.float32).reshape(-1, 3) for m in meshes]
+        f = [np.array(m.faces_buffer(), dtype=np.int64).reshape(-1, 3) for m in meshes]
+        first = np.cumsum([0, *(len(one) for one in v)])
+        mesh = np.repeat(np.arange(len(f)), [len(one) for one in f])
+        positions = np.concatenate([np.zeros((0, 3), np.float32), *v])
+        faces = np.concatenate(
+            [np.zeros((0, 3), np.int64), *(one + start for one, start in zip(f, first, strict=False))]
+        )
+        corners = positions.astype(np.float64)[faces]
+        some = np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) != 0, axis=1)
+        faces, mesh = faces[some], mesh[some]
+        joined = _joined(positions, faces)
+        return Triangles(meshes, positions.astype(np.float64), first, faces, joined, mesh)
 
     def parts(self) -> np.ndarray:
         """Number of the connected part that each face belongs to, ``(F,)``."""
-        count = int(self.joined.max(initial=-1)) + 1
-        label = np.arange(count)
-        while True:
-            lowest = label[self.joined].min(1)
-            new = label.copy()
-            np.minimum.at(new, self.joined.ravel(), np.repeat(lowest, 3))
-            new = new[new]
-            if np.array_equal(new, label):
-                return np.unique(label[self.joined[:, 0]], return_inverse=True)[1].ravel()
-            label = new
+        return _merged(self.joined, int(self.joined.max(initial=-1)) + 1)[self.joined[:, 0]]
+
+
+def _joined(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Places of the corners of faces. What is not the same to the bit is the same place if it lies on rims: pieces that
+    were put together by transforms are off by some roundings.
+    """
+    # Adding zero makes one of the two zeros.
+    keys = np.ascontiguousarray(positions + np.float32(0)).view("V12").ravel()
+    _, sample, place = np.unique(keys, return_index=True, return_inverse=True)
+    place = place.ravel()
+    joined = place[faces]
+    key, _ = _edge_keys(joined)
+    _, back, count = np.unique(key, return_inverse=True, return_counts=True)
+    on_rim = np.unique(joined[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)[count[back.ravel()] == 1])
+    if not len(on_rim):
+        return joined
+    p = positions[sample[on_rim]].astype(np.float64)
+    cell = p / (APART * max(float(np.abs(p).max()), 1e-30))
+    # Two points nearer than half a cell share one in some of the eight shifted grids.
+    groups = []
+    for shift in range(8):
+        of_grid = np.floor(cell + 0.5 * np.array([shift & 1, shift >> 1 & 1, shift >> 2 & 1])).astype(np.int64)
+        _, index, inverse = np.unique(of_grid, axis=0, return_index=True, return_inverse=True)
+        groups.append(np.stack([np.arange(len(p)), index[inverse.ravel()]], 1))
+    label = np.arange(len(sample))
+    label[on_rim] = on_rim[_merged(np.concatenate(groups), len(p), numbered=False)]
+    return label[joined]
+
+
+def _merged(groups: np.ndarray, count: int, numbered: bool = True) -> np.ndarray:
+    """A label for each of ``count`` things, the same for those that a row of ``groups`` (G, K) names: the least number
+    of its like, or ``numbered`` from zero on.
+    """
+    label = np.arange(count)
+    while True:
+        new = label.copy()
+        np.minimum.at(new, groups.ravel(), np.repeat(label[groups].min(1), groups.shape[1]))
+        new = new[new]
+        if np.array_equal(new, label):
+            return np.unique(label, return_inverse=True)[1].ravel() if numbered else label
+        label = new
+
+
+def _edge_keys(joined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A number for each edge of each face, the same for the same edge, and whether it is one at all: ``(3 F,)``."""
+    low, high = joined.ravel(), joined[:, [1, 2, 0]].ravel()
+    return np.minimum(low, high) * (int(joined.max(initial=0)) + 1) + np.maximum(low, high), low != high
 
 
 @dataclass
 class Edges:
-    """Edges of one mesh, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices. ``sides``: the third
-    corners of the two outermost faces, twice the same where there is one. ``closed``: no edge has a single face.
+    """Edges of some faces, ``E`` of them: ``ends`` (E, 2) and ``sides`` (E, 2), numbers of vertices; ``mesh`` (E,),
+    that of the ends. ``sides``: the third corners of the two outermost faces, twice the same where there is one.
+    ``share`` (E,): an edge at which several meshes meet is listed for each of them, with shares that sum to one.
+    ``closed``: no edge has a single face.
     """
 
     ends: np.ndarray
     sides: np.ndarray
+    mesh: np.ndarray
+    share: np.ndarray
     closed: bool
 
     @staticmethod
-    def of(mesh: Triangles, faces: np.ndarray) -> Edges:
-        """The edges that can be outlines of some faces (F,) of a mesh, given by their numbers."""
-        corners, places = mesh.faces[faces], mesh.joined[faces]
-        a, b, c = ([0, 1, 2], [1, 2, 0], [2, 0, 1])
-        low, high = places[:, a].ravel(), places[:, b].ravel()
-        key = np.minimum(low, high) * (int(places.max(initial=0)) + 1) + np.maximum(low, high)
-        order = np.argsort(key, kind="stable")
-        first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    def of(all_of_them: Triangles, faces: np.ndarray) -> Edges:
+        """The edges that can be outlines of some faces (F,), given by their numbers."""
+        corners = all_of_them.faces[faces]
+        key, whole = _edge_keys(all_of_them.joined[faces])
+        mesh = np.repeat(all_of_them.mesh[faces], 3)
+        order = np.lexsort((mesh, key))
+        order = order[whole[order]]
+        ends = np.stack([corners.ravel(), corners[:, [1, 2, 0]].ravel()], 1)[order]
+        third, mesh, key = corners[:, [2, 0, 1]].ravel()[order], mesh[order], key[order]
+        new = np.diff(key, prepend=-1) != 0
+        first = np.flatnonzero(new)
         count = np.diff(first, append=len(key))
-        ends = np.stack([corners[:, a].ravel(), corners[:, b].ravel()], 1)[order]
-        third = corners[:, c].ravel()[order]
         sides = np.stack([third[first], third[np.minimum(first + 1, len(third) - 1)]], 1)
         sides[count == 1, 1] = sides[count == 1, 0]
-        rows, chosen = ends[first], np.ones(len(first), dtype=bool)
-        two = count == 2
-        h = [_across(mesh.vertices, rows[two], sides[two, i]) for i in range(2)]
+        chosen, two = np.ones(len(first), dtype=bool), count == 2
+        h = [_across(all_of_them.vertices, ends[first[two]], sides[two, i]) for i in range(2)]
         chosen[two] = (h[0] * h[1]).sum(1) > -1 + FLAT
         for e in np.flatnonzero(count > 2):
-            around = third[first[e] : first[e] + count[e]]
-            pair = _outermost(mesh.vertices, rows[e], around)
+            pair = _outermost(all_of_them.vertices, ends[first[e]], third[first[e] : first[e] + count[e]])
             chosen[e] = pair is not None
             if pair is not None:
                 sides[e] = pair
-        return Edges(rows[chosen], sides[chosen], bool(np.all(count > 1)))
+        listed = np.flatnonzero(new | (np.diff(mesh, prepend=-1) != 0))
+        group = (np.cumsum(new) - 1)[listed]
+        share = 1 / np.bincount(group, minlength=len(first))[group] if len(group) else np.zeros(0)
+        some = chosen[group]
+        closed = bool(np.all(count > 1))
+        return Edges(ends[listed][some], sides[group][some], mesh[listed][some], share[some], closed)
 
 
 def _across(v: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -119,50 +177,53 @@ def _outermost(v: np.ndarray, ends: np.ndarray, around: np.ndarray) -> np.ndarra
 
 
 class EdgeTable:
-    """Edges of several ``meshes`` (pairs of a Mitsuba mesh and its :class:`Edges`) with a density along them, and their
-    attached ends. ``viewpoints`` and ``normals`` ``(P, 3)``: points that see them, some of the wall.
+    """Some edges of ``triangles`` with a density along them, and their attached ends. ``viewpoints`` and ``normals``
+    ``(P, 3)``: points that see them, some of the wall.
 
     The probability of an edge is the root mean square over the viewpoints of what it spans there over the square of
     the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain length.
     """
 
-    def __init__(self, meshes: list[tuple[Any, Edges]], viewpoints: np.ndarray, normals: np.ndarray) -> None:
-        corners = [np.concatenate([edges.ends, edges.sides], 1) for _, edges in meshes]
-        points = []
-        for (mesh, _), numbers in zip(meshes, corners, strict=True):
-            v = np.array(dr.detach(mesh.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
-            points.append(v[numbers])
-        p = np.concatenate(points)
+    def __init__(self, triangles: Triangles, edges: list[Edges], viewpoints: np.ndarray, normals: np.ndarray) -> None:
+        mesh = np.concatenate([part.mesh for part in edges])
+        order = np.argsort(mesh, kind="stable")
+        mesh, ends, sides, share = (
+            mesh[order],
+            *(np.concatenate([getattr(part, name) for part in edges])[order] for name in ("ends", "sides", "share")),
+        )
+        p = triangles.vertices[np.concatenate([ends, sides], 1)]
         length = np.linalg.norm(p[:, 1] - p[:, 0], axis=1)
         plain = length / length.sum()
         weight = _weights(p, viewpoints, normals)
         total = weight.sum()
         probability = (1 - DEFENSIVE) * weight / total + DEFENSIVE * plain if total > 0 else plain
-        self.distribution = mi.DiscreteDistribution(mi.Float(probability.astype(np.float32)))
+        self._distribution = mi.DiscreteDistribution(mi.Float(probability.astype(np.float32)))
+        self._share = mi.Float(share.astype(np.float32))
+        self._sides = [mi.Point3f(p[:, i].T.astype(np.float32)) for i in (2, 3)]
         with dr.resume_grad():
-            self.ends = [_gathered(meshes, [row[:, i] for row in corners]) for i in range(2)]
-            with dr.suspend_grad():
-                self.sides = [_gathered(meshes, [row[:, i] for row in corners]) for i in (2, 3)]
-        dr.eval(self.ends, self.sides)
+            self.ends = [_attached(triangles, mesh, ends[:, i]) for i in range(2)]
+        dr.eval(self.ends, self._sides, self._share)
 
-    def sample(self, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-        """For two numbers in [0, 1) (``Float64``, ``Float``): number of an edge, the place on it in [0, 1), the density
-        per unit of that place, and the third corners of the faces there.
-        """
-        index, pmf = self.distribution.sample_pmf(dr.minimum(mi.Float(x), dr.one_minus_epsilon(mi.Float)))
-        return index, y, pmf, [dr.gather(mi.Point3f, side, index) for side in self.sides]
+    def sample(self, x: Any) -> tuple[Any, Any]:
+        """Number of an edge for a ``Float64`` in [0, 1), and one over its probability, times its share."""
+        index, p = self._distribution.sample_pmf(dr.minimum(mi.Float(x), dr.one_minus_epsilon(mi.Float)))
+        return index, dr.gather(mi.Float, self._share, index) / p
 
     def end_points(self, index: Any) -> list[Any]:
         """The ends (Point3f) of edges, attached where gradients are not suspended."""
         return [dr.gather(mi.Point3f, end, index) for end in self.ends]
 
+    def third_corners(self, index: Any) -> list[Any]:
+        """Those (Point3f) of the outermost faces at edges."""
+        return [dr.gather(mi.Point3f, side, index) for side in self._sides]
 
-def _gathered(meshes: list[tuple[Any, Edges]], numbers: list[np.ndarray]) -> Any:
-    """Vertices of several meshes as one Point3f."""
-    points = [
-        dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), mi.UInt32(rows.astype(np.uint32)))
-        for (mesh, _), rows in zip(meshes, numbers, strict=True)
-    ]
+
+def _attached(triangles: Triangles, mesh: np.ndarray, vertices: np.ndarray) -> Any:
+    """Vertices, given by their numbers and in the order of their meshes, as one Point3f."""
+    points = []
+    for number in np.unique(mesh):
+        rows = (vertices[mesh == number] - triangles.first[number]).astype(np.uint32)
+        points.append(dr.gather(mi.Point3f, triangles.meshes[number].vertex_positions_buffer(), mi.UInt32(rows)))
     return mi.Point3f(*[dr.concat([point[axis] for point in points]) for axis in range(3)])
 
 

@@ -2,8 +2,8 @@
 
 How samples are seen, ``cos cos / r^2`` where nothing stands in between and the distance, is found once for each pair
 of a sample and a point of the wall, one ray each, and kept in pairs of numbers. Every lane is a pair of a scan point
-and a laser spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many samples
-are in a block as memory allows, however many points there are.
+and a laser spot, has a histogram of its own and loops over the samples of a block: two loads and a product. As many
+samples are in a block as memory allows, however many points there are.
 """
 
 from __future__ import annotations
@@ -34,10 +34,21 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
     interpolated and the film is stored in one band. Raises SceneError, ShapeError.
     """
     film = job.film
+    job.check_region(lasers)
     if not film.exhaustive_scan:
         raise SceneError(
             "add_exhaustive: expected a film with a histogram for every pair of laser and sensor position; set "
             "exhaustive_scan, laser_scan_width and laser_scan_height."
+        )
+    if film.lanes_at_most(1) is not None:
+        raise SceneError(
+            f"add_exhaustive: expected a film that adds events up at once, got a {film.plugin}, which lists them. Use "
+            "the general path integrator."
+        )
+    if job.samples.tiles > 1:
+        raise SceneError(
+            "add_exhaustive: expected samples that all scan points share, got those of "
+            f"{job.samples.tiles} tiles; build HiddenElements without tiles."
         )
     if lasers.width != film.laser_count():
         raise ShapeError(
@@ -109,7 +120,7 @@ class SampleBlock:
         if self.colours == 1:
             g *= dr.sqrt(value[0] * dr.gather(mi.Float, samples.weight, k))
         active = (g > 0) & (dr.max(value) > 0)
-        active &= ~occluded(job.scene, sample, line, p, mi.Vector3f(n), active)
+        active &= ~occluded(job.scene, sample, line, p, mi.Vector3f(n), active & (k >= samples.clear))
         g = dr.select(active, dr.mulsign(g, line.cos), 0)
         table = dr.zeros(mi.Float, 2 * self.rows * points.width)
         dr.scatter(table, mi.Vector2f(g, line.r), lane)
@@ -122,13 +133,13 @@ class Pairs:
 
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, laser: Any) -> None:
         _, _, value, leg = job.sensors.take(pixel)
-        _, _, spot_value, spot_leg = lasers.take(laser)
-        self.factor = value * job.energy * spot_value
-        self.opl = leg + spot_leg - job.film.start_opl
+        _, _, laser_value, laser_leg = lasers.take(laser)
+        self.factor = value * job.energy * laser_value
+        self.origin = leg + laser_leg - job.film.start_opl
         self.pixel, self.laser = pixel, laser
         self.sensor_count = dr.opaque(mi.UInt32, job.sensors.width)
-        self.spot_count = dr.opaque(mi.UInt32, lasers.width)
-        dr.eval(self.factor, self.opl, self.pixel, self.laser)
+        self.laser_count = dr.opaque(mi.UInt32, lasers.width)
+        dr.eval(self.factor, self.origin, self.pixel, self.laser)
 
 
 def _launch(
@@ -143,7 +154,7 @@ def _launch(
     pairs = Pairs(job, lasers, pixel, laser)
     wanted = pixel <= laser if mirrored else mi.Mask(True)
     base = film.pixel_base(local * film.entries_per_pixel(), laser)
-    target = film.create_block(Local(band=band), base, job.match, 1, exclusive=True)
+    target = film.create_block(Local(band=band), base, job.match, 1, exclusive=True, origin=pairs.origin)
     kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0)}
     kept = sum_over_block(job, block, pairs, target, kept, wanted)
     _count(film, job.match, pixel, kept, wanted)
@@ -173,12 +184,12 @@ def sum_over_block(job, block, pairs, target, kept, wanted):
 def deposit(job, block, pairs, target, kept, k):
     """One sample's light."""
     seen = dr.gather(mi.Vector2f, block.seen, k * pairs.sensor_count + pairs.pixel)
-    lit = dr.gather(mi.Vector2f, block.lit, k * pairs.spot_count + pairs.laser)
+    lit = dr.gather(mi.Vector2f, block.lit, k * pairs.laser_count + pairs.laser)
     g = seen.x * lit.x
     active = g > 0
-    opl = pairs.opl + mi.Float64(seen.y + lit.y)
+    opl = seen.y + lit.y
     if job.window is not None:
-        active &= job.window.counts(opl)
+        active &= job.window.counts(target.counted(opl))
     value = pairs.factor * g
     if block.values is not None:
         row = dr.gather(mi.Vector4f, block.values, 2 * k + dr.select(seen.x > 0, mi.UInt32(0), 1), active)
@@ -192,18 +203,24 @@ def deposit(job, block, pairs, target, kept, k):
 def _mirror(film: Any) -> None:
     """Histograms of (scan point, laser spot) with the numbers in descending order, from those in ascending order."""
     cube = film.band_array(0)
-    points, size = film.laser_count(), film.temporal_bins * film.channel_count()
+    points, size = film.laser_count(), film.entries_per_array()
+    # Four numbers at once where a histogram is made of fours.
+    packet = 4 if size % 4 == 0 else 1
+    kind = type(cube) if packet == 1 else (mi.Vector4f if type(cube) is mi.Float else mi.Vector4d)
+    parts = size // packet
     # Row by row of scan points: what is in flight stays small.
     at_once = max(1, 2**24 // (points * size))
     for first in range(0, points, at_once):
         rows = min(at_once, points - first)
-        i = dr.arange(mi.UInt32, rows * points * size)
-        entry = i % dr.opaque(mi.UInt32, size)
-        pair = i // dr.opaque(mi.UInt32, size)
+        i = dr.arange(mi.UInt32, rows * points * parts)
+        pair = i // dr.opaque(mi.UInt32, parts)
+        part = i - pair * dr.opaque(mi.UInt32, parts)
         point = pair // dr.opaque(mi.UInt32, points)
         laser, point = pair - point * dr.opaque(mi.UInt32, points), point + dr.opaque(mi.UInt32, first)
         below = laser < point
-        other = (laser * points + point) * size + entry
-        value = dr.gather(type(cube), cube, other, below)
-        dr.scatter(cube, value, (point * points + laser) * size + entry, below)
+        value = dr.gather(kind, cube, (laser * points + point) * parts + part, below)
+        target = (point * points + laser) * parts + part
+        # Before the array is written to, which would be copied otherwise.
+        dr.eval(value, target, below)
+        dr.scatter(cube, value, target, below)
         dr.eval(cube)

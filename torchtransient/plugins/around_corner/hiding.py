@@ -24,64 +24,64 @@ STEPS = 64
 
 @dataclass
 class Part:
-    """A connected piece of a mesh, or a whole shape without triangles (``edges`` None).
+    """A connected piece of meshes, or a whole shape without triangles (``edges`` None).
 
-    ``shape``: number in the list of shapes; ``corners`` (K, 3): points whose convex hull holds it; ``planes`` (M, 3):
+    ``shapes``: numbers in the list of shapes; ``corners`` (K, 3): points whose convex hull holds it; ``planes`` (M, 3):
     normals of planes that may part it from others; ``hides_itself``: it is not known to be flat, or convex and closed.
     """
 
-    shape: int
+    shapes: frozenset[int]
     corners: np.ndarray
     planes: np.ndarray
     hides_itself: bool
     edges: Edges | None
 
 
-def parts_of(shapes: list[Any]) -> list[Part]:
-    """The parts of all shapes. Meshes of very many pieces count as one."""
-    found = []
-    for number, shape in enumerate(shapes):
-        if not shape.is_mesh():
-            found.append(_of_bounds(number, shape))
-            continue
-        mesh = Triangles.of(shape)
-        part = mesh.parts()
-        count = int(part.max(initial=-1)) + 1
-        if count > MOST_PARTS:
-            part, count = np.zeros_like(part), 1
-        order = np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=count))[:-1])
-        found += [_of_faces(number, mesh, faces) for faces in order if len(faces)]
-    return found
+def parts_of(shapes: list[Any]) -> tuple[list[Part], Triangles]:
+    """The parts of all shapes, and the triangles of the meshes. Of very many pieces those of a mesh count as one."""
+    numbers = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
+    triangles = Triangles.of([shapes[k] for k in numbers])
+    label = triangles.parts()
+    if label.max(initial=-1) >= MOST_PARTS:
+        label = triangles.mesh
+    order = np.argsort(label, kind="stable")
+    pieces = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
+    found = [_of_faces(frozenset(numbers[k] for k in np.unique(triangles.mesh[f])), triangles, f) for f in pieces]
+    found += [_of_bounds(k, shape) for k, shape in enumerate(shapes) if not shape.is_mesh()]
+    return found, triangles
 
 
 def _of_bounds(number: int, shape: Any) -> Part:
-    low, high = (np.array(corner, dtype=np.float64).ravel() for corner in bounds_of(shape))
-    corners = np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
+    bounds = bounds_of(shape)
+    corners = _box(*(np.array(corner, dtype=np.float64).ravel() for corner in (bounds.min, bounds.max)))
     # A tube shows its inside; spheres and disks cannot hide themselves.
     hides_itself = shape.class_name() not in ("Sphere", "Disk")
-    return Part(number, corners, np.eye(3), hides_itself, None)
+    return Part(frozenset([number]), corners, np.eye(3), hides_itself, None)
 
 
-def _of_faces(number: int, mesh: Triangles, faces: np.ndarray) -> Part:
-    edges = Edges.of(mesh, faces)
-    v = mesh.vertices[np.unique(mesh.faces[faces])]
-    _, axes = np.linalg.eigh(np.cov((v - v.mean(0)).T))
-    planes = axes.T
-    size = max(float(np.ptp(v, axis=0).max()), 1e-30)
-    local = (v - v.mean(0)) @ axes
-    flat = float(np.ptp(local, axis=0).min()) < ROUNDING * size
-    hides_itself = not flat and not (edges.closed and _is_convex(mesh, faces, v, ROUNDING * size))
+def _box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The corners ``(8, 3)`` of a box."""
+    return np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
+
+
+def _of_faces(shapes: frozenset[int], triangles: Triangles, faces: np.ndarray) -> Part:
+    edges = Edges.of(triangles, faces)
+    v = triangles.vertices[np.unique(triangles.faces[faces])]
+    middle = v.mean(0)
+    _, axes = np.linalg.eigh((v - middle).T @ (v - middle))
+    local = (v - middle) @ axes
+    size = np.ptp(local, axis=0)
+    flat = bool(size.min() < ROUNDING * size.max())
+    hides_itself = not flat and not (edges.closed and _is_convex(triangles, faces, v, ROUNDING * size.max()))
     if len(v) > MOST_CORNERS:
-        low, high = local.min(0), local.max(0)
-        box = np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
-        v = box @ axes.T + v.mean(0)
-    return Part(number, v, planes, hides_itself, edges)
+        v = _box(local.min(0), local.max(0)) @ axes.T + middle
+    return Part(shapes, v, axes.T, hides_itself, edges)
 
 
-def _is_convex(mesh: Triangles, faces: np.ndarray, v: np.ndarray, tolerance: float) -> bool:
+def _is_convex(triangles: Triangles, faces: np.ndarray, v: np.ndarray, tolerance: float) -> bool:
     if len(faces) * len(v) > MOST_PRODUCTS:
         return False
-    a, b, c = (mesh.vertices[mesh.faces[faces, i]] for i in range(3))
+    a, b, c = (triangles.vertices[triangles.faces[faces, i]] for i in range(3))
     n = np.cross(b - a, c - a)
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     heights = n @ v.T - (n * a).sum(1)[:, None]
@@ -93,11 +93,13 @@ def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, of_interest: Any) ->
     """(hider, hidden) by number, of the parts of which one may hide the other from some of the ``viewpoints`` (P, 3).
 
     ``of_interest(i, j)``: which pairs are asked for. Conservative: what is left out cannot happen. A part that may hide
-    points of its own is a pair with itself.
+    points of its own is a pair with itself. Of too many parts each one may hide another.
     """
-    asked = [(i, j) for i in range(len(parts)) for j in range(len(parts)) if of_interest(i, j)]
-    if len(parts) > MOST_PARTS:
-        return asked
+    count = len(parts)
+    if count > MOST_PARTS:  # one for each will do
+        found = ((i, next((j for j in range(count) if j != i and of_interest(i, j)), None)) for i in range(count))
+        return [(i, j) for i, j in found if j is not None]
+    asked = [(i, j) for i in range(count) for j in range(count) if of_interest(i, j)]
     return [(i, j) for i, j in asked if _may_hide(parts[i], parts[j], viewpoints, i == j)]
 
 

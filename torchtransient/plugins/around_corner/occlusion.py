@@ -8,12 +8,12 @@ and what its interior derivative leaves out is the motion of the outlines: the j
 viewpoint ``Q``, a scanned point or a laser spot. An outline is a piece of an edge, and what it hides begins at the
 point ``y`` behind a point ``p`` of it. Seen from ``Q`` the edge moves outwards against ``y`` by the angle
 
-    sweep = n . ((dp - dQ) / |p - Q| - (dy - dQ) / |y - Q|),
+    outwards = n . ((dp - dQ) / |p - Q| - (dy - dQ) / |y - Q|),
 
 with ``n`` across the edge and the line of sight, out of what hides. An angle across is an area of ``y`` times
 ``cos_y / |y - Q|^2``, and the length ``dl`` of the edge spans ``|d x t| / |p - Q| dl`` along, so that
 
-    dI = - int  f(y) |y - Q|^2 / cos_y  |d x t| / |p - Q|  sweep  dl
+    dI = - int  f(y) |y - Q|^2 / cos_y  |d x t| / |p - Q|  outwards  dl
 
 over the outlines seen from ``Q``. Where a spot and the scanned point differ, both are viewpoints, each with the
 visibility from the other one as a factor. (The boundary term of differentiable rendering, Li et al. 2018, in the
@@ -80,7 +80,7 @@ class MutualOcclusion:
                 objective = mi.Float(0)
                 for term in self._terms(rays, pixel, job):
                     A, _ = block.read(term.opl, term.active)
-                    objective += dr.select(term.active, total_of(A, term.value) * term.sweep, 0)
+                    objective += dr.select(term.active, total_of(A, term.value) * term.outwards, 0)
                 if dr.grad_enabled(objective):
                     dr.backward_from(objective)
             dr.eval()
@@ -95,10 +95,10 @@ class MutualOcclusion:
             block = film.create_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():
                 terms = self._terms(rays, pixel, job)
-                sweeps = tangents_of([term.sweep for term in terms])
+                tangents = tangents_of([term.outwards for term in terms])
             events, total = block.begin(), light_type()(0)
-            for term, sweep in zip(terms, sweeps, strict=True):
-                value = dr.select(term.active, term.value * sweep, 0)
+            for term, outwards in zip(terms, tangents, strict=True):
+                value = dr.select(term.active, term.value * outwards, 0)
                 block.put_slope(events, term.opl, value, light_type()(0), term.active)
                 total += value
             block.end(events)
@@ -115,7 +115,7 @@ class MutualOcclusion:
     # --------------------------------------------------------------------------------------------- the terms
 
     def _terms(self, rays: Any, pixel: Any, job: Pass) -> list[Local]:
-        """One term for each viewpoint: ``value`` (detached), ``sweep`` (attached), ``opl``, ``active``."""
+        """One term for each viewpoint: ``value`` (detached), ``outwards`` (attached), ``opl``, ``active``."""
         world = self.world
         ray = dr.detach(rays.ray)
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
@@ -143,12 +143,13 @@ class MutualOcclusion:
         number = lane - lane // dr.opaque(mi.UInt32, job.spp) * dr.opaque(mi.UInt32, job.spp)
         # Every pixel has points of its own.
         seed, _ = mi.sample_tea_32(mi.UInt32(job.seed), pixel)
-        index, u, pmf, sides = self.edges.sample(*plane_point(number, job.spp, seed))
+        x, u = plane_point(number, job.spp, seed)
+        index, per_edge = self.edges.sample(x)
         a, b = self.edges.end_points(index)
         along = dr.detach(b) - dr.detach(a)
         length = dr.norm(along)
-        p = dr.lerp(a, b, u)
-        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length / pmf)
+        p, sides = dr.lerp(a, b, u), self.edges.third_corners(index)
+        return Local(p=p, at=dr.detach(p), t=along / length, sides=sides, weight=length * per_edge)
 
     def _term(self, place: Local, edge: Local, from_spot: bool) -> Local:
         """The boundary term of one viewpoint."""
@@ -172,9 +173,14 @@ class MutualOcclusion:
             beyond = dr.norm(si.p - viewer.p)
             active &= si.is_valid() & (beyond > distance * (1 - BEFORE))
             value, opl, active = self._light(place, si, from_spot, active)
-            value *= -dr.select(active, edge.weight * spans / distance, 0)
-        sweep = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
-        return Local(value=value, sweep=dr.select(active, sweep, 0), opl=opl, active=active)
+            weight = -edge.weight * spans / distance
+            if not self.spots.confocal:
+                weight *= self._seen_otherwise(
+                    place.seen if from_spot else place.lit, viewer, si, d - n * BESIDE, active
+                )
+            value *= dr.select(active, weight, 0)
+        outwards = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
+        return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
 
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
         """(light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some)."""
@@ -184,9 +190,6 @@ class MutualOcclusion:
         d_seen, d_spot = to_hidden / r_seen, to_spot / r_spot
         cos_seen, cos_spot = dr.abs_dot(si.n, d_seen), dr.abs_dot(si.n, d_spot)
         active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
-        if not self.spots.confocal:
-            other = seen if from_spot else lit
-            active &= ~world.scene.ray_test(si.spawn_ray_to(other.p), active)
         at_wall = self._scattered(seen, place.ray.d, d_seen, active)
         hidden = self._scattered(si, d_seen, d_spot, active)
         light = self.spots.light(lit, d_spot, active)
@@ -196,6 +199,17 @@ class MutualOcclusion:
         opl = place.before + mi.Float64((r_seen + r_spot) * place.η)
         active = world.counted(active, opl)
         return dr.select(active, value * measure, 0), opl, active
+
+    def _seen_otherwise(self, other: Any, viewer: Any, si: Any, d: Any, active: Any) -> Any:
+        """How much of the hidden point ``si`` is seen from the ``other`` viewpoint (Float).
+
+        The mean of both sides of the outline, ``d`` pointing to the one that is hidden: where a spot, a scanned point
+        and an edge lie in one plane, both viewpoints have the same outline, which counts once and not twice.
+        """
+        hidden = dr.copy(si)
+        hidden.p = mi.Point3f(viewer.p + d * (dr.dot(si.n, si.p - viewer.p) / dr.dot(si.n, d)))
+        tests = [self.world.scene.ray_test(at.spawn_ray_to(other.p), active) for at in (si, hidden)]
+        return sum(dr.select(hit, mi.Float(0), 0.5) for hit in tests)
 
     def _scattered(self, si: Any, into: Any, out: Any, active: Any) -> Any:
         """Value of the BSDF between the frames of the segments: the ray of direction ``into`` goes on by ``out``."""

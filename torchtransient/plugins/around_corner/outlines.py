@@ -14,6 +14,7 @@ from torchtransient.plugins.around_corner.edges import EdgeTable
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
+from torchtransient.plugins.parameter_effect import CORRECT
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 
@@ -22,6 +23,27 @@ SHARE = 4
 # Viewpoints that the density of edges is made for.
 MOST_REFERENCES = 25
 _SEED = 0x85EBCA6B
+
+
+def follows_outlines(segment: type, contents: Any) -> bool:
+    """Whether outlines are followed in derivatives: where hidden points are points of their shapes (``segment``), and
+    nothing scatters late.
+    """
+    return issubclass(segment, MaterialVacuum) and contents.delays is None
+
+
+def silhouettes(least: int, most: int, exhaustive: bool) -> str:
+    """What the table of parameters says of moving silhouettes where outlines are followed, for light of ``least`` to
+    ``most`` bounces.
+    """
+    lacking = []
+    if least <= BOUNCES <= most and not exhaustive:
+        lacking = ["behind shapes without triangles", "where bodies run into each other"]
+    if least <= BOUNCES <= most and exhaustive:
+        lacking = ["where one hidden part may hide another (refused)"]
+    if most > BOUNCES:
+        lacking += ["in light of more than three bounces where one part hides another"]
+    return f"correct except {', '.join(lacking)} (no boundary term)" if lacking else CORRECT
 
 
 class Viewpoints:
@@ -52,14 +74,15 @@ def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def mutual_occlusion(
     integrator: Any, world: Any, sensor: Any, film: Any, seed: Any, spp: int, scanned: Any
 ) -> MutualOcclusion | None:
-    """The boundary term of a job, None where nothing that moves can change what hides what.
+    """The boundary term of a job, None where nothing that moves can change what hides what, or where outlines are not
+    followed.
 
     ``scanned``: preliminary intersections of the scanned points. ``spp``: of the job, 0 for the sampler's own; there
     is an edge sample for every ``SHARE`` paths. Raises GradientError in exhaustive captures, where every pair of
     positions would have outlines of its own; warns where something that has no edges may hide another thing.
     """
     wanted = world.wanted
-    if not (wanted.geometry and isinstance(world.segment, MaterialVacuum)):
+    if not (wanted.geometry and follows_outlines(type(world.segment), world.contents)):
         return None
     if not world.min_depth <= BOUNCES <= world.max_depth:
         return None
@@ -71,10 +94,10 @@ def mutual_occlusion(
     shapes = list(world.scene.shapes())
     moving = {k for k, shape in enumerate(shapes) if shape.ptr in wanted.shapes}
     moves_viewpoints |= any(registry_number(shapes[k]) in viewpoints.shapes for k in moving)
-    parts = parts_of(shapes)
+    parts, triangles = parts_of(shapes)
 
     def of_interest(i: int, j: int) -> bool:
-        return moves_viewpoints or parts[i].shape in moving or parts[j].shape in moving
+        return bool(moves_viewpoints or moving & parts[i].shapes or moving & parts[j].shapes)
 
     pairs = hiding_pairs(parts, viewpoints.p, of_interest)
     if not pairs:
@@ -86,7 +109,7 @@ def mutual_occlusion(
     if not hiders:
         return None
     rows = viewpoints.references
-    edges = EdgeTable([(shapes[parts[i].shape], parts[i].edges) for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
+    edges = EdgeTable(triangles, [parts[i].edges for i in hiders], viewpoints.p[rows], viewpoints.n[rows])
     sampler = sensor.sampler().clone()
     count = spp or sampler.sample_count()
     own_seed, _ = mi.sample_tea_32(seed_array(seed), mi.UInt32(_SEED))
@@ -98,10 +121,10 @@ def _names(shapes: list[Any], parts: list[Part], pairs: list[tuple[int, int]]) -
     """Up to three of the pairs in words."""
 
     def name(part: Part) -> str:
-        return repr(shapes[part.shape].id() or shapes[part.shape].class_name())
+        return " and ".join(repr(shapes[k].id() or shapes[k].class_name()) for k in sorted(part.shapes))
 
     words = [
-        f"{name(parts[i])} hides another part of itself" if parts[i].shape == parts[j].shape
+        f"{name(parts[i])} hides another part of itself" if name(parts[i]) == name(parts[j])
         else f"{name(parts[i])} hides {name(parts[j])}"
         for i, j in pairs
     ]  # fmt: skip

@@ -22,8 +22,6 @@ class SampleTable:
 
     def __init__(self, samples: SharedSamples, front: Any = None, n: Any = None, delay: Any = None) -> None:
         self.count, self.smooth, self.lit = samples.count, samples.smooth, delay is not None
-        # In memory, so that kernels do not depend on the number of samples.
-        self.size = dr.opaque(mi.UInt32, samples.count)
         n = samples.n if n is None else n
         f = list(samples.front * samples.weight if front is None else front)
         b = list(samples.back * samples.weight)
@@ -33,7 +31,7 @@ class SampleTable:
         if samples.smooth:
             rows.append([*samples.geometric_n, mi.Float(0)])
         self.packets, self.channels = len(rows), len(f)
-        self.flat = packed_columns(rows, samples.count)
+        self.flat = packed_columns(rows, samples.count * samples.tiles)
 
     def load(self, k: Any, active: Any = True) -> Local:
         """``p``, ``n``, ``geometric_n``, ``front``, ``back`` and ``delay`` of samples."""

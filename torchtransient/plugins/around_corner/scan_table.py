@@ -25,12 +25,11 @@ class LaserSpots:
     ``si`` (SurfaceInteraction3f of all spots), ``length`` (Float, from the laser), ``origin`` (Point3f).
     """
 
-    def __init__(self, scene: Any, laser: Any, targets: Any, origin: Any) -> None:
+    def __init__(self, scene: Any, laser: Any, aims: Any, origin: Any) -> None:
         self.emitter, self.origin = laser, origin
-        d = targets - self.origin
-        there = dr.norm(d)
-        _check_not_at(dr.detach(there), "laser", "emitter's to_world")
-        self.ray = mi.Ray3f(self.origin, d / there)
+        there = dr.norm(aims)
+        _check_not_at(dr.detach(there), "laser", "emitter's to_world or laser_origin")
+        self.ray = mi.Ray3f(self.origin, aims / there)
         with dr.suspend_grad():
             pi = scene.ray_intersect_preliminary(dr.detach(self.ray), coherent=True)
             dr.eval(pi)
@@ -84,42 +83,55 @@ def origin_of(scene: Any, sensor: Any) -> Any:
     return mi.Point3f(laser_of(scene).world_transform().translation()) if given is None else given
 
 
-def targets_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) -> Any:
-    """Where the laser points (Point3f): one target, or one for every pixel, or one for every laser position.
+def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) -> Any:
+    """Where the laser points from its origin (Vector3f, of any length): one direction, or one for every pixel, or one
+    for every laser position.
 
     ``fov``: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for those
     of the sensor.
     """
-    laser = laser_of(scene)
+    transform, origin = laser_of(scene).world_transform(), origin_of(scene, sensor)
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
-        return given
+        return given - origin
     if capture is CaptureType.SINGLE:
-        transform = laser.world_transform()
-        return mi.Point3f(transform.translation()) + transform @ mi.Vector3f(0, 0, 1)
+        return transform @ mi.Vector3f(0, 0, 1)
     if fov is None:
-        return sensor_targets(sensor)
+        return scanned_points(scene, sensor) - origin
     film = sensor.film()
     columns, rows = film.laser_scan_width, film.laser_scan_height
     index = dr.arange(mi.UInt32, columns * rows)
     half = float(np.tan(np.radians(fov / 2)))
     x = (mi.Float(index % columns) + 0.5) / columns * 2 - 1
     y = (mi.Float(index // columns) + 0.5) / rows * 2 - 1
-    transform = laser.world_transform()
-    local = mi.Vector3f(-x * half, -y * half * rows / columns, 1)
-    return mi.Point3f(transform.translation()) + transform @ local
+    return transform @ mi.Vector3f(-x * half, -y * half * rows / columns, 1)
 
 
-def sensor_targets(sensor: Any) -> Any:
-    """A point ahead of the sensor on the axis of every pixel of its film (of a scan: the scanned point)."""
+def scan_rays(sensor: Any) -> Any:
+    """One ray (Ray3f) for each pixel of a sensor's film, to the scanned point or along the pixel's axis; attached where
+    the sensor is.
+    """
+    if hasattr(sensor, "scanned"):
+        origin = mi.Point3f(sensor.origin)
+        return mi.Ray3f(origin, dr.normalize(sensor.scanned() - origin))
     size = sensor.film().crop_size()
     index = dr.arange(mi.UInt32, int(size[0]) * int(size[1]))
-    if hasattr(sensor, "targets"):
-        return sensor.targets(index)
     row = index // int(size[0])
     place = mi.Point2f(mi.Float(index - row * int(size[0])), mi.Float(row)) + 0.5
     ray, _ = sensor.sample_ray(0.0, 0.5, place / mi.ScalarVector2f(size), mi.Point2f(0.5))
-    return mi.Point3f(ray.o + ray.d)
+    return mi.Ray3f(ray.o, ray.d)
+
+
+def scanned_points(scene: Any, sensor: Any) -> Any:
+    """The scanned points (Point3f): as the sensor says, or what its pixels see."""
+    if hasattr(sensor, "scanned"):
+        return sensor.scanned()
+    ray = scan_rays(sensor)
+    with dr.suspend_grad():
+        pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
+        dr.eval(pi)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+    return dr.select(si.is_valid(), si.p, ray.o + ray.d)
 
 
 def reference_points(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -129,14 +141,29 @@ def reference_points(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
     size = sensor.film().crop_size()
     columns, rows = (np.unique(np.linspace(0, int(n) - 1, min(int(n), ACROSS)).round().astype(int)) for n in size)
     index = (rows[:, None] * int(size[0]) + columns).ravel()
-    targets = dr.gather(mi.Point3f, dr.detach(sensor_targets(sensor)), mi.UInt32(index.astype(np.uint32)))
-    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
-    si = scene.ray_intersect(mi.Ray3f(origin, dr.normalize(targets - origin)))
+    rays = dr.gather(mi.Ray3f, dr.detach(scan_rays(sensor)), mi.UInt32(index.astype(np.uint32)))
+    si = scene.ray_intersect(rays)
     p, n = np.array(si.p).T, np.array(dr.select(si.wi.z < 0, -si.n, si.n)).T
     found = np.array(si.is_valid())
     if not found.any():
         _check_hit(np.array(si.t), "sensor")
     return p[found], n[found]
+
+
+def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
+    """Raise SceneError unless the laser has as many aims as the capture asks for."""
+    film, count = sensor.film(), dr.width(aims)
+    if capture is CaptureType.SINGLE and count != 1:
+        raise SceneError(
+            f"scan: a single capture has one laser spot, got {count} laser_points. Give one, or set capture_type to "
+            "exhaustive."
+        )
+    if capture is CaptureType.EXHAUSTIVE and count != film.laser_count():
+        raise SceneError(
+            f"scan: the film has a grid of {film.laser_scan_width} x {film.laser_scan_height} laser positions, and the "
+            f"laser {count} points to aim at. Set laser_scan_width and laser_scan_height to the sensor's grid (or to "
+            "that of laser_points), or force_equal_illumination_scanning to false for a grid around the laser's axis."
+        )
 
 
 def _check_not_at(there: Any, what: str, where: str) -> None:

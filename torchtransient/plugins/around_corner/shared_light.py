@@ -11,7 +11,7 @@ import mitsuba as mi
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.attached import Ends
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
-from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, sensor_targets
+from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints
@@ -28,7 +28,9 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     """What stands against shared samples in a scene, None for nothing."""
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
-    if not hasattr(sensor, "targets"):
+    if sensor.film().exhaustive_scan and sensor.film().measures != "transient":
+        return f"the film of an exhaustive capture is a {sensor.film().plugin}"
+    if not hasattr(sensor, "scanned"):
         return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:
         return "there are participating media"
@@ -63,7 +65,7 @@ def _is_flat_mesh(shape: Any) -> bool:
         return False
     v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
     spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
-    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])  # noqa: PLR2004 (thickness, the least of three)
+    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])
 
 
 @dataclass
@@ -81,7 +83,7 @@ class ScanLight:
 def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType, legs: bool) -> ScanLight:
     """Of the scene as it is now."""
     origin = mi.Point3f(sensor.origin)
-    seen = seen_points(scene, sensor, origin)
+    seen = seen_points(scene, sensor)
     looked_at = _points(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     si = dr.copy(spots.si)
     si.wi = si.to_local(-spots.ray.d)
@@ -98,10 +100,9 @@ def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType,
     return ScanLight(looked_at, _points(si, factor * dr.inv_pi, spots.length if legs else mi.Float(0)), energy)
 
 
-def seen_points(scene: Any, sensor: Any, origin: Any) -> Any:
+def seen_points(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet (SurfaceInteraction3f), attached where sensor or shape are."""
-    targets = sensor_targets(sensor)
-    ray = mi.Ray3f(origin, dr.normalize(targets - origin))
+    ray = scan_rays(sensor)
     with dr.suspend_grad():
         pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
         dr.eval(pi)
@@ -133,7 +134,13 @@ class SharedThirdBounce:
     """
 
     def __init__(
-        self, world: Any, film: Any, light: ScanLight, elements: HiddenElements, capture: CaptureType, draw: tuple[Any, int]
+        self,
+        world: Any,
+        film: Any,
+        light: ScanLight,
+        elements: HiddenElements,
+        capture: CaptureType,
+        draw: tuple[Any, int],
     ) -> None:
         self.world, self.film, self.light, self.capture = world, film, light, capture
         self.samples = draw_samples(elements, draw[1], draw[0])
@@ -146,9 +153,7 @@ class SharedThirdBounce:
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
-        third = ThirdBounce(
-            self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress
-        )
+        third = ThirdBounce(self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress)
         if self.capture is CaptureType.CONFOCAL:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:

@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.errors import SceneError, ShapeError, VariantError
 from torchtransient.plugins.around_corner.geometry import occluded, span
@@ -34,7 +35,8 @@ class ThirdBounce:
     ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
     will be): light is added to what it holds. ``sensors``: the scan points; ``energy`` (J, a number or an
     ``UnpolarizedSpectrum``): of the laser, by colour. ``scene``: everything that can stand in the way, the wall too.
-    ``progress(fraction)`` is called after every kernel launch.
+    ``progress(fraction)`` is called after every kernel launch. ``tile`` (``UInt32``): which tile's samples each scan
+    point takes, where there are several.
 
     Light outside of the film's window is counted as the film does. Raises SceneError, ShapeError, VariantError. Not
     supported: spectral and polarized variants; derivatives.
@@ -48,6 +50,7 @@ class ThirdBounce:
         sensors: WallPoints,
         energy: Any = 1.0,
         progress: Any = None,
+        tile: Any = None,
     ) -> None:
         if mi.is_spectral or mi.is_polarized:
             raise VariantError(
@@ -60,9 +63,16 @@ class ThirdBounce:
                 f"ThirdBounce: expected a pixel of the film for every scan point, got {width} x {height} pixels and "
                 f"{sensors.width} points."
             )
+        if (samples.tiles > 1) != (tile is not None) or (tile is not None and dr.width(tile) != sensors.width):
+            raise ShapeError(
+                f"ThirdBounce: expected the tile of every scan point for samples of {samples.tiles} tiles, and none "
+                f"for one; got {'none' if tile is None else dr.width(tile)}."
+            )
         if film.steady is None:
             raise SceneError("ThirdBounce: expected a film that is prepared; call film.prepare(samples=...) before.")
         self.scene, self.film, self.samples, self.sensors = scene, film, samples, sensors
+        self.tile = tile
+        self.check_region(sensors)
         self.energy = mi.UnpolarizedSpectrum(energy)
         dr.make_opaque(self.energy)
         self.match = ChannelMatch(None, mi.UnpolarizedSpectrum(1))
@@ -80,6 +90,7 @@ class ThirdBounce:
                 f"{lasers.width} spots and {self.sensors.width} points."
             )
         self._check_not_exhaustive("add_confocal")
+        self.check_region(lasers)
         self._run(SampleTable(self.samples), lasers)
 
     def add_single(self, laser: WallPoints) -> None:
@@ -87,7 +98,16 @@ class ThirdBounce:
         if laser.width != 1:
             raise ShapeError(f"add_single: expected one laser spot, got {laser.width}.")
         self._check_not_exhaustive("add_single")
+        self.check_region(laser)
         self._run(lit_by(self.scene, self.samples, laser), laser)
+
+    def check_region(self, points: WallPoints) -> None:
+        """Raise ShapeError for points that samples without visibility rays were not told of."""
+        if self.samples.has_clear and not self.samples.region.holds(np.array(points.p, dtype=float).T):
+            raise ShapeError(
+                "ThirdBounce: expected points within the region that shafts.spare_rays was given, got others; hand all "
+                "scan points and laser spots to it."
+            )
 
     def _check_not_exhaustive(self, name: str) -> None:
         if self.film.exhaustive_scan:
@@ -105,12 +125,23 @@ class ThirdBounce:
     def _launch(self, table: SampleTable, lasers: WallPoints, launch: Launch) -> None:
         film = self.film
         pixel, first, last = launch.lanes()
+        tile = mi.UInt32(0) if self.tile is None else dr.gather(mi.UInt32, self.tile, pixel)
         lane = ScanLanes(self, lasers, pixel, table.lit)
         block = film.create_block(
-            launch, launch.base(film, pixel), self.match, launch.most_events, exclusive=launch.chunks == 1
+            launch,
+            launch.base(film, pixel),
+            self.match,
+            launch.most_events,
+            exclusive=launch.chunks == 1,
+            origin=lane.origin,
         )
         kept = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": block.begin()}
-        kept = sum_over_samples(self, table, lane, block, kept, first, last)
+        clear = dr.clip(dr.gather(mi.UInt32, self.samples.clear, tile), first, last)
+        first, clear, last = (k + tile * dr.opaque(mi.UInt32, table.count) for k in (first, clear, last))
+        if self.samples.has_clear:
+            kept = sum_over_samples(self, table, lane, block, kept, (first, clear), False)
+            first = clear
+        kept = sum_over_samples(self, table, lane, block, kept, (first, last), True)
         block.end(kept["block"])
         film.add_steady(pixel, self.match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
@@ -130,24 +161,26 @@ class ScanLanes:
     def __init__(self, job: ThirdBounce, lasers: WallPoints, pixel: Any, lit: bool) -> None:
         self.p, n, value, leg = job.sensors.take(pixel)
         self.n = mi.Vector3f(n)
-        _, _, spot_value, spot_leg = lasers.take(mi.UInt32(0) if lit else pixel)
+        _, _, laser_value, laser_leg = lasers.take(mi.UInt32(0) if lit else pixel)
         # What arrives at the samples of one spot holds neither the spot's albedo nor the energy.
-        self.factor = value * job.energy * spot_value
-        self.opl = leg + spot_leg - job.film.start_opl
-        dr.eval(self.p, self.n, self.factor, self.opl)
+        self.factor = value * job.energy * laser_value
+        self.origin = leg + laser_leg - job.film.start_opl
+        dr.eval(self.p, self.n, self.factor, self.origin)
 
 
 @dr.syntax
-def sum_over_samples(job, table, lane, block, kept, first, last):
-    """What the samples from ``first`` to ``last`` (exclusive) send to the lanes' scan points, into the film's block."""
-    k = mi.UInt32(first)
+def sum_over_samples(job, table, lane, block, kept, numbers, rays):
+    """What the samples of these ``numbers``, from the first to the last (exclusive), send to the lanes' scan points,
+    into the film's block. ``rays``: whether something may hide them.
+    """
+    k, last = mi.UInt32(numbers[0]), numbers[1]
     while dr.hint(k < last, label="hidden samples"):
-        deposit(job, table, lane, block, kept, k)
+        deposit(job, table, lane, block, kept, k, rays)
         k += 1
     return kept
 
 
-def deposit(job, table, lane, block, kept, k):
+def deposit(job, table, lane, block, kept, k, rays):
     """One sample's light."""
     sample = table.load(k)
     line = span(sample, lane.p, lane.n)
@@ -159,11 +192,11 @@ def deposit(job, table, lane, block, kept, k):
         value = dr.select(line.cos > 0, sample.front, sample.back)
         geometry = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
     value = value * geometry
-    opl = lane.opl + mi.Float64(opl)
     active = side & (dr.max(value) > 0)
     if job.window is not None:
-        active &= job.window.counts(opl)
-    active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
+        active &= job.window.counts(block.counted(opl))
+    if rays:
+        active &= ~occluded(job.scene, sample, line, lane.p, lane.n, active)
     value = value * lane.factor
     kept["L"] = kept["L"] + dr.select(active, value, 0)
     before, after = block.put(kept["block"], opl, value, active)
@@ -179,9 +212,17 @@ def lit_by(scene: Any, samples: SharedSamples, laser: WallPoints) -> SampleTable
     arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
     reflected = dr.select(line.cos > 0, samples.front, samples.back) * samples.weight
     active = (arrives > 0) & (dr.max(reflected) > 0)
-    active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), active)
+    in_doubt = active & ~_clear(samples)
+    active &= ~occluded(scene, sample, line, p, mi.Vector3f(n), in_doubt)
     front = dr.select(active, reflected * arrives, 0)
     return SampleTable(samples, front, dr.mulsign(mi.Vector3f(samples.n), line.cos), line.r)
+
+
+def _clear(samples: SharedSamples) -> Any:
+    """Which samples need no rays."""
+    k, count = dr.arange(mi.UInt32, samples.count * samples.tiles), dr.opaque(mi.UInt32, samples.count)
+    tile = k // count
+    return k - tile * count < dr.gather(mi.UInt32, samples.clear, tile)
 
 
 def _as_lines(samples: SharedSamples) -> Any:

@@ -3,7 +3,7 @@
 Reverse mode has a lane for each hidden sample, which loops over the scanned points and keeps the adjoint of its sample
 to itself: no sum is atomic, whatever the number of connections. What belongs to the scanned points is found in a
 second pass, with a lane for each of them. The adjoints of samples and points are then handed on to the scene once. In
-forward mode the tangents of samples and points are tables, and every connection puts ``k df + f k' dtau`` onto the film.
+forward mode the tangents of samples and points are tables; every connection puts ``k df + f k' dtau`` onto the film.
 
 Samples are material points: with the density held fixed per area of material, a lone body's outline needs no boundary
 term. What stands in between is asked again and held fixed; bodies that hide each other need the term of their edges.

@@ -25,9 +25,12 @@ MAX_SINGLE_PRECISION_SAMPLES = 2**16
 class TimeResolvedFilm(mi.Film):
     """Abstract base of films that keep an array behind every pixel beside the steady image.
 
+    ``exhaustive_scan`` (bool, false), ``laser_scan_width``, ``laser_scan_height`` (int, 0): one array for every pair of
+    sensor and laser position, ``(H, W, Lh, Lw, ...)``; the steady image is the sum over the laser's positions.
+
     What it has to offer is declared in :class:`torchtransient.interfaces.FilmInterface`. A subclass adds ``plugin``
     (its name in messages) and ``measures`` (``transient``, ``phasor``, ``gated``, ...: what its array is), the shape of
-    that array (``cube_shape``, ``entries_per_pixel``), and how an arrival meets it: ``put``, its derivative
+    that array (``cube_shape``, ``entries_per_array``), and how an arrival meets it: ``put``, its derivative
     ``put_slope`` and its adjoint ``read``. A class that lacks one of them is refused where it is registered.
 
     Children that are spectra are the response curves of the film's channels (``curves``), see :mod:`.response`.
@@ -36,6 +39,8 @@ class TimeResolvedFilm(mi.Film):
     exhaustive_scan = False
     keeps_steady = True
     has_window = True
+    # Whether ``put`` takes the word that every lane has an array of its own.
+    knows_exclusive_lanes = False
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
     has_slope = True
     pulses = ()
@@ -45,11 +50,28 @@ class TimeResolvedFilm(mi.Film):
         self.start_opl = float(props.get("start_opl", 0.0))
         if not abs(self.start_opl) < float("inf"):
             raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
+        self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
+        self.laser_scan_width = int(props.get("laser_scan_width", 0))
+        self.laser_scan_height = int(props.get("laser_scan_height", 0))
+        self._check_laser_grid()
         self.curves = SensorResponse.of(props)
         self.bands = []
         self.steady = None
         self.outside = None
         self._offset_distribution = None
+
+    def _check_laser_grid(self):
+        laser = self.laser_scan_width, self.laser_scan_height
+        if self.exhaustive_scan and min(laser) < 1:
+            raise SceneError(
+                f"{self.plugin}: exhaustive_scan needs laser_scan_width and laser_scan_height of at least 1, got "
+                f"{laser[0]} x {laser[1]}."
+            )
+        if not self.exhaustive_scan and max(laser) > 0:
+            raise SceneError(
+                f"{self.plugin}: laser_scan_width and laser_scan_height have no effect without exhaustive_scan; set "
+                "exhaustive_scan to true or leave them out."
+            )
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -81,8 +103,10 @@ class TimeResolvedFilm(mi.Film):
     def lanes_at_most(self, most_events: int) -> int | None:
         return None
 
-    def create_block(self, job, base, match, most_events: int, tangents=False, exclusive=False) -> FilmBlock:
-        return FilmBlock(self, job.band, base, match, exclusive)
+    def create_block(
+        self, job, base, match, most_events: int, tangents=False, exclusive=False, origin=None
+    ) -> FilmBlock:
+        return FilmBlock(self, job.band, base, match, exclusive and self.knows_exclusive_lanes, origin)
 
     def create_adjoint_block(self, response, base, steady, match) -> AdjointBlock:
         return AdjointBlock(self, response, base, steady, match)
@@ -99,6 +123,24 @@ class TimeResolvedFilm(mi.Film):
         if self.curves is not None:
             return self.curves.names
         return ("L",) if mi.is_monochromatic else ("R", "G", "B")
+
+    def laser_count(self) -> int:
+        """Number of laser positions of an exhaustive scan, otherwise 1."""
+        return self.laser_scan_width * self.laser_scan_height if self.exhaustive_scan else 1
+
+    def laser_shape(self) -> tuple[int, ...]:
+        """The dimensions of an array that belong to the laser: (Lh, Lw), or none."""
+        return (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
+
+    def entries_per_pixel(self) -> int:
+        """Floats behind one pixel."""
+        return self.laser_count() * self.entries_per_array()
+
+    def pixel_base(self, base, laser):
+        """Index of the array of one laser position (``row * laser_scan_width + column``, None without a scan), where
+        ``base`` is that of a pixel's first one.
+        """
+        return base if laser is None else base + laser * self.entries_per_array()
 
     def band_rows(self) -> int:
         """Rows of one storage band: as many as 32-bit indices allow."""

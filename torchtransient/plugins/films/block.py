@@ -7,6 +7,7 @@ has to carry along a path is in ``events``, which belongs to the loop.
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 
 from torchtransient.plugins.films.colour import mean_of
 from torchtransient.plugins.polarized import light_type
@@ -14,14 +15,15 @@ from torchtransient.plugins.polarized import light_type
 
 class FilmBlock:
     """The samples of one pass: which band of the film they write to, from which entry on, with which weight; whether
-    each of them has a ``base`` of its own (``exclusive``).
+    each of them has a ``base`` of its own (``exclusive``); from which length on theirs are counted (``origin``).
 
     A loop calls ``begin`` once, ``put`` (or ``put_slope`` in forward mode) for every event and ``end`` after the last
     one; whoever launched the loop calls ``finish`` when all of it is recorded. A histogram writes every event at once.
     """
 
-    def __init__(self, film, band: int, base, match, exclusive: bool = False):
-        self.film, self.band, self.base, self.match, self.exclusive = film, band, base, match, exclusive
+    def __init__(self, film, band: int, base, match, exclusive: bool = False, origin=None):
+        self.film, self.band, self.base, self.match = film, band, base, match
+        self.exclusive, self.origin = exclusive, origin
 
     def begin(self):
         """What the film carries along a path: loop state, handed back at every event."""
@@ -30,14 +32,24 @@ class FilmBlock:
     def put(self, events, opl, value, active):
         """Write a contribution; returns what fell before and after the window (mean over channels)."""
         channels = self.match.to_channels(value)
-        before, after = self.film.put(self.band, self.base, opl, channels, active, self.exclusive)
+        before, after = self.store(opl, channels, active)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
+
+    def store(self, opl, channels, active):
+        """Write to the film; returns the fractions before and after the window."""
+        # Films that know nothing of it add atomically.
+        alone = {"exclusive": True} if self.exclusive else {}
+        return self.film.put(self.band, self.base, self.counted(opl), channels, active, **alone)
+
+    def counted(self, opl):
+        """A path length from the film's start on, ``Float64``."""
+        return opl if self.origin is None else self.origin + mi.Float64(opl)
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
         """Forward mode: write ``k df + f k' dtau``."""
         d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
-        self.film.put_slope(self.band, self.base, opl, d, slope, active)
+        self.film.put_slope(self.band, self.base, self.counted(opl), d, slope, active)
 
     def end(self, events):
         """The paths are over."""

@@ -38,10 +38,11 @@ class GatedHDRFilm(TimeResolvedFilm):
     settings of an integrator are ignored. A profile is straight between 2049 points, or exact where its own points
     are at equal distances.
 
-    Not supported: alpha channel, half precision, exhaustive scans.
+    Not supported: alpha channel, half precision.
     """
 
     plugin = "gated_hdr_film"
+    knows_exclusive_lanes = True
     measures = "gated"
     has_window = False
     keeps_steady = False
@@ -88,12 +89,12 @@ class GatedHDRFilm(TimeResolvedFilm):
         return self.table.count
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the gated images: (H, W, G, C)."""
+        """Shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
         size = self.crop_size()
-        return int(size[1]), int(size[0]), self.gate_count(), self.channel_count()
+        return (int(size[1]), int(size[0]), *self.laser_shape(), self.gate_count(), self.channel_count())
 
-    def entries_per_pixel(self) -> int:
-        """Floats behind one pixel."""
+    def entries_per_array(self) -> int:
+        """Floats of the gates of one pixel and laser position."""
         return self.gate_count() * self.channel_count()
 
     # ----------------------------------------------------------------------------------- splat and read

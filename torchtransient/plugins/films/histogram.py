@@ -8,6 +8,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
+from torchtransient.plugins.films.block import FilmBlock
 from torchtransient.plugins.films.long_kernel import BinLayout, reduce_mode
 from torchtransient.plugins.films.long_kernel import put as put_long
 from torchtransient.plugins.films.long_kernel import read as read_long
@@ -19,6 +20,29 @@ from torchtransient.plugins.films.window import ArrivalWindow
 MAX_UNROLLED = 9
 # Temporal filters of other settings that a film keeps.
 MAX_FILTERS = 8
+
+
+class HistogramBlock(FilmBlock):
+    """Events whose lengths are counted from an origin of their sample: its bin is found once, in double precision, and
+    from there on bins are counted in single precision, which is as good as the lengths are.
+    """
+
+    def __init__(self, film, band, base, match, exclusive, origin):
+        super().__init__(film, band, base, match, exclusive, origin)
+        x = film.bin_position(origin)
+        # Farther away, single precision does not know the bin anyway.
+        start = dr.clip(dr.floor(x), -(2.0**30), 2.0**30)
+        self.fraction = mi.Float(x - start)
+        self.window = mi.Float(-start), mi.Float(film.temporal_bins - start)
+        # Whole numbers wrap around and back again.
+        self.first = base + mi.UInt32(mi.Int32(start)) * film.channel_count()
+        self.scale = mi.Float(1 / film.bin_width_opl)
+        dr.eval(self.fraction, self.window, self.first)
+
+    def store(self, opl, channels, active):
+        x = dr.fma(mi.Float(opl), self.scale, self.fraction)
+        cube, mode = self.film.band_array(self.band), reduce_mode(self.exclusive)
+        return self.film.put_bins(cube, self.first, x, self.window, channels, active, mode)
 
 
 class TransientHDRFilm(TimeResolvedFilm):
@@ -66,6 +90,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "transient_hdr_film"
+    knows_exclusive_lanes = True
     measures = "transient"
 
     def __init__(self, props):
@@ -74,9 +99,6 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
         self._filter_name = str(props.get("temporal_filter", "box"))
         self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
-        self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
-        self.laser_scan_width = int(props.get("laser_scan_width", 0))
-        self.laser_scan_height = int(props.get("laser_scan_height", 0))
         self.keeps_steady = self.has_window = bool(props.get("steady", True))
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
@@ -94,17 +116,6 @@ class TransientHDRFilm(TimeResolvedFilm):
                 f"transient_hdr_film: bin_width_opl must be a positive length in metres, got {self.bin_width_opl}."
             )
         check_stddev(self._gaussian_stddev)
-        laser = self.laser_scan_width, self.laser_scan_height
-        if self.exhaustive_scan and min(laser) < 1:
-            raise SceneError(
-                "transient_hdr_film: exhaustive_scan needs laser_scan_width and laser_scan_height of at least 1, "
-                f"got {laser[0]} x {laser[1]}."
-            )
-        if not self.exhaustive_scan and max(laser) > 0:
-            raise SceneError(
-                "transient_hdr_film: laser_scan_width and laser_scan_height have no effect without exhaustive_scan; "
-                "set exhaustive_scan to true or leave them out."
-            )
 
     @property
     def temporal_filter(self) -> str:
@@ -168,19 +179,14 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     # ---------------------------------------------------------------------------------------- storage
 
-    def laser_count(self) -> int:
-        """Number of laser positions of an exhaustive scan, otherwise 1."""
-        return self.laser_scan_width * self.laser_scan_height if self.exhaustive_scan else 1
-
     def cube_shape(self) -> tuple[int, ...]:
         """Shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
         size = self.crop_size()
-        laser = (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
-        return (int(size[1]), int(size[0]), *laser, self.temporal_bins, self.channel_count())
+        return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
-    def entries_per_pixel(self) -> int:
-        """Floats behind one pixel."""
-        return self.laser_count() * self.temporal_bins * self.channel_count()
+    def entries_per_array(self) -> int:
+        """Floats of one histogram."""
+        return self.temporal_bins * self.channel_count()
 
     # ----------------------------------------------------------------------------------- splat and read
 
@@ -188,9 +194,10 @@ class TransientHDRFilm(TimeResolvedFilm):
         """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
         return opl_from_start / mi.Float64(self.bin_width_opl)
 
-    def pixel_base(self, base, laser):
-        """Index of the histogram of one laser position, where ``base`` is that of a pixel's first one."""
-        return base if laser is None else base + laser * (self.temporal_bins * self.channel_count())
+    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+        if origin is None or tangents or self._long:
+            return super().create_block(job, base, match, most_events, tangents, exclusive, origin)
+        return HistogramBlock(self, job.band, base, match, exclusive, origin)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, laser=None):
         """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
@@ -203,19 +210,28 @@ class TransientHDRFilm(TimeResolvedFilm):
         if self._long:
             layout = BinLayout(cube, base, channels, 1, bins, channels, exclusive)
             return put_long(layout, self.filter, x, value, None, active)
+        return self.put_bins(cube, base, x, (0, bins), value, active, reduce_mode(exclusive))
+
+    def put_bins(self, cube, base, x, window, value, active, mode):
+        """Add to the bins that the filter reaches from ``x``, in bins (``Float`` or ``Float64``). ``base``: index of
+        bin 0; ``window``: first bin that is stored, and the one after the last.
+        """
+        channels = self.channel_count()
+        low, high = window
         before, after = mi.Float(0), mi.Float(0)
         first, taps = self.filter.weights(x)
-        # Comparisons happen on doubles, before the cast: a negative number cast to an unsigned one would wrap into a
-        # bin.
+        # Comparisons happen on floating point numbers: a negative one cast to an unsigned one would wrap into a bin.
         for offset, weight, _ in taps:
             k = first + offset
-            before += dr.select(k < 0, weight, 0)
-            after += dr.select(k >= bins, weight, 0)
-            inside = active & (k >= 0) & (k < bins)
-            index = dr.fma(mi.UInt32(k), channels, base)
+            before += dr.select(k < low, weight, 0)
+            after += dr.select(k >= high, weight, 0)
+            inside = active & (k >= low) & (k < high)
+            # Bins may be counted from one in the middle of the window.
+            number = mi.UInt32(k) if dr.type_v(k) == dr.VarType.Float64 else mi.UInt32(mi.Int32(k))
+            index = dr.fma(number, channels, base)
             for c in range(channels):
                 v = value[c] if len(taps) == 1 else value[c] * weight
-                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside, reduce_mode(exclusive))
+                dr.scatter_reduce(dr.ReduceOp.Add, cube, type(cube)(v), index + c, inside, mode)
         return before, after
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):

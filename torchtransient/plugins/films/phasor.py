@@ -108,7 +108,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
     Memory: the phasors, and up to 256 MB of events of the kernel in flight (twice that in forward mode); never a
     histogram.
 
-    Not supported: alpha channel, half precision, exhaustive scans.
+    Not supported: alpha channel, half precision.
     """
 
     plugin = "phasor_hdr_film"
@@ -135,12 +135,13 @@ class PhasorHDRFilm(TimeResolvedFilm):
         return len(self.frequencies)
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the phasors: (H, W, F, 2 C), real and imaginary part in turn."""
+        """Shape of the phasors: (H, W, F, 2 C) or (H, W, Lh, Lw, F, 2 C), real and imaginary part in turn."""
         size = self.crop_size()
-        return int(size[1]), int(size[0]), self.frequency_count(), 2 * self.channel_count()
+        entries = (self.frequency_count(), 2 * self.channel_count())
+        return (int(size[1]), int(size[0]), *self.laser_shape(), *entries)
 
-    def entries_per_pixel(self) -> int:
-        """Floats behind one pixel."""
+    def entries_per_array(self) -> int:
+        """Floats of the phasors of one pixel and laser position."""
         return self.frequency_count() * 2 * self.channel_count()
 
     def lanes_at_most(self, most_events: int) -> int | None:
@@ -149,8 +150,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
 
     # ----------------------------------------------------------------------------------- splat and read
 
-    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False):
-        return EventBlock(self, job, base, match, most_events, tangents)
+    def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+        return EventBlock(self, job, base, match, most_events, tangents, origin)
 
     def _table(self, flat, exclusive=False):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)

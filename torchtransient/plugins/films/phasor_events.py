@@ -42,13 +42,14 @@ def rotation(turns):
 class EventBlock(FilmBlock):
     """Keeps the events of each path of one pass and sums them up in ``finish``."""
 
-    def __init__(self, film, job, base, match, most_events, tangents):
-        super().__init__(film, job.band, base, match)
+    def __init__(self, film, job, base, match, most_events, tangents, origin=None):
+        super().__init__(film, job.band, base, match, origin=origin)
         self.first_row, _, self.cube = film.bands[job.band]
         self.job, self.tangents = job, tangents
         self.slots = slots_for(most_events)
         self.overflows = most_events > self.slots
-        self.width = int(film.crop_size()[0])
+        # Arrays of a row: those of all laser positions of a pixel stand together.
+        self.width = int(film.crop_size()[0]) * film.laser_count()
         self.paths = self.width * job.rows * job.spp
         # In memory: as a literal, every number of samples would compile kernels of its own.
         self.stride = dr.opaque(mi.UInt32, self.paths)
@@ -61,14 +62,14 @@ class EventBlock(FilmBlock):
         return {"count": mi.UInt32(0), "path": dr.arange(mi.UInt32, self.paths)}
 
     def put(self, events, opl, value, active):
-        channels = self.match.to_channels(value)
+        channels, opl = self.match.to_channels(value), self.counted(opl)
         more = self._store(events, opl, channels, active)
         if self.overflows:
             self.film.put(self.band, self.base, opl, channels, more)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, events, opl, d_value, value_d_opl, active):
-        d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
+        d, slope, opl = self.match.to_channels(d_value), self.match.to_channels(value_d_opl), self.counted(opl)
         more = self._store(events, opl, d + slope, active)
         if self.overflows:
             self.film.put_slope(self.band, self.base, opl, d, slope, more)
@@ -107,7 +108,7 @@ class EventBlock(FilmBlock):
         spp = dr.opaque(mi.UInt32, job.spp)
         first = pixel * spp + group * GROUP
         last = dr.minimum(first + GROUP, (pixel + 1) * spp)
-        base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_pixel()
+        base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_array()
         start = block * per_block
         frequencies = FrequencyBlock(film, start, per_block)
         re, im = sum_events(self, frequencies, first, last)

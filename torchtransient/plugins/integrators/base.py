@@ -14,14 +14,13 @@ from torchtransient.plugins.films.temporal_filter import check_name, check_stdde
 from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
+from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
-from torchtransient.plugins.parameters import ParameterTracker, check_slope, check_stand_ins, moving_names
-from torchtransient.plugins.polarized import rotation_tangent
+from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
-from torchtransient.plugins.transport.carry import Carry
 from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents, tangents_of
+from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents
 from torchtransient.plugins.transport.derivative.reverse import reverse
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.film import FilmSink
@@ -109,7 +108,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         beams = [emitter.id() for emitter in scene.emitters() if getattr(emitter, "needs_aim", False)]
         if beams and not self.aims_lasers:
             raise SceneError(
-                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling can see the light of the "
+                f"{self.class_name()}: nothing but transient_nlos_path with nlos_laser_sampling sees the light of the "
                 f"laser_beam {beams[0]!r}. Use that, or describe the light as a 'spot', 'projector' or 'angulararea'."
             )
         film.take_filter(self.temporal_filter, self.gaussian_stddev)
@@ -122,6 +121,10 @@ class TransientIntegrator(mi.CppADIntegrator):
     def parameters(self, scene) -> ParameterTracker:
         """The parameters of the scene, to be asked which of them carry gradients."""
         return self._seen_scene(scene).tracker(scene)
+
+    def silhouettes(self, scene):
+        """What derivatives of a scene are where silhouettes move, in the words of the table of parameters."""
+        return SILHOUETTES
 
     def reference(self, scene):
         """The sphere around the scene as described, which light from and to infinity is timed by."""
@@ -337,19 +340,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         with dr.resume_grad():
             if world.wanted.sensor or dr.grad_enabled(rays.η):
-                dr.backward_from(self._objective_of(world, rays, adjoint))
-
-    def _objective_of(self, world, rays, adjoint):
-        """``<adjoint, Carry>`` of the primary rays."""
-        objective = adjoint.η * rays.η
-        if not self.camera_unwarp:
-            objective += adjoint.slope * rays.length()
-        if world.wanted.sensor:
-            objective += dr.dot(adjoint.o + adjoint.x, rays.ray.o) + dr.dot(adjoint.d + adjoint.w, rays.ray.d)
-        if world.wanted.sensor and mi.is_polarized:
-            d_rotation = dr.sum(adjoint.β[1, 2] - adjoint.β[2, 1])
-            objective += d_rotation * sensor_rotation(rays.seen, rays.ray).angle()
-        return objective
+                dr.backward_from(objective_of(world, rays, adjoint))
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
@@ -382,28 +373,10 @@ class TransientIntegrator(mi.CppADIntegrator):
         match = self.channel_match(film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events(), tangents=True)
-        tangent = self._tangent_of(world, rays)
+        tangent = tangent_of(world, rays)
         dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
         film.add_steady(pixel, match.to_channels(dL))
         block.finish()
-
-    def _tangent_of(self, world, rays) -> Carry:
-        """The tangent of the Carry of the primary rays."""
-        tangent = Carry.zeros()
-        with dr.resume_grad():
-            if not (world.wanted.sensor or dr.grad_enabled(rays.η)):
-                return tangent
-            attached = [rays.ray.o, rays.ray.d, rays.length(), rays.η]
-            if mi.is_polarized:
-                attached.append(sensor_rotation(rays.seen, rays.ray).angle())
-            o, d, length, η, *rotation = tangents_of(attached)
-        tangent.o, tangent.x = mi.Vector3f(o), mi.Vector3f(o)
-        tangent.d, tangent.w = mi.Vector3f(d), mi.Vector3f(d)
-        tangent.slope = mi.Float(0) if self.camera_unwarp else mi.Float(length)
-        tangent.η = mi.Float(η)
-        if mi.is_polarized:
-            tangent.β = rotation_tangent(rotation[0])
-        return tangent
 
     def to_string(self):
         return (

@@ -11,13 +11,14 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.around_corner.outlines import mutual_occlusion
+from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
+    aims_of,
+    check_count,
     laser_of,
     origin_of,
-    sensor_targets,
-    targets_of,
+    scan_rays,
 )
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
@@ -237,11 +238,15 @@ class TransientNLOSPath(base.TransientIntegrator):
         guides = self._guides(contents)
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
+        scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
+        return self._segment(contents)(), scattering, self._connections(contents)
+
+    def _segment(self, contents: Any) -> type:
+        if contents.media is not None:
+            return Media
         # Instances, and what Mitsuba leaves detached, are attached along rays alone.
         along_rays = contents.instances is not None or contents.detached_hits is not None
-        vacuum = Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
-        segment, scattering = (Media(), SurfaceOrMedium(guides)) if in_media else (vacuum(), surface(guides))
-        return segment, scattering, self._connections(contents)
+        return Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
 
     def _connections(self, contents: Any) -> list[Any]:
         if not self.laser_sampling:
@@ -250,8 +255,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
 
         def read_spots(scene: Any) -> LaserSpots:
-            targets = targets_of(scene, sensor, capture, fov)
-            return LaserSpots(scene, laser_of(scene), targets, origin_of(scene, sensor))
+            aims = aims_of(scene, sensor, capture, fov)
+            check_count(aims, sensor, capture)
+            return LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
 
         return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
 
@@ -268,16 +274,26 @@ class TransientNLOSPath(base.TransientIntegrator):
     # ----------------------------------------------------------------------------------- primary rays
 
     def offset_in_pixel(self, film: Any, sensor: Any, sampler: Any) -> Any:
-        if hasattr(sensor, "targets"):  # a scan looks at points
+        if hasattr(sensor, "scanned"):  # a scan looks at points
             return mi.Point2f(0), None
         return super().offset_in_pixel(film, sensor, sampler)
 
     def start(self, scene: Any, contents: Any, sensor: Any, film: Any, job: Any) -> Any:
         rays = super().start(scene, contents, sensor, film, job)
-        pixel = rays.row * int(film.crop_size()[0]) + rays.column
-        if hasattr(sensor, "targets") and contents.media is None:
+        # A pilot run has a smaller film than the sensor, and one laser position a path.
+        width, height = (int(n) for n in sensor.film().crop_size())
+        columns, rows = (int(n) for n in film.crop_size())
+        row, column = rays.row, rays.column
+        if (columns, rows) != (width, height):
+            row, column = (2 * row + 1) * height // (2 * rows), (2 * column + 1) * width // (2 * columns)
+        pixel = row * width + column
+        if hasattr(sensor, "scanned") and contents.media is None:
             rays.leg = dr.gather(mi.PreliminaryIntersection3f, _scanned(scene, sensor), pixel)
-        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, rays.laser)
+        laser = rays.laser
+        if self.capture is CaptureType.EXHAUSTIVE and laser is None:
+            count = sensor.film().laser_count()
+            laser = dr.minimum(mi.UInt32(rays.sampler.next_1d() * count), count - 1)
+        rays.spot = {CaptureType.SINGLE: mi.UInt32(0), CaptureType.CONFOCAL: pixel}.get(self.capture, laser)
         return rays
 
     # ----------------------------------------------------------------------------------- derivatives
@@ -287,11 +303,19 @@ class TransientNLOSPath(base.TransientIntegrator):
             return True
         return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
 
+    def silhouettes(self, scene: Any) -> str:
+        sensors = scene.sensors()
+        contents = self.contents(scene, sensors[0]) if sensors else None
+        if contents is None or not follows_outlines(self._segment(contents), contents):
+            return super().silhouettes(scene)
+        settings = self.settings()
+        return silhouettes(settings.min_depth, settings.max_depth, self.capture is CaptureType.EXHAUSTIVE)
+
     def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
             return []
         shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
-        ray = _scan_rays(sensor)
+        ray = dr.detach(scan_rays(sensor))
         scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
         return shared if edges is None else [*shared, edges]
@@ -304,15 +328,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
 
 
-def _scan_rays(sensor: Any) -> Any:
-    """One ray for each pixel of a sensor's film, detached."""
-    origin = mi.Point3f(dr.detach(sensor.world_transform()).translation())
-    return mi.Ray3f(origin, dr.normalize(dr.detach(sensor_targets(sensor)) - origin))
-
-
 def _scanned(scene: Any, sensor: Any) -> Any:
     """What the rays of a scan meet, one for each pixel: all samples of a pixel look at one point."""
-    found = scene.ray_intersect_preliminary(_scan_rays(sensor), coherent=True)
+    found = scene.ray_intersect_preliminary(dr.detach(scan_rays(sensor)), coherent=True)
     dr.eval(found)
     return found
 

@@ -49,6 +49,7 @@ class _PilotFilm:
     """Stands in for the sensor's film: the same view at another resolution, box filter, no storage."""
 
     start_opl = 0.0
+    exhaustive_scan = False
 
     def __init__(self, film, size: tuple[int, int]):
         self._size = mi.ScalarVector2u(*size)
@@ -122,7 +123,8 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         settings = integrator.settings()
         settings = replace(settings, max_depth=PILOT_DEPTH, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
         world = integrator.world(scene, contents, settings=settings)
-        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η))
+        world.start(rays)
+        walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η), rays.leg)
         most = dr.max(sink.used)
         dr.eval(most, sink.opl, sink.energy, sink.depth)
         dr.sync_thread()

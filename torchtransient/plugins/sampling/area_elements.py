@@ -136,14 +136,18 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
     return x
 
 
+def can_be_listed(shape: Any) -> bool:
+    """Whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids."""
+    if not has_surface(shape) or shape.is_ellipsoids():
+        return False
+    return bool(shape.is_mesh() or shape.class_name() in _KINDS)
+
+
 def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | None:
     """(axes, kind, area, normal) of one shape, None for what cannot be listed."""
-    if not has_surface(shape) or shape.is_ellipsoids():
+    if not can_be_listed(shape):
         return None
-    if shape.is_mesh():
-        return _triangles(shape)
-    kind = _KINDS.get(shape.class_name())
-    return None if kind is None else _analytic(shape, kind)
+    return _triangles(shape) if shape.is_mesh() else _analytic(shape, _KINDS[shape.class_name()])
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:

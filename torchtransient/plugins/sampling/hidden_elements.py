@@ -64,10 +64,10 @@ class HiddenElements:
         order = np.flatnonzero(parts.area > 0)
         order = order[morton_order(parts.centers()[order])]
         self.shapes, self.elements = list(shapes), parts.take(order)
-        self.tile_count = len(points)
+        self.tile_count, self.region = len(points), None
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
-        p = self._probabilities(points, normals, defensive)
-        self._lay_out(p)
+        self.probabilities = p = self._probabilities(points, normals, defensive)
+        self._lay_out(p, 0)
         per_area = p / self.elements.area
         self._by_primitive = PrimitiveDensity(self.shapes, every, cuts, uncut[order], cell[order], per_area)
 
@@ -84,8 +84,18 @@ class HiddenElements:
             p.append((1 - defensive) * w / total + defensive * area if total > 0 else area)
         return np.array(p)
 
-    def _lay_out(self, p: np.ndarray) -> None:
+    def put_first(self, clear: np.ndarray, region: Any) -> None:
+        """Put those elements first, ``(E,)`` of booleans, whose samples need no visibility rays to points that
+        ``region.holds``. The density stays what it is.
+        """
+        self.region = region
+        order = np.argsort(~clear, kind="stable")
+        self.elements, self.probabilities = self.elements.take(order), self.probabilities[:, order]
+        self._lay_out(self.probabilities, int(clear.sum()))
+
+    def _lay_out(self, p: np.ndarray, clear: int) -> None:
         e = self.elements
+        self.has_clear, self.clear_count = clear > 0, dr.opaque(mi.UInt32, clear)
         self.kinds = tuple(int(k) for k in np.unique(e.kind))
         cdf = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
         self._cdf = mi.Float64((cdf / cdf[:, -1:]).ravel())

@@ -21,13 +21,16 @@ MAX_SAMPLES = 2**26
 
 @dataclass
 class SharedSamples:
-    """``count`` points, in the order of the elements of ``HiddenElements`` (neighbours stand together).
+    """``count`` points for each of ``tiles`` tiles of the scan, one tile after the other, in the order of the elements
+    of ``HiddenElements`` (neighbours stand together).
 
     ``p`` (``Point3f``); ``n`` shading and ``geometric_n`` geometric normal (``Normal3f``), the same where ``smooth`` is
     false; ``front``, ``back`` (``UnpolarizedSpectrum``): albedo over pi of the side that the shading normal points to,
     and of the other one; ``weight`` (``Float``): one over ``count`` times the density per area, so that a mean over the
     area is a sum over samples; ``element`` (``UInt32``): number in the table; ``shape``, ``primitive``, ``u``
-    (``Point2f``): the material point, the same for other positions of the shape.
+    (``Point2f``): the material point, the same for other positions of the shape. ``clear`` (``UInt32``, one for each
+    tile): how many of its samples, the first ones, nothing hides from any point that ``region.holds``; ``has_clear``:
+    whether there are elements of that kind.
     """
 
     count: int
@@ -42,17 +45,22 @@ class SharedSamples:
     primitive: Any
     u: Any
     smooth: bool
+    tiles: int
+    clear: Any
+    has_clear: bool
+    region: Any
 
 
-def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = None) -> SharedSamples:
-    """``count`` samples of the hidden geometry's density; ``seed``: UInt32 of width one, in memory, or a whole number.
-    ``tile``: number of the tile whose density is drawn from.
+def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSamples:
+    """``count`` samples of the hidden geometry's density, for each tile of the table; ``seed``: UInt32 of width one, in
+    memory, or a whole number.
 
     Raises SceneError for surfaces that are not plainly diffuse (``diffuse``, ``twosided`` around it), UnitError,
     and VariantError in spectral and polarized variants, where a sample has no colour of its own.
     """
-    if not 1 <= count <= MAX_SAMPLES:
-        raise UnitError(f"draw_samples: expected 1 to {MAX_SAMPLES} samples, got {count!r}.")
+    sets = elements.tile_count
+    if not 1 <= count <= MAX_SAMPLES // sets:
+        raise UnitError(f"draw_samples: expected 1 to {MAX_SAMPLES // sets} samples, got {count!r}.")
     if mi.is_spectral or mi.is_polarized:
         raise VariantError(
             f"draw_samples: shared samples hold a colour, which variant {mi.variant()} has not; expected a mono or RGB "
@@ -64,19 +72,21 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any, tile: Any = No
             "draw_samples: expected surfaces of 'diffuse', or of 'twosided' around it, got "
             f"{'; '.join(others)}. Use the general path integrator."
         )
-    tile = None if tile is None else mi.UInt32(tile)
     seed = mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed) % 2**32)
-    x, y = plane_points(count, seed)
+    x, y = plane_points(count, seed, sets)
+    tile = dr.arange(mi.UInt32, count * sets) // dr.opaque(mi.UInt32, count) if sets > 1 else None
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
     shape, primitive = elements.surface(element)
     si = _interaction(elements, element, p, n, a, y)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
+    clear = dr.select(element < elements.clear_count, mi.UInt32(1), 0)
     samples = SharedSamples(
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
         element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
+        tiles=sets, clear=dr.block_sum(clear, count), has_clear=elements.has_clear, region=elements.region,
     )  # fmt: skip
     dr.eval(samples)
     return samples

@@ -34,8 +34,8 @@ class NLOSCaptureMeter(mi.Sensor):
     Every sample of a pixel looks along the same ray, so spatial filters do not spread it. A pixel measures the radiance
     that leaves its point towards the sensor.
 
-    Differentiable: ``sensor_origin``, ``points``, ``laser_points`` and ``laser_origin`` (the rays follow; what they meet decides where
-    the points are).
+    Differentiable: ``sensor_origin``, ``points``, ``laser_points`` and ``laser_origin`` (the rays follow; what they
+    meet decides where the points are).
     """
 
     def __init__(self, props: Any) -> None:
@@ -90,6 +90,14 @@ class NLOSCaptureMeter(mi.Sensor):
         place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
         return shape.sample_position(0.0, place).p
 
+    def scanned(self) -> Any:
+        """The scanned points (Point3f) of all pixels of the film's crop window, row by row."""
+        film = self.film()
+        (width, height), (x, y) = film.crop_size(), film.crop_offset()
+        index = dr.arange(mi.UInt32, int(width) * int(height))
+        row = index // int(width)
+        return self.targets((row + int(y)) * int(film.size()[0]) + (index - row * int(width)) + int(x))
+
     def spots(self) -> Any:
         """Where the laser points (Point3f), None where nothing of the sensor says so."""
         if self.lookat_pixel is None:
@@ -138,4 +146,8 @@ def _points_of(props: Any, name: str) -> Any:
 
 register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
 _PLACE = ParameterEffect(moves_length=True, role="sensor")
-declare_effects(NLOSCaptureMeter, dict.fromkeys(("sensor_origin", "points", "laser_points", "laser_origin"), _PLACE))
+# The rays of the sensor do not follow the laser.
+_LASER = ParameterEffect(moves_length=True, role="emitter")
+declare_effects(
+    NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER, "laser_origin": _LASER}
+)

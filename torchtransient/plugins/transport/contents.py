@@ -32,8 +32,8 @@ DAMPING = 0.005
 class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
-    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a lobe. ``instances``: those of
-    shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
+    ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a
+    lobe. ``instances``: those of shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
     (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
     transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around the sensor
     (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``: masks and

@@ -181,8 +181,8 @@ class Connection(Strategy):
     """Light that is found at a vertex, or that a vertex is connected to.
 
     What a connection owes: it keeps to ``vertex.goes_on``, ``vertex.connectable`` and ``world.deep_enough``, asks
-    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from ``vertex.scattered_τ`` along
-    ``vertex.η * answer.eta``.
+    ``world.counted`` before it traces a shadow ray, weighs its samples by :meth:`weight`, and counts time from
+    ``vertex.scattered_τ`` along ``vertex.η * answer.eta``.
     """
 
     # Whether all of its light is that of the scene's emitters, so that their box bounds where it can come from.

@@ -29,9 +29,11 @@ def cube_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components
 
 
 def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-    """From the film's (H, W, F, 2 C) of real and imaginary parts to complex (C, F, H, W) behind ``leading``."""
-    pairs = cube.reshape(*leading, *cube.shape[-4:-1], -1, 2)
-    return _stokes_first(torch.view_as_complex(pairs).movedim((-1, -2), (-4, -3)), -4, components)
+    """From the film's (H, W, F, 2 C) of real and imaginary parts to complex (C, F, H, W) behind ``leading``; of an
+    exhaustive scan as :func:`cube_channels_first`.
+    """
+    pairs = torch.view_as_complex(cube.reshape(*cube.shape[:-1], -1, 2))
+    return cube_channels_first(pairs, leading, components)
 
 
 def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:

@@ -127,9 +127,10 @@ class LaserSpot(Connection):
         light *= world.segment.attached_transmittance(world, vertex, end, lit)
         value = dr.select(lit, product(matrix, light), 0)
         leg = self.leg(lit)
-        opl = vertex.scattered_opl + mi.Float64(dr.detach(length * towards.eta) * vertex.v.η) + mi.Float64(dr.detach(leg))
+        opl = (
+            vertex.scattered_opl + mi.Float64(dr.detach(length * towards.eta) * vertex.v.η) + mi.Float64(dr.detach(leg))
+        )
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length + leg)
         return [EventTerm(value=product(vertex.carry.β, value), slope=slope, opl=opl, active=lit)]
-

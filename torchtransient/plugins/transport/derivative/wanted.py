@@ -14,12 +14,12 @@ from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``geometry``: path lengths change. ``shapes``: pointers of the shapes that move. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun
-    moves, or None. ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights
-    are spheres. ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is
-    handed on, behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but
-    its place changes. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry`
-    that derivatives go through.
+    ``geometry``: path lengths change. ``shapes``: pointers of the shapes that move. ``light``: an emitter without a
+    shape moves. ``sky``: the emitter whose sun moves, or None. ``emitter_shape``: the shape of a light does.
+    ``sphere_lights``: path lengths change and some lights are spheres. ``sensor``: the sensor moves. ``index``: an
+    index of refraction changes. ``ray``: the ray itself is handed on, behind delta lobes or a sensor that moves.
+    ``plain``: where a point slides on its surface, nothing but its place changes. ``extinction``: that of a medium
+    changes. ``carried``: the fields of the :class:`~..carry.Carry` that derivatives go through.
 
     ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """

@@ -136,8 +136,8 @@ class Surface(Scattering):
             chosen = (u >= below) & (u < below + share)
             step.point = dr.select(chosen, point, step.point)
             below += share
-        to = dr.select(step.guided, step.point - vertex.at.p, step.out)
-        step.out = dr.select(step.guided, dr.normalize(to), step.out)
+        # Rays start beside the surface, from where a near point lies in another direction.
+        step.out = dr.select(step.guided, vertex.at.spawn_ray_to(step.point).d, step.out)
         step.delta, step.unconnected = step.delta & ~step.guided, step.unconnected & ~step.guided
         step.weight = dr.select(step.delta, step.weight / own, step.weight)
 

@@ -1,0 +1,302 @@
+"""Derivatives where hidden things hide each other: the boundary term against finite differences."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate
+from support.moved_captures import MovedCapture, move, noted, turn
+from support.nlos_scenes import film, plane, scan_scene, side, transform
+from torchtransient.errors import GradientError, TorchTransientWarning
+from torchtransient.plugins.parameter_effect import SILHOUETTES
+
+VARIANT = "llvm_ad_mono"
+SIGMAS = 3.5
+# The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass
+# a rim meanwhile, where the capture has a kink.
+STEP = 4e-3
+SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
+
+
+def agree(capture, spp=2**12, seeds=4, spp_differences=2**16, seeds_differences=8, step=STEP, most_error=0.02):
+    """Both modes are the same derivative, which is that of finite differences; returns what paths alone say of it."""
+    found = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
+    assert capture.forward(0, spp) == pytest.approx(found[0], rel=2e-4)
+    expected = np.array([capture.difference(step, 100 + seed, spp_differences) for seed in range(seeds_differences)])
+    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
+    assert abs(found.mean() - expected.mean()) < SIGMAS * error
+    assert error < most_error * abs(found.mean())
+    with noted():
+        return capture.reverse(0, spp), found.mean(), error
+
+
+def plates(**changes):
+    return {"back": plane(1.2) | changes, "front": plane(0.9, 0.3, 0.22, 0.1)}
+
+
+def capture_of(hidden, keys, change, kind="confocal", points=4, response=None, **integrator):
+    response = response or film(points, **SMOOTH)
+    return MovedCapture(scan_scene(hidden, kind, response, **integrator), keys, change)
+
+
+MOVED = {
+    "front, sideways": ("front.to_world", move(1, 0, 0), 3),
+    "front, depth": ("front.to_world", move(0, 0, 1), 1.1),
+    "back, sideways": ("back.to_world", move(1, 0, 0), 3),
+    "wall, sideways": ("wall.to_world", move(1, 0, 0), 1.5),
+    "front turns": ("front.to_world", turn((0.22, 0.1, 0.9)), None),
+}
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("case", MOVED)
+def test_a_plate_before_a_plate(case, kind):
+    """What hides, what is hidden and the viewpoints move; without the boundary term the derivative is some other."""
+    key, change, factor = MOVED[case]
+    interior, whole, error = agree(capture_of(plates(), key, change, kind), most_error=0.1 if factor is None else 0.02)
+    assert abs(interior - whole) > 4 * error
+    if factor is not None:
+        assert not 1 / factor < interior / whole < factor
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_paths_have_the_same_term(kind):
+    capture = capture_of(plates(), "front.to_world", move(1, 0, 0), kind, third_bounce="paths", max_depth=4)
+    agree(capture, 2**13, spp_differences=2**16, most_error=0.05)
+
+
+def test_light_that_is_not_of_three_bounces():
+    """The term is that of three bounces: it is there in all light that holds them, and in no other."""
+    for settings, there in (
+        ({"max_depth": 5}, True), ({"filter_bounces": 3}, True), ({"max_depth": 5, "filter_bounces": 4}, False),
+        ({"max_depth": 2}, False),
+    ):  # fmt: skip
+        capture = capture_of(plates(), "front.to_world", move(1, 0, 0), **{"max_depth": 3} | settings)
+        assert (capture.boundary() is not None) == there
+
+
+FILMS = {
+    "gaussian": lambda: film(4, **SMOOTH | {"temporal_filter": "gaussian"}),
+    "without a steady image": lambda: film(4, **SMOOTH, steady=False),
+    "phasors": lambda: {"type": "phasor_hdr_film", "width": 4, "height": 4, "rfilter": {"type": "box"},
+                        "frequencies": "0.5, 1.0, 2.5"},
+    "gates": lambda: {"type": "gated_hdr_film", "width": 4, "height": 4, "rfilter": {"type": "box"},
+                      "gates": "gaussian 2.0 0.3; gaussian 2.6 0.4"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("name", FILMS)
+def test_films(name, kind):
+    agree(capture_of(plates(), "front.to_world", move(1, 0, 0), kind, response=FILMS[name]()), 2**14, most_error=0.05)
+
+
+def test_the_steady_image():
+    capture = capture_of(plates(), "front.to_world", move(1, 0, 0))
+    capture.install(mi.Float(0))
+    scene, seeds = capture.scene, range(4)
+
+    def difference(seed):
+        images = []
+        for h in (STEP, -STEP):
+            capture.install(mi.Float(h))
+            images.append(np.array(scene.integrator().render(scene, seed=seed, spp=2**16)[0], dtype=np.float64).sum())
+        return (images[0] - images[1]) / (2 * STEP)
+
+    import drjit as dr
+
+    def tangent(seed):
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        capture.install(θ)
+        dr.set_grad(θ, 1.0)
+        return float(np.array(scene.integrator().render_forward(scene, capture.parameters, seed=seed, spp=2**12)[0]).sum())
+
+    found, expected = (np.array([f(seed) for seed in seeds]) for f in (tangent, difference))
+    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
+    assert abs(found.mean() - expected.mean()) < 4.5 * error  # of four runs each
+    assert error < 0.02 * abs(found.mean())
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_first_and_last_leg(kind):
+    capture = capture_of(
+        plates(), "front.to_world", move(1, 0, 0), kind, response=film(4, **SMOOTH | {"bins": 140}),
+        account_first_and_last_bounces=True,
+    )  # fmt: skip
+    agree(capture)
+
+
+TWO_SIDED = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.6}}
+MATERIALS = {
+    "two-sided": TWO_SIDED,
+    "plastic": {"type": "roughplastic", "alpha": 0.3},
+    "metal": {"type": "roughconductor", "alpha": 0.4},
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_materials(name):
+    capture = capture_of(plates(bsdf=MATERIALS[name]), "front.to_world", move(1, 0, 0), "single")
+    agree(capture, 2**13, most_error=0.03)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_variants(variant):
+    mi.set_variant(variant)
+    try:
+        material = MATERIALS["metal"] if "polarized" in variant else {"type": "diffuse", "reflectance": colour(variant)}
+        agree(capture_of(plates(bsdf=material), "front.to_world", move(1, 0, 0), "single"), 2**13, most_error=0.05)
+    finally:
+        mi.set_variant(VARIANT)
+
+
+def colour(variant):
+    return {"type": "rgb", "value": [0.7, 0.4, 0.2]} if variant != "llvm_ad_mono" else 0.7
+
+
+def test_a_ball_behind_a_plate():
+    """What is hidden need not be a mesh; it may move, too."""
+    hidden = {
+        "ball": {"type": "sphere", "center": [0.1, 0, 1.3], "radius": 0.35, "bsdf": {"type": "diffuse"}},
+        "front": plane(0.9, 0.3, 0.22, 0.1),
+    }
+    for key in ("front.to_world", "ball.to_world"):
+        agree(capture_of(hidden, key, move(1, 0, 0), "single"), most_error=0.05)
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_a_box_of_six_plates_is_a_cube(kind):
+    """Rims at which shapes meet are one edge."""
+    base = transform().translate([0.1, 0.05, 0.8]).rotate([0.3, 1, 0.2], 25).scale(0.12)
+    turns = [([0, 1, 0], angle) for angle in (0, 90, 180, 270)] + [([1, 0, 0], 90), ([1, 0, 0], -90)]
+    bsdf = {"type": "diffuse", "reflectance": 0.6}
+    box = {
+        f"side{i}": {"type": "rectangle", "to_world": base @ transform().rotate(*t).translate([0, 0, 1]), "bsdf": bsdf}
+        for i, t in enumerate(turns)
+    }
+    behind = {"back": plane(1.3, 1.2)}
+    six = capture_of(box | behind, [f"{name}.to_world" for name in box], move(1, 0, 0), kind)
+    cube = capture_of({"cube": {"type": "cube", "to_world": base, "bsdf": bsdf}} | behind, "cube.to_world",
+                      move(1, 0, 0), kind)  # fmt: skip
+    found = [np.array([c.reverse(seed, 2**13) for seed in range(6)]) for c in (six, cube)]
+    error = np.hypot(*(x.std(ddof=1) / 6**0.5 for x in found))
+    assert abs(found[0].mean() - found[1].mean()) < 4.5 * error
+    assert error < 0.01 * abs(found[1].mean())
+    agree(cube, 2**13, most_error=0.03)
+
+
+def test_viewpoints_with_the_same_outline():
+    """The spot is a scanned point and lies in line with others; outlines along the lines are those of both."""
+    scene = scan_scene(plates(), "single", film(4, **SMOOTH), spot=(-0.125, 0.125, 0.0))
+    for change in (move(1, 0, 0), move(0, 1, 0)):
+        agree(MovedCapture(scene, "front.to_world", change))
+
+
+def test_what_hides_may_stand_still():
+    """Edges of static shapes count where what is behind them moves; bodies that stand before one another at rest in
+    derivatives of others do not.
+    """
+    far = plates() | {"far": plane(1.0, 0.1, 1.7)}
+    assert capture_of(plates(), "back.to_world", move(1, 0, 0)).boundary() is not None
+    assert capture_of(far, "far.to_world", move(1, 0, 0)).boundary() is None
+    assert capture_of(far, "wall.to_world", move(1, 0, 0)).boundary() is not None
+    assert capture_of(plates(), "back.bsdf.reflectance.value", lambda start, θ: start + θ).boundary() is None
+
+
+def test_points_of_the_capture_move():
+    points = np.stack(np.meshgrid(*[(np.arange(3) - 1) * 0.3] * 2), -1).reshape(-1, 2)
+    scene = scan_scene(plates(), "single", film(3, **SMOOTH))
+    meter = scene["wall"]["sensor"]
+    meter["points"] = mi.TensorXf(np.float32(np.c_[points, 0 * points[:, :1]]))
+    meter["laser_points"] = mi.TensorXf(np.float32([[-0.2, 0.13, 0.0]]))
+    for key in ("wall.sensor.points", "wall.sensor.laser_points"):
+        agree(MovedCapture(scene, key, move(1, 0, 0)), most_error=0.03)
+
+
+# --------------------------------------------------------------------------------------------- where there is none
+
+ALONE = {
+    "a plate": lambda: {"front": plane(0.9, 0.3)},
+    "a cube": lambda: {"front": {"type": "cube", "to_world": transform().translate([0, 0, 0.9]).scale(0.1)}},
+    "a ball": lambda: {"front": {"type": "sphere", "center": [0, 0, 0.9], "radius": 0.2}},
+    "plates side by side": lambda: {"front": plane(0.9, 0.3, -0.3), "back": plane(0.9, 0.3, 0.3)},
+    "plates far apart": lambda: {"front": plane(0.9, 0.3, -1.6), "back": plane(1.2, 0.3, 1.6)},
+    "a ball behind a plate that is not in its way": lambda: {
+        "front": plane(0.5, 0.1, -0.9), "back": {"type": "sphere", "center": [0.9, 0, 1.2], "radius": 0.1}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_what_hides_nothing_costs_nothing(name):
+    assert capture_of(ALONE[name](), "front.to_world", move(1, 0, 0)).boundary() is None
+
+
+def test_exhaustive_captures():
+    """They have no boundary term: derivatives are refused where it is not known to be zero."""
+    response = film(2, kind="exhaustive", **SMOOTH)
+    with pytest.raises(GradientError, match="exhaustive capture.*'front' hides 'back'"):
+        capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).reverse(0, 16)
+    with pytest.raises(GradientError, match="exhaustive capture"):
+        capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).forward(0, 16)
+    alone = capture_of(ALONE["plates side by side"](), "front.to_world", move(1, 0, 0), "exhaustive", response=response)
+    assert alone.reverse(0, 16) != 0
+    value = capture_of(plates(), "front.bsdf.reflectance.value", lambda start, θ: start + θ, "exhaustive",
+                       response=response)  # fmt: skip
+    assert value.reverse(0, 16) != 0
+
+
+def test_outlines_without_edges_are_told():
+    hidden = {"ball": {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.1}, "back": plane(1.2)}
+    with pytest.warns(TorchTransientWarning, match="'ball' hides 'back'"):
+        assert capture_of(hidden, "ball.to_world", move(1, 0, 0)).boundary() is None
+
+
+def test_the_table_of_parameters_says_so():
+    def reason(kind="confocal", **integrator):
+        response = film(2, kind=kind, **SMOOTH)
+        return tt.load(scan_scene(plates(), kind, response, **integrator), merge=False).parameters()
+
+    def of(table):
+        return table["front.to_world"].reason
+
+    assert "without triangles" in of(reason()) and "more than three" not in of(reason())
+    assert "more than three" in of(reason(max_depth=5))
+    assert "refused" in of(reason("exhaustive")) and "triangles" not in of(reason("exhaustive"))
+    assert of(reason(nlos_laser_sampling=False, nlos_hidden_geometry_sampling=False)).startswith(SILHOUETTES)
+    assert SILHOUETTES not in of(reason())
+
+
+# ------------------------------------------------------------------------------------------------------- bodies
+
+
+def arm_and_rest():
+    z = 1.2
+    rest = join(
+        ball([0, 0.55, z], [0.11, 0.14, 0.12]), ball([0, 0.15, z], [0.2, 0.28, 0.13]),
+        ball([0.12, -0.38, z], [0.08, 0.34, 0.09]), ball([-0.12, -0.38, z], [0.08, 0.34, 0.09]),
+        ball([0.33, 0.2, z - 0.05], [0.22, 0.06, 0.06]),
+    )  # fmt: skip
+    return {"rest": mesh("rest", rest), "body": mesh("body", ball([-0.2, 0.2, z - 0.27], [0.06, 0.06, 0.24]))}
+
+
+BODIES = {
+    "a mannequin turns": (lambda: {"body": mesh("body", mannequin())}, turn((0, 0, 1.2))),
+    "a mannequin moves sideways": (lambda: {"body": mesh("body", mannequin())}, move(1, 0, 0)),
+    "a mannequin moves away": (lambda: {"body": mesh("body", mannequin())}, move(0, 0, 1)),
+    "its arm moves sideways": (arm_and_rest, move(1, 0, 0)),
+    "its arm moves away": (arm_and_rest, move(0, 0, 1)),
+    "a fold and a plate turn": (lambda: {"body": mesh("body", folded_plates())}, turn((0, 0, 1.2))),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("case", BODIES)
+def test_bodies_of_many_parts(case, kind):
+    hidden, change = BODIES[case]
+    capture = capture_of(hidden(), "body.vertex_positions", change, kind)
+    agree(capture, 2**15, 4, 2**19, 12, 3e-3, most_error=0.05)

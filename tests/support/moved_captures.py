@@ -1,0 +1,99 @@
+"""Captures with a part that moves: the derivative of a linear loss in both modes, and by finite differences."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from unittest.mock import patch
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.plugins.around_corner.occlusion import MutualOcclusion
+
+
+def move(*v):
+    """A transform, or vertices, or points, along ``v`` times the parameter."""
+
+    def moved(start, θ):
+        if "Transform" in type(start).__name__:
+            return mi.Transform4f().translate(mi.Vector3f(*v) * θ) @ mi.Transform4f(start)
+        if dr.depth_v(start) == 2:
+            return start + mi.Vector3f(*v) * θ
+        return start + mi.Float(np.tile(np.float32(v), dr.width(start) // 3)) * θ
+
+    return moved
+
+
+def turn(center):
+    """A transform about the vertical through ``center``, by radians; the same for vertices, to first order."""
+
+    def turned(start, θ):
+        if "Transform" in type(start).__name__:
+            there = mi.Transform4f().translate(list(center)).rotate([0, 1, 0], mi.Float(np.degrees(1.0)) * θ)
+            return there.translate([-c for c in center]) @ mi.Transform4f(start)
+        v = np.array(dr.detach(start)).reshape(-1, 3) - np.float32(center)
+        return start + mi.Float(np.stack([v[:, 2], 0 * v[:, 0], -v[:, 0]], 1).ravel().astype(np.float32)) * θ
+
+    return turned
+
+
+class MovedCapture:
+    """A scene, the parameters that ``change(start, θ)`` moves, and a loss that is linear in the capture."""
+
+    def __init__(self, description, keys, change):
+        self.scene = mi.load_dict(description, optimize=False)
+        self.parameters, self.change = mi.traverse(self.scene), change
+        keys = [keys] if isinstance(keys, str) else keys
+        self.start = {key: type(self.parameters[key])(self.parameters[key]) for key in keys}
+        shape = tuple(self.scene.sensors()[0].film().cube_shape())
+        rng = np.random.default_rng(5)
+        weights = 1 + 0.3 * rng.normal(size=(*shape[:2], 1, 1)) + np.sin(np.arange(shape[2]) / 7)[:, None]
+        self.adjoint = mi.TensorXf((weights * (1 + 0.5 * np.arange(shape[3]))).astype(np.float32))
+
+    def install(self, θ):
+        for key, start in self.start.items():
+            self.parameters[key] = self.change(start, θ)
+        self.parameters.update()
+
+    def _weighed(self, cube):
+        return float((np.array(cube, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
+
+    def loss(self, θ, seed, spp):
+        self.install(mi.Float(θ))
+        with dr.suspend_grad():
+            return self._weighed(self.scene.integrator().render(self.scene, seed=seed, spp=spp)[1])
+
+    def difference(self, h, seed, spp):
+        return (self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
+
+    def reverse(self, seed, spp):
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        self.install(θ)
+        self.scene.integrator().render_backward(self.scene, self.parameters, (None, self.adjoint), seed=seed, spp=spp)
+        return float(dr.grad(θ)[0])
+
+    def forward(self, seed, spp):
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        self.install(θ)
+        dr.set_grad(θ, 1.0)
+        return self._weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp)[1])
+
+    def boundary(self, spp=64):
+        """The boundary term that a job of derivatives has, None for none."""
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        self.install(θ)
+        with noted() as found:
+            self.scene.integrator().render_backward(self.scene, self.parameters, (None, self.adjoint), seed=0, spp=spp)
+        return found[0] if found else None
+
+
+@contextmanager
+def noted():
+    """The boundary terms that are computed meanwhile, which are left out."""
+    found = []
+    with patch.object(MutualOcclusion, "backward", lambda self, incoming: found.append(self)):
+        yield found
