@@ -68,10 +68,6 @@ def test_a_plane_in_closed_form(tiles):
 @pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
 @pytest.mark.parametrize("film", [{}, {"frequencies": FREQUENCIES}], ids=["bins", "phasors"])
 def test_parts_in_a_file_and_without(tmp_path, kind, film):
-    if kind == "exhaustive" and film:
-        with pytest.raises(SceneError, match="exhaustive_scan"):
-            simulated(of=scan(kind), **film)
-        return
     path = tmp_path / "a.part"
     kept = simulated(of=scan(kind), part=path, tiles=4, **film)
     without = simulated(of=scan(kind), tiles=4, **film)

@@ -106,8 +106,8 @@ def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
     if available is not None and taken * (1 + share) > available:
         numbers = " x ".join(map(str, shape))
         raise StorageError(
-            f"simulate: the capture would take {size(taken)} ({numbers} numbers) and {size(int(taken * share))} beside "
-            f"it, and {size(available)} are available. Use fewer bins, sensor points or laser spots, or simulate parts "
+            f"simulate: the capture would take {size(int(taken * (1 + share)))} ({numbers} numbers), and "
+            f"{size(available)} are available. Use fewer bins, sensor points or laser spots, or simulate parts "
             "of the scan (Scan.single, Scan.points)."
         )
 

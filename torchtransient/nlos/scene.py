@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, UnitError
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.scene_handle import load
 from torchtransient.render.variant import active_variant
@@ -20,7 +21,11 @@ WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
 ALL_BOUNCES = "all"
 _MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
-_CHAIN = ("sensor", "integrator", "emitter")
+# Plugins of emitters, Mitsuba's and ours.
+_LIGHTS = (
+    "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
+    "envmap", "sunsky", "timed_sunsky",
+)  # fmt: skip
 
 
 def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0) -> dict[str, Any]:
@@ -32,13 +37,15 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
     laser, a number or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor
     ``wall.sensor``.
 
-    Raises SceneError for what is no shape, for names that the capture needs itself, and for a scan without a wall.
+    Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
+    without a wall; UnitError for an energy below zero.
     """
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
             "or Scan.points(..., wall=...)."
         )
+    _check_energy(energy)
     first, last = _range(bounces)
     shapes = hidden_shapes(hidden)
     taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
@@ -86,11 +93,18 @@ def hidden_shapes(hidden: Any) -> dict[str, Any]:
     """Hidden things as a dictionary of Mitsuba shapes (and what they refer to) by name."""
     if isinstance(hidden, (str, Path)):
         plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
+        if Path(hidden).suffix.lower() == ".xml":
+            raise SceneError(
+                f"hidden: {str(hidden)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it "
+                "as it is: tt.nlos.simulate(path)."
+            )
         if plugin is None:
             raise SceneError(
                 f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got "
                 f"{str(hidden)!r}."
             )
+        if not Path(hidden).is_file():
+            raise SceneError(f"hidden: no file {str(hidden)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
         return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
     if isinstance(hidden, Mapping):
         if hidden.get("type") == "scene" or "type" not in hidden:
@@ -133,6 +147,29 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
                 f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
                 "it out, or render a complete scene with tt.TransientRenderer."
             )
+        _check_dark(node, name)
+
+
+def _check_dark(node: Mapping[str, Any], where: str) -> None:
+    """Raise SceneError for light among hidden things."""
+    if str(node.get("type")) in _LIGHTS:
+        raise SceneError(
+            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone: the one light of a capture is the "
+            "laser. Leave it out, or render a complete scene with tt.TransientRenderer."
+        )
+    for name, part in node.items():
+        if isinstance(part, Mapping):
+            _check_dark(part, f"{where}.{name}")
+
+
+def _check_energy(energy: Any) -> None:
+    """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
+    if isinstance(energy, Mapping):
+        return
+    if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
+        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {energy!r}.")
+    if not (math.isfinite(energy) and energy >= 0):
+        raise UnitError(f"energy: expected joules of at least 0, got {energy!r}.")
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:

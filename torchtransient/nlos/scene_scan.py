@@ -58,7 +58,12 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
     sensor, film = integrator.resolve(scene, sensor)
     kind = integrator.capture.name.lower()
     columns, rows = (int(n) for n in film.crop_size())
-    seen, there = _on_extended_wall(_sensor_ends(scene, sensor), (rows, columns))
+    ends = _sensor_ends(scene, sensor)
+    if hasattr(sensor, "scanned"):
+        aimed = _array(sensor.scanned())
+        _check_same(ends, aimed, aimed, "sensor")
+        _check_hidden(scene, ends)
+    seen, there = _on_extended_wall(ends, (rows, columns))
     points = seen.points.reshape(rows, columns, 3)
     normals = seen.normals.reshape(rows, columns, 3)
     laser_origin, spots = _laser_ends(scene, sensor, integrator)
@@ -82,12 +87,14 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
 
 
 def check_scan_is_seen(scene: Any, scan: Scan) -> None:
-    """Raise SceneError where rays of a scan's own scene end somewhere else than at its points. Call it inside
-    ``active_variant``.
+    """Raise SceneError where rays of a scan's own scene end somewhere else than at its points, or nothing hidden is
+    before the wall. Call it inside ``active_variant``.
     """
     sensor = scene.sensors()[0]
     points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
-    _check_same(_sensor_ends(scene, sensor), points, points, "sensor")
+    ends = _sensor_ends(scene, sensor)
+    _check_same(ends, points, points, "sensor")
+    _check_hidden(scene, ends)
     spots = scan.laser_points.detach().cpu().numpy().reshape(-1, 3)
     _check_same(_laser_ends(scene, sensor, scene.integrator())[1], spots, points, "laser")
 
@@ -97,20 +104,9 @@ def check_scan_is_seen(scene: Any, scan: Scan) -> None:
 
 def _sensor_ends(scene: Any, sensor: Any) -> Ends:
     """Of the rays of pixel centres, row by row."""
-    import drjit as dr
-    import mitsuba as mi
+    from torchtransient.plugins.around_corner.scan_table import scan_rays
 
-    from torchtransient.plugins.around_corner.scan_table import sensor_targets
-
-    if hasattr(sensor, "targets"):
-        origin = mi.Point3f(sensor.world_transform().translation())
-        return _ends(scene, mi.Ray3f(origin, dr.normalize(sensor_targets(sensor) - origin)))
-    size = sensor.film().crop_size()
-    index = dr.arange(mi.UInt32, int(size[0]) * int(size[1]))
-    row = index // int(size[0])
-    place = mi.Point2f(mi.Float(index - row * int(size[0])), mi.Float(row)) + 0.5
-    ray, _ = sensor.sample_ray(0.0, 0.5, place / mi.ScalarVector2f(size), mi.Point2f(0.5))
-    return _ends(scene, mi.Ray3f(ray.o, ray.d))
+    return _ends(scene, scan_rays(sensor))
 
 
 def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.float64], Ends]:
@@ -119,7 +115,7 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     import mitsuba as mi
 
     from torchtransient.interfaces import CaptureType
-    from torchtransient.plugins.around_corner.scan_table import laser_of, origin_of, targets_of
+    from torchtransient.plugins.around_corner.scan_table import aims_of, check_count, laser_of, origin_of
 
     laser = laser_of(scene)
     if laser.get_shape() is not None or mi.has_flag(laser.flags(), mi.EmitterFlags.Infinite):
@@ -131,8 +127,9 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     if integrator.capture is CaptureType.EXHAUSTIVE and not integrator.equal_grids:
         fov = integrator.laser_fov
     origin = dr.detach(origin_of(scene, sensor))
-    targets = dr.detach(targets_of(scene, sensor, integrator.capture, fov))
-    return _array(origin).reshape(3), _ends(scene, mi.Ray3f(origin, dr.normalize(targets - origin)))
+    aims = dr.detach(aims_of(scene, sensor, integrator.capture, fov))
+    check_count(aims, sensor, integrator.capture)
+    return _array(origin).reshape(3), _ends(scene, mi.Ray3f(origin, dr.normalize(aims)))
 
 
 def _ends(scene: Any, ray: Any) -> Ends:
@@ -232,9 +229,30 @@ def _check_all_meet(spots: Ends) -> None:
         )
 
 
+def _check_hidden(scene: Any, wall: Ends) -> None:
+    """Raise SceneError unless a shape that rays do not meet reaches before the wall."""
+    seen = set(wall.shapes)
+    hidden = [shape for shape in scene.shapes() if (shape.id() or shape.class_name()) not in seen]
+    if not hidden:
+        raise SceneError(
+            "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
+            "the hidden things as shapes."
+        )
+    for shape in hidden:
+        box = shape.bbox()
+        corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
+        if bool((((corners[:, None] - wall.points) * wall.normals).sum(-1) > 0).any()):
+            return
+    raise SceneError(
+        "hidden: expected something before the wall, on the side that its normals point to, got nothing there: what is "
+        "behind it sends it no light. Move the hidden things or turn the wall (flip_normals)."
+    )
+
+
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:
     """Raise SceneError unless rays end at ``points``; ``scanned``: those that say how large the scan is."""
-    size = max(float(np.linalg.norm(scanned.max(0) - scanned.min(0))), float(np.linalg.norm(points[0])) * 1e-3, 1e-6)
+    legs = np.linalg.norm(points - ends.origins, axis=-1)
+    size = max(float(np.linalg.norm(scanned.max(0) - scanned.min(0))), float(legs.max()))
     off = np.linalg.norm(ends.points - points, axis=-1)
     wrong = np.flatnonzero((off > SAME_POINT * size) | np.array([not name for name in ends.shapes]))
     if not len(wrong):

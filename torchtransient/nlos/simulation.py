@@ -30,6 +30,7 @@ from torchtransient.nlos.renderer import in_film_shape, in_scan_shape, measured
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, checked_count, seed_of
+from torchtransient.render.arguments import samples
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
 from torchtransient.units import seconds_to_opl
@@ -134,8 +135,7 @@ def _work(
 ) -> Work:  # fmt: skip
     if time_axis is not None and frequencies is not None:
         raise SceneError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
-    if spp is not None:
-        checked_count("spp", spp)
+    samples("spp", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
     if not isinstance(scan, Scan):
