@@ -46,7 +46,8 @@ class RowLayout:
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> RowLayout:
         """Of what `plain` returned."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in plain.items()})
+        given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
+        return cls(**given)
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
@@ -77,7 +78,7 @@ class RowLayout:
         measured, steady = numbers[:, :split], numbers[:, split:]
         if self.phasor:
             # Beside a steady image the pairs of a row may begin at odd places.
-            measured = torch.view_as_complex(measured.unflatten(1, (-1, 2)).contiguous())
+            measured = torch.view_as_complex(measured.reshape(len(numbers), -1, 2).contiguous())
         made: dict[str, Any] = {"transient": None, "phasor": None, "steady": None}
         made["phasor" if self.phasor else "transient"] = _points_last(measured, self.front, scan)
         if self.steady:
@@ -106,4 +107,5 @@ def _points_first(tensor: torch.Tensor, rank: int) -> torch.Tensor:
 
 def _points_last(rows: torch.Tensor, front: tuple[int, ...], scan: Scan) -> torch.Tensor:
     """(*front, *sensor) of (N, columns)."""
-    return rows.unflatten(1, front).movedim(0, -1).unflatten(-1, scan.sensor_shape)
+    moved = rows.reshape(len(rows), *front).movedim(0, -1)
+    return moved.reshape(*front, *scan.sensor_shape)
