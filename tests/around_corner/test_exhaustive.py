@@ -104,6 +104,20 @@ def test_bins_and_what_is_outside_are_the_steady_image(window):
     assert (outside > 0.1 * steady.sum()) == (window[1] == 6)
 
 
+def test_gates_are_sums_of_bins_and_phasors_are_refused():
+    runs = Runs(SCENES["body"]())
+    runs.pairs = films(40, 1.2)[1]
+    _, cube = runs.exhaustive()
+    grid = {"exhaustive_scan": True, "laser_scan_width": GRID, "laser_scan_height": GRID}
+    runs.pairs = film_of(GRID, GRID, type="gated_hdr_film", gates="rectangular 1.2 2.2; rectangular 2.2 3.2", **grid)
+    for reciprocal in (True, False):
+        _, gated = runs.exhaustive(reciprocal=reciprocal)
+        assert gated == pytest.approx(cube.reshape(GRID**2, GRID**2, 2, 20, 1).sum(3), rel=1e-5)
+    runs.pairs = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0, 1", **grid)
+    with pytest.raises(SceneError, match="phasor_hdr_film"):
+        runs.exhaustive()
+
+
 def test_colours():
     """Each channel is a capture in its own albedo and energy."""
     with mi.variant_context("llvm_ad_rgb"):

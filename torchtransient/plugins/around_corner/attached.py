@@ -1,70 +1,69 @@
-"""Samples, scanned points and laser spots with derivatives: what they are of the scene's parameters, and as leaves."""
+"""Samples and points of the wall with derivatives: what they are of the scene's parameters, and as leaves of a lane."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.around_corner.geometry import span
+from torchtransient.plugins.around_corner.geometry import occluded, span
+from torchtransient.plugins.sampling.packed import packed_columns
 from torchtransient.plugins.sampling.shared_samples import material_samples
 from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.strategy import Local
 
-# What a sample and a point of the wall are made of, see :func:`three_bounces`.
-SAMPLE = ("p", "n", "geometric_n", "front", "back")
-POINT = ("p", "n", "value", "leg")
-
 
 class Ends:
-    """Fields of many samples or points, by name: arrays of one width, attached where the scene is. A plain object."""
+    """Fields of ``count`` samples or points, by name, attached where the scene is: vectors, spectra and numbers.
 
-    def __init__(self, fields: dict[str, Any]) -> None:
-        self.fields = fields
-        self.width = max((dr.width(value) for value in fields.values()), default=0)
+    :meth:`load` reads them four numbers at a time. A plain object, which Dr.Jit loops leave alone.
+    """
 
-    @staticmethod
-    def of_samples(elements: Any, samples: Any, meshes: Any) -> Ends:
-        """The shared samples as material points of their shapes: what each stands for grows with its area."""
-        found = material_samples(elements, samples, meshes)
-        return Ends({name: getattr(found, name) for name in SAMPLE if samples.smooth or name != "geometric_n"})
-
-    @staticmethod
-    def of_points(points: Any, energy: Any = 1) -> Ends:
-        """Scanned points, or laser spots with their ``energy``."""
-        value, leg = mi.UnpolarizedSpectrum(points.value * energy), mi.Float(points.leg)
-        return Ends({"p": points.p, "n": mi.Vector3f(points.n), "value": value, "leg": leg})
+    def __init__(self, count: int, fields: dict[str, Any]) -> None:
+        self.count, self.fields = count, fields
+        self.size = dr.opaque(mi.UInt32, count)
+        with dr.suspend_grad():
+            columns = [column for value in fields.values() for column in _columns(dr.detach(value))]
+            self.rows = -(-len(columns) // 4)
+            columns += [mi.Float(0)] * (4 * self.rows - len(columns))
+            self.flat = packed_columns([columns[4 * i : 4 * i + 4] for i in range(self.rows)], count)
 
     @property
-    def attached(self) -> tuple[str, ...]:
-        """The fields with derivatives."""
-        return tuple(name for name, value in self.fields.items() if dr.grad_enabled(value))
+    def attached(self) -> list[str]:
+        """Names of the fields with derivatives; none are where derivatives are suspended."""
+        return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
 
-    def take(self, index: Any, active: Any = True) -> Local:
+    def load(self, index: Any) -> Local:
         """The fields of some of them, without derivatives."""
-        return Local(**{name: _taken(dr.detach(value), index, active) for name, value in self.fields.items()})
+        rows = [dr.gather(mi.Vector4f, self.flat, index * self.rows + i) for i in range(self.rows)]
+        columns = [row[i] for row in rows for i in range(4)]
+        found = {}
+        for name, value in self.fields.items():
+            size = dr.size_v(value) if dr.depth_v(value) > 1 else 1
+            own, columns = columns[:size], columns[size:]
+            found[name] = type(value)(*own)
+        return Local(**found)
 
     def tangents(self) -> Ends:
-        """Those that forward mode has brought to the fields."""
-        return Ends({name: dr.grad(self.fields[name]) for name in self.attached})
+        """What forward mode has brought to the attached fields."""
+        return Ends(self.count, {name: dr.grad(self.fields[name]) for name in self.attached})
 
     def hand_on(self, adjoints: dict[str, Any]) -> None:
-        """Back-propagate ``<adjoints, fields>``: adjoints of fields by name, of one sample or point each."""
+        """Back-propagate ``<adjoints, fields>``: adjoints by field, of one sample or point each."""
         for name, adjoint in adjoints.items():
             field = self.fields[name]
-            if dr.width(field) < dr.width(adjoint):
-                adjoint = type(adjoint)(dr.sum(adjoint, axis=-1)) if dr.depth_v(adjoint) > 1 else dr.sum(adjoint)
+            if dr.width(field) < self.count:
+                adjoint = dr.sum(adjoint) if dr.depth_v(adjoint) == 1 else type(adjoint)(*map(dr.sum, adjoint))
             dr.backward_from(total_of(adjoint, field))
 
 
-def _taken(value: Any, index: Any, active: Any) -> Any:
-    return dr.gather(type(value), value, index if dr.width(value) > 1 else mi.UInt32(0), active)
+def _columns(value: Any) -> list[Any]:
+    return [value] if dr.depth_v(value) == 1 else [value[i] for i in range(dr.size_v(value))]
 
 
-def leaves(local: Local, names: tuple[str, ...], width: int, tangents: Local | None = None) -> dict[str, Any]:
-    """Make leaves of the fields ``names`` of one sample or point each lane; returns them."""
+def leaves(local: Local, names: list[str], width: int, tangents: Local | None = None) -> dict[str, Any]:
+    """Make leaves of the fields ``names`` of one sample or point a lane, with ``tangents`` in forward mode."""
     found = {}
     for name in names:
         value = getattr(local, name)
@@ -78,34 +77,42 @@ def leaves(local: Local, names: tuple[str, ...], width: int, tangents: Local | N
     return found
 
 
-@dataclass
-class Light:
-    """Light of three bounces: ``value``, ``length`` (m), ``active`` (before it is asked what stands in between), and
-    the lines to the scanned point and to the spot.
+def ends_of_samples(scene: Any, elements: Any, samples: Any, meshes: Any, laser: Any = None) -> Ends:
+    """Shared samples as material points: ``p``, ``n``, ``front`` and ``back`` (what the sides scatter of light, times
+    the area that a sample stands for), and ``geometric_n`` where normals are interpolated.
+
+    ``laser`` (:class:`.wall_points.WallPoints` of one point): the spot that lights them all. ``n`` then points to the
+    side that is lit, ``front`` holds what arrives there, and ``delay`` is the length of the way to the spot.
     """
-
-    value: Any
-    length: Any
-    active: Any
-    seen: Any
-    lit: Any
-
-
-def three_bounces(sample: Local, point: Local, spot: Local, confocal: bool) -> Light:
-    """What a hidden sample sends from a spot to a scanned point; ``sample.front``, ``back``: albedo over pi of its
-    sides, times the area that it stands for; ``spot.value``: with the laser's energy.
-    """
-    if not hasattr(sample, "geometric_n"):
-        sample.geometric_n = sample.n
-    seen = span(sample, point.p, point.n)
-    if confocal:
-        lit, length = seen, 2 * seen.r
+    found = material_samples(elements, samples, meshes)
+    fields = {"p": found.p, "n": found.n, "front": found.front}
+    if laser is None:
+        fields["back"] = found.back
     else:
-        lit = span(sample, spot.p, spot.n)
-        length = seen.r + lit.r
-    scattered = dr.select(lit.cos > 0, sample.front, sample.back)
-    g = dr.abs(lit.cos) * lit.wall_cos * lit.inverse_square
-    g = g * dr.abs(seen.geometric_cos) * seen.wall_cos * seen.inverse_square
-    active = (dr.detach(g) > 0) & (dr.detach(lit.cos * seen.cos) > 0)
-    value = scattered * g * point.value * spot.value
-    return Light(value, length + point.leg + spot.leg, active, seen, lit)
+        line = span(_line_start(found, samples.smooth), laser.p, mi.Vector3f(laser.n))
+        arrives = dr.abs(line.cos) * line.wall_cos * line.inverse_square
+        reflected = dr.select(line.cos > 0, found.front, found.back)
+        with dr.suspend_grad():
+            plain = _line_start(Local(**{k: dr.detach(v) for k, v in vars(found).items()}), samples.smooth)
+            to = span(plain, dr.detach(laser.p), mi.Vector3f(dr.detach(laser.n)))
+            lit = dr.detach(arrives) > 0
+            lit &= ~occluded(scene, plain, to, dr.detach(laser.p), mi.Vector3f(dr.detach(laser.n)), lit)
+        fields["n"] = dr.select(to.cos > 0, found.n, -found.n)
+        fields["front"] = dr.select(lit, reflected * arrives, 0)
+        fields["delay"] = dr.select(lit, line.r, 0)
+    if samples.smooth:
+        fields["geometric_n"] = found.geometric_n
+    return Ends(samples.count, fields)
+
+
+def _line_start(sample: Local, smooth: bool) -> Local:
+    return Local(p=sample.p, n=sample.n, geometric_n=sample.geometric_n if smooth else sample.n)
+
+
+def ends_of_points(sensors: Any, lasers: Any, energy: Any) -> Ends:
+    """Scanned points with what the wall makes of light there and at the spot, times the laser's energy (``value``), and
+    the legs before and behind (``leg``).
+    """
+    value = mi.UnpolarizedSpectrum(sensors.value * lasers.value * energy)
+    leg = mi.Float(sensors.leg) + mi.Float(lasers.leg)
+    return Ends(sensors.width, {"p": sensors.p, "n": mi.Vector3f(sensors.n), "value": value, "leg": leg})

@@ -24,6 +24,8 @@ from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 # What single precision leaves of the largest coordinate: triangles that share an edge do not hide each other. Rays
 # start 15 times farther off a surface.
 ROUNDING = 6e-6
+# Rays that are traced while a triangle is tested, and as many again for those that are not spared.
+_RAYS_A_TRIANGLE = 1000
 # Directions across the wall that shafts are cut off in.
 _ACROSS = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)]
 
@@ -48,6 +50,12 @@ class ScanRegion:
         local = np.asarray(points, dtype=np.float64).reshape(-1, 3) @ self.frame.T
         slack = ROUNDING * self.scale
         return bool(np.all(local >= self.low - slack) and np.all(local <= self.high + slack))
+
+
+def pays(scene: Any, rays: int) -> bool:
+    """Whether finding shafts takes less time than the rays that they may spare: it is some 400 rays a triangle."""
+    triangles = sum(int(shape.face_count()) for shape in scene.shapes() if shape.is_mesh())
+    return rays > _RAYS_A_TRIANGLE * triangles
 
 
 def spare_rays(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> float:

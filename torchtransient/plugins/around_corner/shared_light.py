@@ -7,11 +7,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.attached import Ends
+from torchtransient.plugins.around_corner.attached import ends_of_points, ends_of_samples
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
+from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints
@@ -28,8 +30,8 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     """What stands against shared samples in a scene, None for nothing."""
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
-    if sensor.film().exhaustive_scan and sensor.film().measures != "transient":
-        return f"the film of an exhaustive capture is a {sensor.film().plugin}"
+    if sensor.film().exhaustive_scan and sensor.film().lanes_at_most(1) is not None:
+        return f"the film of an exhaustive capture is a {sensor.film().plugin}, which lists events"
     if not hasattr(sensor, "scanned"):
         return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:
@@ -59,8 +61,6 @@ def wall_lights_itself(sensor: Any) -> bool:
 
 
 def _is_flat_mesh(shape: Any) -> bool:
-    import numpy as np
-
     if not shape.is_mesh():
         return False
     v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
@@ -127,6 +127,11 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
+def _rows(vectors: Any, width: int) -> np.ndarray:
+    """(width, 3), detached."""
+    return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
+
+
 class SharedThirdBounce:
     """Light of three bounces of one job: its render, and its derivatives beside those of paths (confocal and single).
 
@@ -143,13 +148,25 @@ class SharedThirdBounce:
         draw: tuple[Any, int],
     ) -> None:
         self.world, self.film, self.light, self.capture = world, film, light, capture
+        if world.wanted is None:
+            self._spare_rays(elements, draw[1])
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
         if world.wanted is not None:
+            laser = None if capture is CaptureType.CONFOCAL else light.spots
             with dr.resume_grad():
-                ends = Ends.of_samples(elements, self.samples, world.contents.meshes)
-            confocal = capture is CaptureType.CONFOCAL
-            self.gradients = ThirdBounceGradients(world.scene, film, light, ends, confocal)
+                samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
+                points = ends_of_points(light.sensors, light.spots, light.energy)
+            self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
+
+    def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
+        """Leave out rays to what nothing hides, where that is found faster than they are traced."""
+        points = (
+            [self.light.sensors] if self.light.spots is self.light.sensors else [self.light.sensors, self.light.spots]
+        )
+        if pays(self.world.scene, samples * sum(each.width for each in points)):
+            p, n = (np.concatenate([_rows(getattr(each, name), each.width) for each in points]) for name in "pn")
+            spare_rays(self.world.scene, elements, p, n)
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""

@@ -1,9 +1,10 @@
 """Derivatives of third-bounce light from shared samples, confocal and single, in both modes.
 
 Reverse mode has a lane for each hidden sample, which loops over the scanned points and keeps the adjoint of its sample
-to itself: no sum is atomic, whatever the number of connections. What belongs to the scanned points is found in a
-second pass, with a lane for each of them. The adjoints of samples and points are then handed on to the scene once. In
-forward mode the tangents of samples and points are tables; every connection puts ``k df + f k' dtau`` onto the film.
+to itself: no sum is atomic, and memory does not grow with the number of connections. What belongs to the scanned points
+is found in a second pass, with a lane for each of them. The adjoints of samples and points are then handed on to the
+scene once. In forward mode the tangents of samples and points are tables, and every connection puts ``k df + f k'
+dtau`` onto the film.
 
 Samples are material points: with the density held fixed per area of material, a lone body's outline needs no boundary
 term. What stands in between is asked again and held fixed; bodies that hide each other need the term of their edges.
@@ -16,8 +17,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.around_corner.attached import Ends, leaves, three_bounces
-from torchtransient.plugins.around_corner.geometry import occluded
+from torchtransient.plugins.around_corner.attached import Ends, leaves
+from torchtransient.plugins.around_corner.geometry import occluded, span
 from torchtransient.plugins.around_corner.launches import launches_of
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.transport.carry import slope_only, total_of
@@ -29,153 +30,140 @@ BUSY = 2**14
 
 
 class ThirdBounceGradients:
-    """One job of derivatives. ``light``: the :class:`.shared_light.ScanLight`, ``samples``: :class:`.attached.Ends` of
-    the shared samples, both attached; ``confocal``: each scanned point is the spot itself, else there is one for all.
+    """One job of derivatives. ``samples`` and ``points``: :class:`.attached.Ends`, attached; ``clear``: how many of the
+    samples, the first ones, nothing can hide.
 
     A plain class, which Dr.Jit loops leave alone.
     """
 
-    def __init__(self, scene: Any, film: Any, light: Any, samples: Ends, confocal: bool) -> None:
-        self.scene, self.film, self.samples, self.confocal = scene, film, samples, confocal
-        with dr.resume_grad():
-            self.sensors, self.spots = Ends.of_points(light.sensors), Ends.of_points(light.spots, light.energy)
+    def __init__(self, scene: Any, film: Any, samples: Ends, points: Ends, clear: Any) -> None:
+        self.scene, self.film, self.samples, self.points, self.clear = scene, film, samples, points, clear
+        self.lit, self.smooth = "delay" in samples.fields, "geometric_n" in samples.fields
         self.match = ChannelMatch(None, mi.UnpolarizedSpectrum(1))
         self.window = film.arrivals()
-        self.lit = None if confocal else self._lit()
-        # In memory, so that kernels do not depend on them.
-        self.sample_count = dr.opaque(mi.UInt32, samples.width)
-        self.point_count = dr.opaque(mi.UInt32, self.sensors.width)
 
-    def _lit(self) -> Any:
-        """Which samples the single spot reaches, by one ray each."""
-        sample, spot = self.samples.take(dr.arange(mi.UInt32, self.samples.width)), self.spots.take(mi.UInt32(0))
-        light = three_bounces(sample, spot, spot, confocal=True)
-        lit = light.active & ~occluded(self.scene, sample, light.lit, spot.p, spot.n, light.active)
-        dr.eval(lit)
-        return lit
-
-    def connection(self, sample: Any, point: Any, spot: Any, k: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(:class:`.attached.Light` of sample ``k``, arrival minus the film's start, whether it arrives)."""
-        light = three_bounces(sample, point, spot, self.confocal)
-        opl = mi.Float64(dr.detach(light.length)) - self.film.start_opl
-        active = active & light.active
-        if self.lit is not None:
-            active &= dr.gather(mi.Mask, self.lit, k, active)
+    def connection(self, sample: Any, point: Any, k: Any) -> tuple[Any, Any, Any, Any]:
+        """(value, length and arrival minus the film's start of sample ``k`` at a point, whether it arrives)."""
+        geometric_n = sample.geometric_n if self.smooth else sample.n
+        line = span(Local(p=sample.p, n=sample.n, geometric_n=geometric_n), point.p, point.n)
+        if self.lit:
+            side, scattered, length = line.cos > 0, sample.front, line.r + sample.delay
+            g = dr.abs(line.geometric_cos) * line.wall_cos * line.inverse_square
+        else:
+            side, length = line.cos != 0, 2 * line.r
+            scattered = dr.select(line.cos > 0, sample.front, sample.back)
+            g = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
+        length = length + point.leg
+        active = dr.detach(side & (g > 0))
+        opl = mi.Float64(dr.detach(length)) - self.film.start_opl
         if self.window is not None:
             active &= self.window.counts(opl)
         with dr.suspend_grad():
-            from_sample, line = (Local(**{n: dr.detach(v) for n, v in vars(x).items()}) for x in (sample, light.seen))
-            active &= ~occluded(self.scene, from_sample, line, dr.detach(point.p), dr.detach(point.n), active)
-        return light, opl, active
-
-    # ------------------------------------------------------------------------------------------------- reverse
+            plain, line = (Local(**{n: dr.detach(v) for n, v in vars(x).items()}) for x in (sample, line))
+            plain.geometric_n = plain.geometric_n if self.smooth else plain.n
+            in_doubt = active & (k >= self.clear)
+            active &= ~occluded(self.scene, plain, line, dr.detach(point.p), dr.detach(point.n), in_doubt)
+        return scattered * g * point.value, length, opl, active
 
     def tables(self) -> list[Any]:
-        """The attached fields of samples, points and spots."""
+        """The attached fields of samples and points."""
         with dr.resume_grad():
-            return [ends.fields[name] for ends in self._ends().values() for name in ends.attached]
+            return [ends.fields[name] for ends in (self.samples, self.points) for name in ends.attached]
+
+    # ------------------------------------------------------------------------------------------------- reverse
 
     def backward(self, incoming: Any) -> None:
         """Hand ``<incoming adjoint, capture>`` on to the scene."""
         read = AdjointReader(self.film, self.match, incoming)
-        with dr.resume_grad():  # the question whether a field is attached is answered no while suspended
-            at_sample, at_point, at_spot = ([(k, n) for n in ends.attached] for k, ends in self._ends().items())
-        (at_point if self.confocal else at_sample).extend(at_spot)
-        found: dict[tuple[str, str], Any] = {}
-        if at_sample:
-            split = Split(self.samples.width, self.sensors.width)
-            kept = over_points(self, read, self._zeros(at_sample), split.own, split.first, split.last)
-            found |= {key: split.reduced(kept[".".join(key)]) for key in at_sample}
-        if at_point:
-            split = Split(self.sensors.width, self.samples.width)
-            kept = over_samples(self, read, self._zeros(at_point), split.own, split.first, split.last)
-            found |= {key: split.reduced(kept[".".join(key)]) for key in at_point}
-        dr.eval(found)
+        found = []
+        for own, others, over in ((self.samples, self.points, over_points), (self.points, self.samples, over_samples)):
+            with dr.resume_grad():  # the question whether a field is attached is answered no while suspended
+                names = own.attached
+            if names:
+                split = Split(own, others.count)
+                kept = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
+                found.append((own, {name: split.reduced(value) for name, value in kept.items()}))
+        dr.eval([adjoints for _, adjoints in found])
         with dr.resume_grad():
-            for kind, ends in self._ends().items():
-                ends.hand_on({name: value for (of, name), value in found.items() if of == kind})
+            for ends, adjoints in found:
+                ends.hand_on(adjoints)
 
-    def _ends(self) -> dict[str, Ends]:
-        return {"sample": self.samples, "point": self.sensors, "spot": self.spots}
-
-    def _zeros(self, wanted: list[tuple[str, str]]) -> dict[str, Any]:
-        ends = self._ends()
-        return {f"{kind}.{name}": dr.zeros(type(ends[kind].fields[name])) for kind, name in wanted}
-
-    def step_back(self, read: AdjointReader, kept: dict[str, Any], k: Any, s: Any) -> None:
-        """Add the adjoints of the connection of sample ``k`` and point ``s`` to ``kept``."""
-        width = max(dr.width(k), dr.width(s))
+    def step_back(self, read: AdjointReader, kept: dict[str, Any], pair: Local, of_sample: bool) -> None:
+        """Add the adjoints of one connection to ``kept``: those of its sample, or of its point. ``pair``: ``sample``
+        and ``point``, number ``k`` and ``s``.
+        """
         with dr.resume_grad():
-            sample, point, spot = self.samples.take(k), self.sensors.take(s), self._spot(s)
-            found = {}
-            for kind, local in (("sample", sample), ("point", point), ("spot", spot)):
-                names = tuple(key.split(".")[1] for key in kept if key.startswith(kind + "."))
-                found |= {f"{kind}.{name}": leaf for name, leaf in leaves(local, names, width).items()}
-            light, opl, arrives = self.connection(sample, point, spot, k, mi.Mask(True))
-            A, slope = read.block(s).read(opl, arrives)
-            objective = total_of(A, light.value) + total_of(slope, dr.detach(light.value)) * slope_only(light.length)
+            sample, point = dr_copy(pair.sample), dr_copy(pair.point)
+            found = leaves(sample if of_sample else point, list(kept), max(dr.width(pair.k), dr.width(pair.s)))
+            value, length, opl, arrives = self.connection(sample, point, pair.k)
+            A, slope = read.block(pair.s).read(opl, arrives)
+            objective = total_of(A, value) + total_of(slope, dr.detach(value)) * slope_only(length)
             dr.backward_from(dr.select(arrives, objective, 0))
             for name, leaf in found.items():
                 kept[name] = kept[name] + dr.grad(leaf)
-
-    def _spot(self, s: Any) -> Local:
-        return self.spots.take(s if self.confocal else mi.UInt32(0))
 
     # ------------------------------------------------------------------------------------------------- forward
 
     def forward(self) -> None:
         """Put the derivative along the scene's tangents onto the film."""
         with dr.resume_grad():
-            tangents = {kind: ends.tangents() for kind, ends in self._ends().items()}
-        launches = launches_of(self.film, self.sensors.width, self.samples.width)
-        for launch in launches:
+            tangents = self.samples.tangents(), self.points.tangents()
+        for launch in launches_of(self.film, self.points.count, self.samples.count):
             pixel, first, last = launch.lanes()
             base = launch.base(self.film, pixel)
             block = self.film.create_block(launch, base, self.match, launch.most_events, tangents=True)
+            lane = Local(own=pixel, first=first, last=last, fields=self.points.load(pixel))
+            lane.tangent = tangents[1].load(pixel)
+            dr.eval(vars(lane.fields), vars(lane.tangent), pixel, first, last)
             kept = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
-            kept = tangents_over_samples(self, tangents, block, kept, pixel, first, last)
+            kept = tangents_over_samples(self, tangents[0], block, kept, lane)
             block.end(kept["block"])
             self.film.add_steady(pixel, self.match.to_channels(kept["dL"]))
             block.finish()
             dr.eval(self.film.bands[launch.band][2], self.film.steady)
 
-    def step_on(self, tangents: dict[str, Ends], block: Any, kept: dict[str, Any], k: Any, s: Any) -> None:
+    def step_on(self, tangents: Ends, block: Any, kept: dict[str, Any], lane: Local, k: Any) -> None:
         """Put the derivative of one connection into the film's block."""
-        width = max(dr.width(k), dr.width(s))
         with dr.resume_grad():
-            sample, point, spot = self.samples.take(k), self.sensors.take(s), self._spot(s)
-            at = {"sample": k, "point": s, "spot": s if self.confocal else mi.UInt32(0)}
-            for kind, local in (("sample", sample), ("point", point), ("spot", spot)):
-                names = tuple(tangents[kind].fields)
-                leaves(local, names, width, tangents[kind].take(at[kind]) if names else None)
-            light, opl, arrives = self.connection(sample, point, spot, k, mi.Mask(True))
-            d_value, d_opl = tangents_of([light.value, slope_only(light.length)])
-        value = dr.detach(light.value)
+            sample, point, width = self.samples.load(k), dr_copy(lane.fields), dr.width(lane.own)
+            leaves(sample, list(tangents.fields), width, tangents.load(k))
+            leaves(point, list(vars(lane.tangent)), width, lane.tangent)
+            value, length, opl, arrives = self.connection(sample, point, k)
+            d_value, d_opl = tangents_of([value, slope_only(length)])
         kept["dL"] = kept["dL"] + dr.select(arrives, d_value, 0)
-        block.put_slope(kept["block"], opl, d_value, value * d_opl, arrives)
+        block.put_slope(kept["block"], opl, d_value, dr.detach(value) * d_opl, arrives)
+
+
+def dr_copy(local: Local) -> Local:
+    """The same fields under another roof: what becomes a leaf in it does not in the other."""
+    return Local(**vars(local))
 
 
 class Split:
-    """Lanes for ``count`` samples or points, several each where there are few, and the range of the ``others`` that
-    each of them goes through.
+    """Lanes for samples or points ``ends``, several each where there are few, and the range of the ``others`` that each
+    of them goes through; ``fields``: those of the lane's own sample or point. Neighbouring lanes go through the others
+    together. A plain object.
     """
 
-    def __init__(self, count: int, others: int) -> None:
-        self.lanes = max(1, min(others, -(-BUSY // count)))
-        lanes, size = dr.opaque(mi.UInt32, self.lanes), dr.opaque(mi.UInt32, -(-others // self.lanes))
-        lane = dr.arange(mi.UInt32, count * self.lanes)
-        self.own = lane // lanes
-        self.first = (lane - self.own * lanes) * size
+    def __init__(self, ends: Ends, others: int) -> None:
+        self.count, self.lanes = ends.count, max(1, min(others, -(-BUSY // ends.count)))
+        size = dr.opaque(mi.UInt32, -(-others // self.lanes))
+        lane = dr.arange(mi.UInt32, self.count * self.lanes)
+        part = lane // ends.size
+        self.own, self.first = lane - part * ends.size, part * size
         self.last = dr.minimum(self.first + size, dr.opaque(mi.UInt32, others))
-        dr.eval(self.own, self.first, self.last)
+        self.fields = ends.load(self.own)
+        dr.eval(self.own, self.first, self.last, vars(self.fields))
 
     def reduced(self, value: Any) -> Any:
         """Sums over the lanes of one sample or point."""
         if self.lanes == 1:
             return value
-        if dr.depth_v(value) == 1:
-            return dr.block_sum(value, self.lanes)
-        return type(value)(*[dr.block_sum(component, self.lanes) for component in value])
+        own = dr.arange(mi.UInt32, self.count)
+        total = dr.gather(type(value), value, own)
+        for part in range(1, self.lanes):
+            total += dr.gather(type(value), value, own + part * self.count)
+        return total
 
 
 class AdjointReader:
@@ -193,30 +181,30 @@ class AdjointReader:
 
 
 @dr.syntax
-def over_points(job, read, kept, k, first, last):
-    """Adjoints of sample ``k`` from the scanned points ``first`` to ``last`` (exclusive)."""
-    s = mi.UInt32(first)
-    while dr.hint(s < last, label="scanned points, reverse"):
-        job.step_back(read, kept, k, s)
+def over_points(job, read, kept, split):
+    """Adjoints of each lane's sample, from its range of the points."""
+    s = mi.UInt32(split.first)
+    while dr.hint(s < split.last, label="scanned points, reverse"):
+        job.step_back(read, kept, Local(sample=split.fields, point=job.points.load(s), k=split.own, s=s), True)
         s += 1
     return kept
 
 
 @dr.syntax
-def over_samples(job, read, kept, s, first, last):
-    """Adjoints of point ``s`` from the samples ``first`` to ``last`` (exclusive)."""
-    k = mi.UInt32(first)
-    while dr.hint(k < last, label="hidden samples, reverse"):
-        job.step_back(read, kept, k, s)
+def over_samples(job, read, kept, split):
+    """Adjoints of each lane's point, from its range of the samples."""
+    k = mi.UInt32(split.first)
+    while dr.hint(k < split.last, label="hidden samples, reverse"):
+        job.step_back(read, kept, Local(sample=job.samples.load(k), point=split.fields, k=k, s=split.own), False)
         k += 1
     return kept
 
 
 @dr.syntax
-def tangents_over_samples(job, tangents, block, kept, s, first, last):
-    """Derivatives of what the samples from ``first`` to ``last`` (exclusive) send to point ``s``."""
-    k = mi.UInt32(first)
-    while dr.hint(k < last, label="hidden samples, forward mode"):
-        job.step_on(tangents, block, kept, k, s)
+def tangents_over_samples(job, tangents, block, kept, lane):
+    """Derivatives of what each lane's range of the samples sends to its point."""
+    k = mi.UInt32(lane.first)
+    while dr.hint(k < lane.last, label="hidden samples, forward mode"):
+        job.step_on(tangents, block, kept, lane, k)
         k += 1
     return kept

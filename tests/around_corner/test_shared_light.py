@@ -1,0 +1,30 @@
+"""Shafts in the integrator: rays are left out where that pays, and the light is the same."""
+
+import pytest
+
+import torchtransient.plugins.around_corner.shared_light as shared_light
+from support.nlos_scenes import captures, film, plane, ratio, scan_scene, side
+
+VARIANT = "llvm_ad_mono"
+pytestmark = pytest.mark.usefixtures("no_leftovers")
+
+
+@pytest.mark.parametrize(("kind", "points"), [("confocal", 4), ("single", 4), ("exhaustive", 2)])
+def test_rays_that_are_left_out_change_nothing(monkeypatch, kind, points):
+    """A plate before another one, and a wall beside them: some elements are clear and some are not."""
+    hidden = {"a": plane(), "b": side(), "c": plane(0.8, 0.2, 0.3, 0.2, 0.3)}
+    shares, runs = [], []
+    found = shared_light.spare_rays
+    monkeypatch.setattr(shared_light, "spare_rays", lambda *a: shares.append(found(*a)))
+    for pays in (True, False):
+        monkeypatch.setattr(shared_light, "pays", lambda scene, rays, p=pays: p)
+        scene = scan_scene(hidden, kind, film(points, kind=kind), max_depth=3, third_bounce="shared")
+        runs.append(captures(scene, 2048, 8))
+    assert len(shares) == 8 and 0.05 < min(shares) <= max(shares) < 0.95
+    value, error = ratio(*runs)
+    assert error < 2e-3 and abs(value - 1) < 4 * error
+
+
+def test_small_jobs_look_for_no_shafts(monkeypatch):
+    monkeypatch.setattr(shared_light, "spare_rays", lambda *a: pytest.fail("not worth its time"))
+    captures(scan_scene({"a": plane()}, max_depth=3, third_bounce="shared"), 16, 1)
