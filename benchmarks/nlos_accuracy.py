@@ -19,21 +19,26 @@ ESTIMATORS = {
     "paths, hidden area": {"third_bounce": "paths"},
     "paths, BSDF alone": {"third_bounce": "paths", "nlos_hidden_geometry_sampling": False},
 }
-HIDDEN = {"letter Z": tt.scenes.nlos_z, "mannequin": tt.scenes.nlos_mannequin, "room": tt.scenes.nlos_room}
+# Hidden shapes and the size of the wall, metres.
+HIDDEN = {
+    "letter Z": (tt.scenes.nlos_z, (2.0, 2.0)),
+    "mannequin": (tt.scenes.nlos_mannequin, (2.0, 2.0)),
+    "room": (tt.scenes.nlos_room, (2.0, 1.6)),
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--picture", type=Path, default=Path("docs/images/nlos/accuracy.png"))
     parser.add_argument("--json", type=Path, default=Path("benchmarks/results/nlos_accuracy.json"))
-    parser.add_argument("--points", type=int, default=16)
-    parser.add_argument("--repeats", type=int, default=8)
+    parser.add_argument("--points", type=int, default=32)
+    parser.add_argument("--repeats", type=int, default=4)
     parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
     options = parser.parse_args()
-    points, spp = (2, (4, 16)) if options.quick else (options.points, (64, 256, 1024, 4096))
+    points, spp = (2, (4, 16)) if options.quick else (options.points, (256, 1024, 4096, 16384))
     curves, numbers = [], {}
-    for name, hidden in HIDDEN.items():
-        scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), points, kind="confocal")
+    for name, (hidden, size) in HIDDEN.items():
+        scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(*size, albedo=0.7), points, kind="confocal")
         shapes = hidden()
         axis = scan.default_axis(tt.scenes.bounds(shapes), 0.02)
         for label, settings in ESTIMATORS.items():

@@ -36,7 +36,7 @@ def built(name: str, kind: str, how: str, points: int):
     film |= {"temporal_bins": 512, "bin_width_opl": 0.0048, "start_opl": 1.6, "temporal_filter": "tent"}
     scene = mi.load_dict(as_mitsuba(description))
     parameters = mi.traverse(scene)
-    key = next(key for key in parameters.keys() if key.endswith("vertex_positions") and not key.startswith("wall"))
+    key = next(key for key in parameters if key.endswith("vertex_positions") and not key.startswith("wall"))
     return scene, parameters, key
 
 
@@ -117,7 +117,7 @@ def main() -> None:
     rows = []
     for name in given.scene or ("z", "mannequin"):
         for kind in ("confocal", "single"):
-            for how, spp in (("shared", 1024), ("paths", 256)):
+            for how, spp in (("shared", 2**14), ("paths", 1024)):
                 t = times(Job(name, kind, how, 32, spp), given.rounds)
                 rows.append({"scene": name, "kind": kind, "how": how, "ratio": t["backward"] / t["render"], **t})
                 print(f"{name:10s} {kind:9s} {how:7s} backward over render {rows[-1]['ratio']:.2f}", flush=True)

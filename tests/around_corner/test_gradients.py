@@ -94,7 +94,7 @@ def plate(**changes):
 @pytest.mark.parametrize("kind", ["confocal", "single"])
 @pytest.mark.parametrize("case", CASES)
 def test_shared_samples(case, kind):
-    """Within 0.1 % of finite differences for a body that nothing hides, whose outline moves; modes agree to rounding."""
+    """Within 0.1 % of finite differences where nothing hides the body and its outline moves; modes agree."""
     key, change, h = CASES[case]
     capture = Capture(scan_scene(plate(), kind, film(3, **SMOOTH)), key, change())
     spp = 2**16

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate
+from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh
 from support.moved_captures import MovedCapture, move, noted, turn
-from support.nlos_scenes import film, plane, scan_scene, side, transform
+from support.nlos_scenes import film, plane, scan_scene, transform
 from torchtransient.errors import GradientError, TorchTransientWarning
 from torchtransient.plugins.parameter_effect import SILHOUETTES
 
 VARIANT = "llvm_ad_mono"
-SIGMAS = 3.5
+SIGMAS = 4.0
 # The parameter of differences: of the third derivative a share of (h / 0.3 m)^2 is left. No shadow of a plate may pass
 # a rim meanwhile, where the capture has a kink.
 STEP = 4e-3
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
 
 
-def agree(capture, spp=2**12, seeds=4, spp_differences=2**16, seeds_differences=8, step=STEP, most_error=0.02):
+def agree(capture, spp=2**12, seeds=6, spp_differences=2**16, seeds_differences=10, step=STEP, most_error=0.02):
     """Both modes are the same derivative, which is that of finite differences; returns what paths alone say of it."""
     found = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(found[0], rel=2e-4)
@@ -31,6 +31,11 @@ def agree(capture, spp=2**12, seeds=4, spp_differences=2**16, seeds_differences=
     assert error < most_error * abs(found.mean())
     with noted():
         return capture.reverse(0, spp), found.mean(), error
+
+
+def long(values, quick):
+    """Parameters of a test, of which those that are not ``quick`` are run with the slow ones."""
+    return [pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values]
 
 
 def plates(**changes):
@@ -43,26 +48,28 @@ def capture_of(hidden, keys, change, kind="confocal", points=4, response=None, *
 
 
 MOVED = {
-    "front, sideways": ("front.to_world", move(1, 0, 0), 3),
-    "front, depth": ("front.to_world", move(0, 0, 1), 1.1),
-    "back, sideways": ("back.to_world", move(1, 0, 0), 3),
-    "wall, sideways": ("wall.to_world", move(1, 0, 0), 1.5),
-    "front turns": ("front.to_world", turn((0.22, 0.1, 0.9)), None),
+    "front, sideways": ("front.to_world", move(1, 0, 0)),
+    "wall, sideways": ("wall.to_world", move(1, 0, 0)),
+    "wall, depth": ("wall.to_world", move(0, 0, 1)),
+    "front, depth": ("front.to_world", move(0, 0, 1)),
+    "back, sideways": ("back.to_world", move(1, 0, 0)),
+    "back, depth": ("back.to_world", move(0, 0, 1)),
+    "front turns": ("front.to_world", turn((0.22, 0.1, 0.9))),
 }
 
 
 @pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("case", MOVED)
+@pytest.mark.parametrize("case", long(MOVED, ["front, sideways", "wall, sideways"]))
 def test_a_plate_before_a_plate(case, kind):
-    """What hides, what is hidden and the viewpoints move; without the boundary term the derivative is some other."""
-    key, change, factor = MOVED[case]
-    interior, whole, error = agree(capture_of(plates(), key, change, kind), most_error=0.1 if factor is None else 0.02)
-    assert abs(interior - whole) > 4 * error
-    if factor is not None:
-        assert not 1 / factor < interior / whole < factor
+    """What hides, what is hidden and the viewpoints move; without the boundary term the derivative is some other, above
+    all where outlines move sideways.
+    """
+    interior, whole, error = agree(capture_of(plates(), *MOVED[case], kind), most_error=0.05)
+    if "sideways" in case:
+        assert abs(interior - whole) > 10 * error
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_paths_have_the_same_term(kind):
     capture = capture_of(plates(), "front.to_world", move(1, 0, 0), kind, third_bounce="paths", max_depth=4)
     agree(capture, 2**13, spp_differences=2**16, most_error=0.05)
@@ -89,39 +96,18 @@ FILMS = {
 
 
 @pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("name", FILMS)
+@pytest.mark.parametrize("name", long(FILMS, ["phasors", "gates"]))
 def test_films(name, kind):
-    agree(capture_of(plates(), "front.to_world", move(1, 0, 0), kind, response=FILMS[name]()), 2**14, most_error=0.05)
+    capture = capture_of(plates(), "front.to_world", move(1, 0, 0), kind, response=FILMS[name]())
+    agree(capture, 2**13, spp_differences=2**18, most_error=0.05)
 
 
 def test_the_steady_image():
-    capture = capture_of(plates(), "front.to_world", move(1, 0, 0))
-    capture.install(mi.Float(0))
-    scene, seeds = capture.scene, range(4)
-
-    def difference(seed):
-        images = []
-        for h in (STEP, -STEP):
-            capture.install(mi.Float(h))
-            images.append(np.array(scene.integrator().render(scene, seed=seed, spp=2**16)[0], dtype=np.float64).sum())
-        return (images[0] - images[1]) / (2 * STEP)
-
-    import drjit as dr
-
-    def tangent(seed):
-        θ = mi.Float(0)
-        dr.enable_grad(θ)
-        capture.install(θ)
-        dr.set_grad(θ, 1.0)
-        return float(np.array(scene.integrator().render_forward(scene, capture.parameters, seed=seed, spp=2**12)[0]).sum())
-
-    found, expected = (np.array([f(seed) for seed in seeds]) for f in (tangent, difference))
-    error = np.hypot(*(x.std(ddof=1) / len(x) ** 0.5 for x in (found, expected)))
-    assert abs(found.mean() - expected.mean()) < 4.5 * error  # of four runs each
-    assert error < 0.02 * abs(found.mean())
+    scene = scan_scene(plates(), "single", film(4, **SMOOTH))
+    agree(MovedCapture(scene, "front.to_world", move(1, 0, 0), steady=True), spp_differences=2**18)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_first_and_last_leg(kind):
     capture = capture_of(
         plates(), "front.to_world", move(1, 0, 0), kind, response=film(4, **SMOOTH | {"bins": 140}),
@@ -138,13 +124,15 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", long(MATERIALS, ["two-sided"]))
 def test_materials(name):
     capture = capture_of(plates(bsdf=MATERIALS[name]), "front.to_world", move(1, 0, 0), "single")
     agree(capture, 2**13, most_error=0.03)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize(
+    "variant", long(["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"], ["llvm_ad_rgb"])
+)
 def test_variants(variant):
     mi.set_variant(variant)
     try:
@@ -158,6 +146,7 @@ def colour(variant):
     return {"type": "rgb", "value": [0.7, 0.4, 0.2]} if variant != "llvm_ad_mono" else 0.7
 
 
+@pytest.mark.slow
 def test_a_ball_behind_a_plate():
     """What is hidden need not be a mesh; it may move, too."""
     hidden = {
@@ -168,7 +157,7 @@ def test_a_ball_behind_a_plate():
         agree(capture_of(hidden, key, move(1, 0, 0), "single"), most_error=0.05)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
+@pytest.mark.parametrize("kind", long(["confocal", "single"], ["confocal"]))
 def test_a_box_of_six_plates_is_a_cube(kind):
     """Rims at which shapes meet are one edge."""
     base = transform().translate([0.1, 0.05, 0.8]).rotate([0.3, 1, 0.2], 25).scale(0.12)
@@ -180,7 +169,7 @@ def test_a_box_of_six_plates_is_a_cube(kind):
     }
     behind = {"back": plane(1.3, 1.2)}
     six = capture_of(box | behind, [f"{name}.to_world" for name in box], move(1, 0, 0), kind)
-    cube = capture_of({"cube": {"type": "cube", "to_world": base, "bsdf": bsdf}} | behind, "cube.to_world",
+    cube = capture_of({"cube": {"type": "cube", "to_world": base, "bsdf": bsdf}} | behind, "cube.vertex_positions",
                       move(1, 0, 0), kind)  # fmt: skip
     found = [np.array([c.reverse(seed, 2**13) for seed in range(6)]) for c in (six, cube)]
     error = np.hypot(*(x.std(ddof=1) / 6**0.5 for x in found))
@@ -193,7 +182,7 @@ def test_viewpoints_with_the_same_outline():
     """The spot is a scanned point and lies in line with others; outlines along the lines are those of both."""
     scene = scan_scene(plates(), "single", film(4, **SMOOTH), spot=(-0.125, 0.125, 0.0))
     for change in (move(1, 0, 0), move(0, 1, 0)):
-        agree(MovedCapture(scene, "front.to_world", change))
+        agree(MovedCapture(scene, "front.to_world", change), most_error=0.04)
 
 
 def test_what_hides_may_stand_still():
@@ -207,6 +196,7 @@ def test_what_hides_may_stand_still():
     assert capture_of(plates(), "back.bsdf.reflectance.value", lambda start, θ: start + θ).boundary() is None
 
 
+@pytest.mark.slow
 def test_points_of_the_capture_move():
     points = np.stack(np.meshgrid(*[(np.arange(3) - 1) * 0.3] * 2), -1).reshape(-1, 2)
     scene = scan_scene(plates(), "single", film(3, **SMOOTH))
@@ -221,7 +211,7 @@ def test_points_of_the_capture_move():
 
 ALONE = {
     "a plate": lambda: {"front": plane(0.9, 0.3)},
-    "a cube": lambda: {"front": {"type": "cube", "to_world": transform().translate([0, 0, 0.9]).scale(0.1)}},
+    "a body": lambda: {"front": mesh("front", ball([0, 0, 0.9], [0.1, 0.2, 0.1]))},
     "a ball": lambda: {"front": {"type": "sphere", "center": [0, 0, 0.9], "radius": 0.2}},
     "plates side by side": lambda: {"front": plane(0.9, 0.3, -0.3), "back": plane(0.9, 0.3, 0.3)},
     "plates far apart": lambda: {"front": plane(0.9, 0.3, -1.6), "back": plane(1.2, 0.3, 1.6)},
@@ -232,13 +222,14 @@ ALONE = {
 
 @pytest.mark.parametrize("name", ALONE)
 def test_what_hides_nothing_costs_nothing(name):
-    assert capture_of(ALONE[name](), "front.to_world", move(1, 0, 0)).boundary() is None
+    key = "front.vertex_positions" if name == "a body" else "front.to_world"
+    assert capture_of(ALONE[name](), key, move(1, 0, 0)).boundary() is None
 
 
 def test_exhaustive_captures():
     """They have no boundary term: derivatives are refused where it is not known to be zero."""
     response = film(2, kind="exhaustive", **SMOOTH)
-    with pytest.raises(GradientError, match="exhaustive capture.*'front' hides 'back'"):
+    with pytest.raises(GradientError, match=r"exhaustive capture.*'front' hides 'back'"):
         capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).reverse(0, 16)
     with pytest.raises(GradientError, match="exhaustive capture"):
         capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", response=response).forward(0, 16)
@@ -257,17 +248,13 @@ def test_outlines_without_edges_are_told():
 
 def test_the_table_of_parameters_says_so():
     def reason(kind="confocal", **integrator):
-        response = film(2, kind=kind, **SMOOTH)
-        return tt.load(scan_scene(plates(), kind, response, **integrator), merge=False).parameters()
+        scene = tt.load(scan_scene(plates(), kind, film(2, kind=kind, **SMOOTH), **integrator))
+        return scene.parameters()["front.to_world"].reason
 
-    def of(table):
-        return table["front.to_world"].reason
-
-    assert "without triangles" in of(reason()) and "more than three" not in of(reason())
-    assert "more than three" in of(reason(max_depth=5))
-    assert "refused" in of(reason("exhaustive")) and "triangles" not in of(reason("exhaustive"))
-    assert of(reason(nlos_laser_sampling=False, nlos_hidden_geometry_sampling=False)).startswith(SILHOUETTES)
-    assert SILHOUETTES not in of(reason())
+    assert "without triangles" in reason() and "more than three" not in reason() and SILHOUETTES not in reason()
+    assert "more than three" in reason(max_depth=5)
+    assert "refused" in reason("exhaustive") and "triangles" not in reason("exhaustive")
+    assert reason(nlos_laser_sampling=False, laser={"type": "projector"}).startswith(SILHOUETTES)
 
 
 # ------------------------------------------------------------------------------------------------------- bodies
@@ -299,4 +286,4 @@ BODIES = {
 def test_bodies_of_many_parts(case, kind):
     hidden, change = BODIES[case]
     capture = capture_of(hidden(), "body.vertex_positions", change, kind)
-    agree(capture, 2**15, 4, 2**19, 12, 3e-3, most_error=0.05)
+    agree(capture, 2**15, 6, 2**19, 12, 1.5e-3, most_error=0.05)

@@ -25,7 +25,8 @@ def agree(a, b, most_error=0.01):
 HIDDEN = {
     "plane": lambda: {"a": plane()},
     "plane behind a plane": lambda: {"a": plane(), "b": plane(1.2)},
-    "three sizes": lambda: {"a": plane(1.0, 0.8), "b": plane(0.8, 0.2, 0.3, 0.2, 0.3), "c": plane(1.4, 0.3, -0.6, 0, 0.9)},
+    "three sizes": lambda: {
+        "a": plane(1.0, 0.8), "b": plane(0.8, 0.2, 0.3, 0.2, 0.3), "c": plane(1.4, 0.3, -0.6, 0, 0.9)},
     "a corner": lambda: {"a": plane(), "b": side()},
     "a ball before a plane": lambda: {
         "a": plane(1.3), "b": {"type": "sphere", "center": [0.1, 0, 0.9], "radius": 0.2}},

@@ -45,7 +45,7 @@ def test_one_number_of_bounces_stays_one():
 
 def test_later_light_is_told():
     plan = tt.plan(scene(hidden=tt.scenes.nlos_corner(), min_bounces=0, max_depth=-1))
-    assert plan.max_depth >= 4 and light(plan) == f"{SHARED}later light, up to {plan.max_depth} bounces, from paths"
+    assert plan.max_depth >= 4 and light(plan).startswith(f"{SHARED}light of 4 ") and "chains" in light(plan)
 
 
 def test_why_paths():

@@ -258,9 +258,10 @@ def test_the_light_is_explained():
         return simulated(spp=4, **settings).metadata["light"]
 
     assert light() == "light of three bounces from hidden samples that all scanned points share; no later light"
-    assert light(bounces=(3, 4, 5)).endswith("later light, up to 5 bounces, from paths")
-    assert light(bounces="all").endswith("later light, without a limit, from paths")
-    assert light(bounces=(4,)).startswith("light of three bounces is not asked for")
+    assert light(bounces=(3, 4, 5)).endswith("; light of 4 to 5 bounces from chains that they share")
+    assert light(bounces=(3, 4)).endswith("; light of 4 bounces from chains that they share")
+    assert light(bounces="all").endswith("from chains that they share; light of 8 and more bounces from paths")
+    assert light(bounces=(4,)).startswith("light of three bounces is not asked for; light of 4 bounces from chains")
     metal = tt.scenes.nlos_z()
     metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
     assert "from paths, since not all surfaces are diffuse" in light(hidden=metal)

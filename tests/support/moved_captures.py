@@ -39,30 +39,38 @@ def turn(center):
 
 
 class MovedCapture:
-    """A scene, the parameters that ``change(start, θ)`` moves, and a loss that is linear in the capture."""
+    """A scene, the parameters that ``change(start, θ)`` moves, and a loss that is linear in the capture, or in its
+    steady image (``steady``).
+    """
 
-    def __init__(self, description, keys, change):
+    def __init__(self, description, keys, change, steady=False):
         self.scene = mi.load_dict(description, optimize=False)
         self.parameters, self.change = mi.traverse(self.scene), change
         keys = [keys] if isinstance(keys, str) else keys
         self.start = {key: type(self.parameters[key])(self.parameters[key]) for key in keys}
+        self.steady = steady
         shape = tuple(self.scene.sensors()[0].film().cube_shape())
         rng = np.random.default_rng(5)
-        weights = 1 + 0.3 * rng.normal(size=(*shape[:2], 1, 1)) + np.sin(np.arange(shape[2]) / 7)[:, None]
-        self.adjoint = mi.TensorXf((weights * (1 + 0.5 * np.arange(shape[3]))).astype(np.float32))
+        weights = 1 + 0.3 * rng.normal(size=shape[:2])
+        if not steady:
+            bins = 1 + np.sin(np.arange(shape[-2]) / 7)
+            weights = weights.reshape(*shape[:2], *[1] * (len(shape) - 3)) * bins
+        weights = weights[..., None] * (1 + 0.5 * np.arange(shape[-1]))
+        self.adjoint = mi.TensorXf(np.broadcast_to(weights, shape if not steady else weights.shape).astype(np.float32))
 
     def install(self, θ):
         for key, start in self.start.items():
             self.parameters[key] = self.change(start, θ)
         self.parameters.update()
 
-    def _weighed(self, cube):
-        return float((np.array(cube, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
+    def _weighed(self, images):
+        image = images[0 if self.steady else 1]
+        return float((np.array(image, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
 
     def loss(self, θ, seed, spp):
         self.install(mi.Float(θ))
         with dr.suspend_grad():
-            return self._weighed(self.scene.integrator().render(self.scene, seed=seed, spp=spp)[1])
+            return self._weighed(self.scene.integrator().render(self.scene, seed=seed, spp=spp))
 
     def difference(self, h, seed, spp):
         return (self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
@@ -71,15 +79,19 @@ class MovedCapture:
         θ = mi.Float(0)
         dr.enable_grad(θ)
         self.install(θ)
-        self.scene.integrator().render_backward(self.scene, self.parameters, (None, self.adjoint), seed=seed, spp=spp)
+        self._backward(seed, spp)
         return float(dr.grad(θ)[0])
+
+    def _backward(self, seed, spp):
+        adjoints = (self.adjoint, None) if self.steady else (None, self.adjoint)
+        self.scene.integrator().render_backward(self.scene, self.parameters, adjoints, seed=seed, spp=spp)
 
     def forward(self, seed, spp):
         θ = mi.Float(0)
         dr.enable_grad(θ)
         self.install(θ)
         dr.set_grad(θ, 1.0)
-        return self._weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp)[1])
+        return self._weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp))
 
     def boundary(self, spp=64):
         """The boundary term that a job of derivatives has, None for none."""
@@ -87,7 +99,7 @@ class MovedCapture:
         dr.enable_grad(θ)
         self.install(θ)
         with noted() as found:
-            self.scene.integrator().render_backward(self.scene, self.parameters, (None, self.adjoint), seed=0, spp=spp)
+            self._backward(0, spp)
         return found[0] if found else None
 
 

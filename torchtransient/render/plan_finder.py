@@ -203,10 +203,12 @@ class Finder:
             return
         options = BuildOptions(max_depth=depth, merge=True, transient=True, integrator=self.draft.integrator)
         with active_variant(self.draft.variant):
+            from torchtransient.plugins.around_corner.explanation import explanation
+
             built = self.draft.scene.built(options).scene
             integrator, sensors = built.integrator(), built.sensors()
             contents = integrator.contents(built, sensors[self.draft.sensor])
-            self.reasons.append(f"light: {integrator.explanation(built, contents)}")
+            self.reasons.append(f"light: {explanation(integrator, built, contents)}")
             self.draft.scene.drop(options)
 
     # ----------------------------------------------------------------------------------------------------- window

@@ -17,7 +17,7 @@ from torchtransient.plugins.transport.strategy import Local
 class Ends:
     """Fields of ``count`` samples or points, by name, attached where the scene is: vectors, spectra and numbers.
 
-    :meth:`load` reads them four numbers at a time. A plain object, which Dr.Jit loops leave alone.
+    :meth:`load` reads the fields four numbers at a time. A plain object, which Dr.Jit loops leave alone.
     """
 
     def __init__(self, count: int, fields: dict[str, Any]) -> None:
@@ -27,12 +27,19 @@ class Ends:
             columns = [column for value in fields.values() for column in _columns(dr.detach(value))]
             self.rows = -(-len(columns) // 4)
             columns += [mi.Float(0)] * (4 * self.rows - len(columns))
-            self.flat = packed_columns([columns[4 * i : 4 * i + 4] for i in range(self.rows)], count)
+            rows = [columns[4 * i : 4 * i + 4] for i in range(self.rows)]
+            self.flat = packed_columns(rows, count) if rows else None
 
     @property
     def attached(self) -> list[str]:
         """Names of the fields with derivatives; none are where derivatives are suspended."""
         return [name for name, value in self.fields.items() if dr.grad_enabled(value)]
+
+    def detached(self) -> Ends:
+        """The same without derivatives. A virtual call attaches what it returns as soon as any plugin is attached that
+        it could have gone to: fields may be attached that nothing moves.
+        """
+        return Ends(self.count, {name: dr.detach(value) for name, value in self.fields.items()})
 
     def load(self, index: Any) -> Local:
         """The fields of some of them, without derivatives."""

@@ -18,6 +18,8 @@ MOST_CORNERS = 64
 MOST_PRODUCTS = 1 << 24
 # Rounding of positions, in parts of the size of what is compared.
 ROUNDING = 1e-5
+# Viewpoints that are asked first.
+FEW = 16
 # Steps in which a plane between two cones has to be found.
 STEPS = 64
 
@@ -90,31 +92,41 @@ def _is_convex(triangles: Triangles, faces: np.ndarray, v: np.ndarray, tolerance
 
 
 def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, of_interest: Any) -> list[tuple[int, int]]:
-    """(hider, hidden) by number, of the parts of which one may hide the other from some of the ``viewpoints`` (P, 3).
+    """(hider, hidden) by number: a pair for each part that may hide another, or points of its own, from some of the
+    ``viewpoints`` (P, 3).
 
-    ``of_interest(i, j)``: which pairs are asked for. Conservative: what is left out cannot happen. A part that may hide
-    points of its own is a pair with itself. Of too many parts each one may hide another.
+    ``of_interest(i, j)``: which pairs are asked for. Conservative: what is left out cannot happen. Of more than
+    ``MOST_PARTS`` each one may hide another.
     """
-    count = len(parts)
-    if count > MOST_PARTS:  # one for each will do
-        found = ((i, next((j for j in range(count) if j != i and of_interest(i, j)), None)) for i in range(count))
-        return [(i, j) for i, j in found if j is not None]
-    asked = [(i, j) for i in range(count) for j in range(count) if of_interest(i, j)]
-    return [(i, j) for i, j in asked if _may_hide(parts[i], parts[j], viewpoints, i == j)]
+    pairs = []
+    some = np.unique(np.linspace(0, len(viewpoints) - 1, min(len(viewpoints), FEW)).astype(int))
+    for i, hider in enumerate(parts):
+        asked = [j for j in range(len(parts)) if of_interest(i, j)]
+        found = [i] if i in asked and hider.hides_itself else None
+        asked = [j for j in asked if j != i]
+        if found is None and len(parts) > MOST_PARTS:
+            found = asked[:1]
+        if found is None:
+            asked = [j for j in asked if not _is_beyond(hider, parts[j], viewpoints)]
+            hidden = (
+                j
+                for q in (viewpoints[some], viewpoints)
+                for j in asked
+                if not _cones_apart(hider.corners, parts[j].corners, q).all()
+            )
+            found = [j for j in (next(hidden, None),) if j is not None]
+        pairs += [(i, j) for j in found]
+    return pairs
 
 
-def _may_hide(hider: Part, hidden: Part, viewpoints: np.ndarray, itself: bool) -> bool:
-    if itself:
-        return hider.hides_itself
+def _is_beyond(hider: Part, hidden: Part, viewpoints: np.ndarray) -> bool:
+    """Whether a plane is found beyond which the hider lies altogether, with all else before it."""
     everything = np.concatenate([hider.corners, hidden.corners, viewpoints])
     rounding = ROUNDING * np.ptp(everything, axis=0).max()
-    for n in np.concatenate([hider.planes, hidden.planes]):
-        for side in (n, -n):
-            near = max((hidden.corners @ side).max(), (viewpoints @ side).max())
-            if (hider.corners @ side).min() >= near - rounding:
-                return False  # nothing of it lies before the other
-    some = np.unique(np.linspace(0, len(viewpoints) - 1, min(len(viewpoints), 16)).astype(int))
-    return any(not _cones_apart(hider.corners, hidden.corners, q).all() for q in (viewpoints[some], viewpoints))
+    before = np.concatenate([hidden.corners, viewpoints])
+    sides = np.concatenate([hider.planes, hidden.planes])
+    sides = np.concatenate([sides, -sides])
+    return bool(np.any((hider.corners @ sides.T).min(0) >= (before @ sides.T).max(0) - rounding))
 
 
 def _cones_apart(a: np.ndarray, b: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:

@@ -158,12 +158,14 @@ class MutualOcclusion:
         with dr.suspend_grad():
             d = edge.at - viewer.p
             distance = dr.norm(d)
+            distance = dr.select(distance > 0, distance, 1)
             d /= distance
             across = dr.cross(edge.t, d)
             spans = dr.norm(across)
-            n = across / spans
+            # Lanes without a term must not multiply zero by what is not a number.
+            n = dr.select(spans > 0, across / spans, 0)
             here, there = (dr.dot(n, side - edge.at) for side in edge.sides)
-            active = place.found & (spans > 0) & (here * there > 0)
+            active = place.found & (here * there > 0)
             n = dr.select(here > 0, -n, n)
             past = viewer.spawn_ray(dr.normalize(d + n * BESIDE))
             behind = scene.ray_intersect_preliminary(past, active=active)
@@ -172,6 +174,7 @@ class MutualOcclusion:
             si = dr.detach(y)
             beyond = dr.norm(si.p - viewer.p)
             active &= si.is_valid() & (beyond > distance * (1 - BEFORE))
+            beyond = dr.select(active, beyond, 1)
             value, opl, active = self._light(place, si, from_spot, active)
             weight = -edge.weight * spans / distance
             if not self.spots.confocal:

@@ -1,4 +1,4 @@
-"""Third-bounce light of a whole scan from shared samples: what it needs of a scene, and when it is possible."""
+"""Light of a whole scan from shared samples and chains: what it needs of a scene, and when it is possible."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ import numpy as np
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.attached import ends_of_points, ends_of_samples
 from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
+from torchtransient.plugins.around_corner.late_density import late_density
+from torchtransient.plugins.around_corner.late_light import LateLight
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -19,6 +22,7 @@ from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBou
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -127,9 +131,31 @@ def _points(si: Any, factor: Any, length: Any) -> WallPoints:
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
+def moves(world: Any, shapes: list[Any]) -> bool:
+    """Whether derivatives are asked for of what some of these shapes are or hold."""
+    held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
+    return bool(held & world.wanted.nodes)
+
+
+def moves_scan(world: Any, hidden: list[Any]) -> bool:
+    """Whether derivatives are asked for of anything that is no part of the hidden shapes alone: wall, sensor, laser."""
+    others = [shape for shape in world.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
+    held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
+    return bool(world.wanted.nodes - held) or moves(world, others)
+
+
 def _rows(vectors: Any, width: int) -> np.ndarray:
     """(width, 3), detached."""
     return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
+
+
+def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
+    """Add the light of these bounces (first, last) to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
+    ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
+    """
+    elements = late_density(scene, job.elements, *reference_points(scene, sensor))
+    film_job = ScanJob(scene, film, job.light.sensors, job.light.energy, run.progress)
+    LateLight(film_job, elements, job.light.spots, job.capture, bounces).add(run.samples, run.seed)
 
 
 class SharedThirdBounce:
@@ -148,8 +174,7 @@ class SharedThirdBounce:
         draw: tuple[Any, int],
     ) -> None:
         self.world, self.film, self.light, self.capture = world, film, light, capture
-        if world.wanted is None:
-            self._spare_rays(elements, draw[1])
+        self._spare_rays(elements, draw[1])
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
         if world.wanted is not None:
@@ -157,6 +182,15 @@ class SharedThirdBounce:
             with dr.resume_grad():
                 samples = ends_of_samples(world.scene, elements, self.samples, world.contents.meshes, laser)
                 points = ends_of_points(light.sensors, light.spots, light.energy)
+            # Forward mode has to pass by all that is attached, wanted or not.
+            self._tables = [ends.fields[n] for ends in (samples, points) for n in ends.fields]
+            self._tables += [*vars(light.sensors).values(), *vars(light.spots).values(), light.energy]
+            scan = moves_scan(world, elements.shapes)
+            if not scan:
+                points = points.detached()
+            # What a single spot lights follows the spot.
+            if not (moves(world, elements.shapes) or (scan and laser is not None)):
+                samples = samples.detached()
             self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
 
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
@@ -180,7 +214,8 @@ class SharedThirdBounce:
 
     def tables(self) -> list[Any]:
         """What has been computed of the scene's parameters."""
-        return self.gradients.tables()
+        with dr.resume_grad():
+            return [table for table in self._tables if dr.is_array_v(table) and dr.grad_enabled(table)]
 
     def backward(self, incoming: Any) -> None:
         """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""

@@ -19,17 +19,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.errors import SceneError, ShapeError, VariantError
+from torchtransient.errors import SceneError, ShapeError
 from torchtransient.plugins.around_corner.geometry import occluded, span
 from torchtransient.plugins.around_corner.launches import Launch, launches_of
 from torchtransient.plugins.around_corner.sample_table import SampleTable
+from torchtransient.plugins.around_corner.scan_job import ScanJob
 from torchtransient.plugins.around_corner.wall_points import WallPoints
-from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.sampling.shared_samples import SharedSamples
 from torchtransient.plugins.transport.strategy import Local
 
 
-class ThirdBounce:
+class ThirdBounce(ScanJob):
     """One capture: scene, film and samples, and the points that ``add_confocal`` and ``add_single`` go through.
 
     ``film``: one with a pixel for each scan point, row by row, on which ``prepare`` was called (and ``finish_render``
@@ -52,32 +52,15 @@ class ThirdBounce:
         progress: Any = None,
         tile: Any = None,
     ) -> None:
-        if mi.is_spectral or mi.is_polarized:
-            raise VariantError(
-                f"ThirdBounce: expected a mono or RGB variant without polarization, got {mi.variant()}. Use the "
-                "general path integrator."
-            )
-        width, height = (int(size) for size in film.crop_size())
-        if sensors.width != width * height:
-            raise ShapeError(
-                f"ThirdBounce: expected a pixel of the film for every scan point, got {width} x {height} pixels and "
-                f"{sensors.width} points."
-            )
+        super().__init__(scene, film, sensors, energy, progress)
         if (samples.tiles > 1) != (tile is not None) or (tile is not None and dr.width(tile) != sensors.width):
             raise ShapeError(
                 f"ThirdBounce: expected the tile of every scan point for samples of {samples.tiles} tiles, and none "
                 f"for one; got {'none' if tile is None else dr.width(tile)}."
             )
-        if film.steady is None:
-            raise SceneError("ThirdBounce: expected a film that is prepared; call film.prepare(samples=...) before.")
-        self.scene, self.film, self.samples, self.sensors = scene, film, samples, sensors
+        self.samples = samples
         self.tile = tile
         self.check_region(sensors)
-        self.energy = mi.UnpolarizedSpectrum(energy)
-        dr.make_opaque(self.energy)
-        self.match = ChannelMatch(None, mi.UnpolarizedSpectrum(1))
-        self.window = film.arrivals()
-        self.progress = progress
 
     def add_confocal(self, lasers: WallPoints | None = None) -> None:
         """The laser falls on each scan point while that one is looked at. ``lasers``: the same points with the legs and
@@ -146,13 +129,6 @@ class ThirdBounce:
         film.add_steady(pixel, self.match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
         block.finish()
-
-    def done(self, fraction: float, band: int) -> None:
-        """Run what is recorded."""
-        dr.eval(self.film.bands[band][2], self.film.steady, self.film.outside)
-        if self.progress:
-            dr.sync_thread()
-            self.progress(fraction)
 
 
 class ScanLanes:

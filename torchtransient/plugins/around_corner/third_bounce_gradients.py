@@ -65,11 +65,6 @@ class ThirdBounceGradients:
             active &= ~occluded(self.scene, plain, line, dr.detach(point.p), dr.detach(point.n), in_doubt)
         return scattered * g * point.value, length, opl, active
 
-    def tables(self) -> list[Any]:
-        """The attached fields of samples and points."""
-        with dr.resume_grad():
-            return [ends.fields[name] for ends in (self.samples, self.points) for name in ends.attached]
-
     # ------------------------------------------------------------------------------------------------- reverse
 
     def backward(self, incoming: Any) -> None:
@@ -82,6 +77,7 @@ class ThirdBounceGradients:
             if names:
                 split = Split(own, others.count)
                 kept = over(self, read, {name: dr.zeros(type(own.fields[name])) for name in names}, split)
+                dr.eval(kept)
                 found.append((own, {name: split.reduced(value) for name, value in kept.items()}))
         dr.eval([adjoints for _, adjoints in found])
         with dr.resume_grad():

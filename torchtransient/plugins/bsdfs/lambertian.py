@@ -15,7 +15,7 @@ def is_lambertian(bsdf: Any) -> bool:
     By class: the flags of a BSDF of someone else may say that it is diffuse, and mean that it is not glossy.
     """
     name = bsdf.class_name()
-    if name == "TwoSided":
+    if name == "TwoSidedBRDF":
         nested = bsdfs_below(bsdf)
         return bool(nested) and all(part.class_name() == "SmoothDiffuse" for part in nested)
     return name == "SmoothDiffuse"

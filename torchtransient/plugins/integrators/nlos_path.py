@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.late_light import FIRST, MOST
 from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
 from torchtransient.plugins.around_corner.scan_table import (
     LaserSpots,
@@ -23,6 +24,7 @@ from torchtransient.plugins.around_corner.scan_table import (
 from torchtransient.plugins.around_corner.shared_light import (
     BOUNCES,
     SharedThirdBounce,
+    add_late_light,
     elements_of,
     scan_light,
     wall_lights_itself,
@@ -40,6 +42,7 @@ from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.material import MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
+from torchtransient.plugins.transport.strategy import Local
 from torchtransient.plugins.transport.world import PathSettings
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
@@ -77,8 +80,13 @@ class TransientNLOSPath(base.TransientIntegrator):
         Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
         which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
         and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
-        can be drawn on every hidden shape, an ``nlos_capture_meter``, and a variant without wavelengths and
-        polarization. Both have the same mean.
+        can be drawn on every hidden shape, an ``nlos_capture_meter`` on a flat wall, and a variant without wavelengths
+        and polarization. Both have the same mean. Where a curved wall lights itself, points of it next to a scanned
+        one weigh without bound, and ``auto`` takes paths.
+    ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
+        Light of four to seven bounces from chains that scanned points far from each other share
+        (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
+        ``third_bounce``; both have the same mean, and derivatives come from paths.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
         horizontal field of view around the laser's axis.
@@ -111,11 +119,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
         self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
-        self.third_bounce = str(props.get("third_bounce", "auto"))
-        if self.third_bounce not in ("auto", "shared", "paths"):
-            raise SceneError(
-                f"transient_nlos_path: third_bounce: expected auto, shared or paths, got {self.third_bounce!r}."
-            )
+        self.third_bounce = _choice(props, "third_bounce", "shared")
+        self.late_light = _choice(props, "late_light", "chains")
         props.get("block_size", 0)
         self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
@@ -180,59 +185,58 @@ class TransientNLOSPath(base.TransientIntegrator):
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
 
-    def shares(self, scene: Any, contents: Any) -> bool:
-        """Whether light of three bounces comes from shared samples. Raises SceneError where it has to and cannot."""
-        if self.third_bounce == "paths" or not self._wants(BOUNCES):
-            return False
-        reason = self._why_not_shared(scene, contents)
-        if reason and self.third_bounce == "shared":
-            raise SceneError(f"transient_nlos_path: third_bounce is 'shared', but {reason}. Set it to 'auto'.")
-        return reason is None
-
-    def _why_not_shared(self, scene: Any, contents: Any) -> str | None:
+    def beside_paths(self, scene: Any, contents: Any, wanted: Any = None) -> tuple[int, int] | None:
+        """First and last number of bounces whose light comes from shared samples and chains, None where all comes from
+        paths. Raises SceneError where it has to come from those and cannot.
+        """
+        settings = self.settings()
+        asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}
+        if wanted is not None:  # chains have no derivatives, nor have exhaustive captures from shared samples
+            asked = {} if self.capture is CaptureType.EXHAUSTIVE else {"third_bounce": asked["third_bounce"]}
+        found = {}
+        for name, (choice, first, last) in asked.items():
+            first, last = max(first, settings.min_depth), min(last, settings.max_depth)
+            unbounded = choice == "auto" and wall_lights_itself(contents.sensor)
+            if choice != "paths" and first <= last and not unbounded:
+                found[name] = (choice, first, last)
+        if not found:
+            return None
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
-            return why_not(scene, contents.sensor, contents)
-        return "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
-
-    def explanation(self, scene: Any, contents: Any) -> str:
-        """How light of three bounces and of more is found in a scene, and why, in words."""
-        settings = self.settings()
-        most = settings.max_depth - (0 if self.laser_sampling else 1)
-        if not self._wants(BOUNCES):
-            third = "light of three bounces is not asked for"
-        elif self.third_bounce == "paths":
-            third = "light of three bounces from paths, as third_bounce asks for"
-        elif self.shares(scene, contents):
-            third = "light of three bounces from hidden samples that all scanned points share"
+            reason = why_not(scene, contents.sensor, contents)
         else:
-            third = f"light of three bounces from paths, since {self._why_not_shared(scene, contents)}"
-        if most == BOUNCES:
-            return f"{third}; no later light"
-        later = "without a limit" if settings.max_depth == base.UNLIMITED else f"up to {most} bounces"
-        return f"{third}; later light, {later}, from paths"
-
-    def _wants(self, bounces: int) -> bool:
-        settings = self.settings()
-        return settings.min_depth <= bounces <= settings.max_depth
+            reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
+        for name, (choice, _, _) in found.items():
+            if reason and choice != "auto":
+                raise SceneError(f"transient_nlos_path: {name} is {choice!r}, but {reason}. Set it to 'auto'.")
+        return None if reason else (min(r[1] for r in found.values()), max(r[2] for r in found.values()))
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        # Exhaustive captures have their derivatives from paths.
-        derived = wanted is None or self.capture is not CaptureType.EXHAUSTIVE
-        if settings is None and derived and self.shares(scene, contents):
-            settings = replace(self.settings(), left_out=BOUNCES)
+        if settings is None:
+            settings = self.settings()
+            beside = self.beside_paths(scene, contents, wanted)
+            most = settings.max_depth
+            if beside is not None and wanted is None and beside[1] == most:
+                # Paths that have nothing to find beyond end before.
+                most = max(beside[0] - 1, 1)
+            settings = replace(settings, left_out=beside, max_depth=most)
         return super().world(scene, contents, wanted, window, settings)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
-        if world.left_out != BOUNCES:
+        if world.left_out is None:
             super().add_light(world, sensor, film, job)
             return
-        walks = self.walks(world)
-        share = 0.5 if walks else 1.0
-        told = job.progress and (lambda done: job.progress(share * done))
-        self._shared(world, sensor, film, job.seed, job.samples).add(told)
-        if walks:
-            told = job.progress and (lambda done: job.progress(share + (1 - share) * done))
-            super().add_light(world, sensor, film, replace(job, progress=told))
+        first, last = world.left_out
+        parts = []
+        if first == BOUNCES:
+            parts.append(lambda run: self._shared(world, sensor, film, run.seed, run.samples).add(run.progress))
+        if last >= FIRST:
+            bounces = max(first, FIRST), last
+            late = Local(light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture)
+            parts.append(lambda run: add_late_light(late, world.scene, sensor, film, bounces, run))
+        if self.walks(world):
+            parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
+        for i, part in enumerate(parts):
+            part(replace(job, progress=_share_of(job.progress, i, len(parts))))
 
     def strategies(self, contents: Any) -> Any:
         guides = self._guides(contents)
@@ -299,9 +303,11 @@ class TransientNLOSPath(base.TransientIntegrator):
     # ----------------------------------------------------------------------------------- derivatives
 
     def walks(self, world: Any) -> bool:
-        if world.left_out != BOUNCES:
+        if world.left_out is None:
             return True
-        return self._wants(BOUNCES + 1) or (self._wants(BOUNCES - 1) and wall_lights_itself(world.contents.sensor))
+        (first, last), settings = world.left_out, self.settings()
+        shortest = settings.min_depth < BOUNCES and wall_lights_itself(world.contents.sensor)
+        return settings.max_depth > last or settings.min_depth <= BOUNCES < first or shortest
 
     def silhouettes(self, scene: Any) -> str:
         sensors = scene.sensors()
@@ -314,18 +320,40 @@ class TransientNLOSPath(base.TransientIntegrator):
     def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
             return []
-        shared = [self._shared(world, sensor, film, seed, samples)] if world.left_out == BOUNCES else []
+        shared = [self._shared(world, sensor, film, seed, samples)] if self._shares(world) else []
         ray = dr.detach(scan_rays(sensor))
         scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
         edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
         return shared if edges is None else [*shared, edges]
 
-    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+    @staticmethod
+    def _shares(world: Any) -> bool:
+        """Whether light of three bounces comes from shared samples."""
+        return world.left_out is not None and world.left_out[0] == BOUNCES
+
+    def _light(self, world: Any, sensor: Any) -> Any:
         spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
         with dr.resume_grad():
-            light = scan_light(world.scene, sensor, spots, self.capture, self.legs)
-        elements = elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+            return scan_light(world.scene, sensor, spots, self.capture, self.legs)
+
+    def _elements(self, world: Any, sensor: Any) -> HiddenElements:
+        return elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+
+    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        light, elements = self._light(world, sensor), self._elements(world, sensor)
         return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
+
+
+def _choice(props: Any, name: str, shared: str) -> str:
+    value = str(props.get(name, "auto"))
+    if value not in ("auto", shared, "paths"):
+        raise SceneError(f"transient_nlos_path: {name}: expected auto, {shared} or paths, got {value!r}.")
+    return value
+
+
+def _share_of(progress: Any, part: int, count: int) -> Any:
+    """The progress of one of several parts of a job."""
+    return progress and (lambda done: progress((part + done) / count))
 
 
 def _scanned(scene: Any, sensor: Any) -> Any:

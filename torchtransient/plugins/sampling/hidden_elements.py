@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -66,23 +67,34 @@ class HiddenElements:
         self.shapes, self.elements = list(shapes), parts.take(order)
         self.tile_count, self.region = len(points), None
         self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
-        self.probabilities = p = self._probabilities(points, normals, defensive)
-        self._lay_out(p, 0)
-        per_area = p / self.elements.area
-        self._by_primitive = PrimitiveDensity(self.shapes, every, cuts, uncut[order], cell[order], per_area)
+        self._cutting, self._defensive = (every, cuts, uncut[order], cell[order]), defensive
+        self._lay_out_densities(self._probabilities(points, normals))
+
+    def reweighted(self, weights: np.ndarray) -> HiddenElements:
+        """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
+        ``elements``; the share of plain area stays. Before :meth:`put_first` alone.
+        """
+        other = copy(self)
+        other.tile_count = len(weights)
+        other._lay_out_densities(np.array([self._mixed(w) for w in np.asarray(weights, dtype=np.float64)]))
+        return other
 
     # ----------------------------------------------------------------------------------------- tables
 
-    def _probabilities(self, points: np.ndarray, normals: np.ndarray, defensive: float) -> np.ndarray:
+    def _probabilities(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(tiles, elements)"""
-        area = self.elements.area / self.elements.area.sum()
-        p = []
-        for q, n in zip(points, normals, strict=True):
-            w = facing_weight(self.elements, q, n)
-            total = w.sum()
-            # What faces no wall point at all is drawn by its area.
-            p.append((1 - defensive) * w / total + defensive * area if total > 0 else area)
-        return np.array(p)
+        pairs = zip(points, normals, strict=True)
+        return np.array([self._mixed(facing_weight(self.elements, q, n)) for q, n in pairs])
+
+    def _mixed(self, w: np.ndarray) -> np.ndarray:
+        """Probabilities of weights, with the share of plain area: all of it where nothing has a weight."""
+        area, total = self.elements.area / self.elements.area.sum(), w.sum()
+        return (1 - self._defensive) * w / total + self._defensive * area if total > 0 else area
+
+    def _lay_out_densities(self, p: np.ndarray) -> None:
+        self.probabilities = p
+        self._lay_out(p, 0)
+        self._by_primitive = PrimitiveDensity(self.shapes, *self._cutting, p / self.elements.area)
 
     def put_first(self, clear: np.ndarray, region: Any) -> None:
         """Put those elements first, ``(E,)`` of booleans, whose samples need no visibility rays to points that

@@ -75,21 +75,29 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
     seed = mi.UInt32(seed) if dr.is_array_v(seed) else dr.opaque(mi.UInt32, int(seed) % 2**32)
     x, y = plane_points(count, seed, sets)
     tile = dr.arange(mi.UInt32, count * sets) // dr.opaque(mi.UInt32, count) if sets > 1 else None
+    samples = samples_at(elements, x, y, count, tile)
+    clear = dr.select(samples.element < elements.clear_count, mi.UInt32(1), 0)
+    samples.tiles, samples.clear = sets, dr.block_sum(clear, count)
+    dr.eval(samples)
+    return samples
+
+
+def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any = None) -> SharedSamples:
+    """The samples at two numbers in [0, 1) for each lane (``Float64``, ``Float``), ``count`` of which make up the
+    area; not evaluated, and without ``clear``.
+    """
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
     shape, primitive = elements.surface(element)
     si = _interaction(elements, element, p, n, a, y)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
-    clear = dr.select(element < elements.clear_count, mi.UInt32(1), 0)
-    samples = SharedSamples(
+    return SharedSamples(
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
         element=element, shape=shape, primitive=primitive, u=mi.Point2f(a, y), smooth=smooth,
-        tiles=sets, clear=dr.block_sum(clear, count), has_clear=elements.has_clear, region=elements.region,
+        tiles=1, clear=None, has_clear=elements.has_clear, region=elements.region,
     )  # fmt: skip
-    dr.eval(samples)
-    return samples
 
 
 def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: Any) -> Local:

@@ -33,16 +33,16 @@ class SceneContents:
     """The static choices of the kernels. Does not change once built.
 
     ``sensor``: the one that looks. ``bsdfs``: those that paths can meet. ``delta``, ``glossy``: some BSDF has such a
-    lobe. ``instances``: those of shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave their hit points detached
-    (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant emitters. ``refraction``: the
-    transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around the sensor
-    (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``: masks and
-    blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
+    lobe. ``instances``: those of shape groups (:class:`.instances.Instances`). ``detached_hits``: the shapes that leave
+    their hit points detached (:class:`.hits.DetachedHits`). ``distant``: reference sphere of infinitely distant
+    emitters. ``refraction``: the transmissive rough BSDFs, which have an index. ``surroundings``: what may lie around
+    the sensor (:class:`~..sensors.surroundings.Surroundings`). ``delays``: the BSDFs that scatter late. ``mixtures``:
+    masks and blends, of which a path may be handed one part. ``two_sided``: the two-sided BSDFs in polarized variants.
     ``hidden_probability``: BSDFs whose delta lobes hide the derivative of their probability. ``media``: the
     participating media (:class:`.media_contents.MediaContents`). ``sphere_lights``: the spherical area lights
     (:class:`~..sampling.sphere_lights.SphereLights`). ``emitting_meshes``: those with vertices of their own;
-    ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables,
-    instances, surroundings, mixtures, media and lights are None where the scene has no such thing.
+    ``meshes``: all of those; ``smooth_lights``: lights on meshes with normals at their vertices. Tables, instances,
+    surroundings, mixtures, media and lights are None where the scene has no such thing.
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
     some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.

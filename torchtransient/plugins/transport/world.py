@@ -16,7 +16,7 @@ from torchtransient.plugins.transport.instances import AttachedSurfaces
 @dataclass(frozen=True)
 class PathSettings:
     """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
-    of smaller depths do not count. ``left_out``: nor do those of this depth.
+    of smaller depths do not count. ``left_out``: nor do those of these depths (first, last).
     """
 
     max_depth: int
@@ -25,7 +25,7 @@ class PathSettings:
     discard_direct_light: bool
     camera_unwarp: bool
     min_depth: int = 0
-    left_out: int | None = None
+    left_out: tuple[int, int] | None = None
 
 
 class World:
@@ -99,7 +99,10 @@ class World:
     def deep_enough(self, active: Any, depth: Any) -> Any:
         """Which events of depth ``depth`` (UInt32) count."""
         active = active if self.min_depth == 0 else active & (depth >= self.min_depth)
-        return active if self.left_out is None else active & (depth != self.left_out)
+        if self.left_out is None:
+            return active
+        first, last = self.left_out
+        return active & ((depth < first) | (depth > last))
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
         """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""

@@ -14,12 +14,13 @@ from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
 class Wanted:
     """Built once a job, outside of traced code; does not change afterwards.
 
-    ``geometry``: path lengths change. ``shapes``: pointers of the shapes that move. ``light``: an emitter without a
-    shape moves. ``sky``: the emitter whose sun moves, or None. ``emitter_shape``: the shape of a light does.
-    ``sphere_lights``: path lengths change and some lights are spheres. ``sensor``: the sensor moves. ``index``: an
-    index of refraction changes. ``ray``: the ray itself is handed on, behind delta lobes or a sensor that moves.
-    ``plain``: where a point slides on its surface, nothing but its place changes. ``extinction``: that of a medium
-    changes. ``carried``: the fields of the :class:`~..carry.Carry` that derivatives go through.
+    ``nodes``: pointers of the plugins with attached parameters. ``geometry``: path lengths change. ``shapes``: pointers
+    of the shapes that move. ``light``: an emitter without a shape moves. ``sky``: the emitter whose sun moves, or None.
+    ``emitter_shape``: the shape of a light does. ``sphere_lights``: path lengths change and some lights are spheres.
+    ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on,
+    behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but its place
+    changes. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry` that
+    derivatives go through.
 
     ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """
@@ -30,6 +31,7 @@ class Wanted:
 
         sensors = {one.ptr for one in sensors_of(sensor)}
         carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
+        self.nodes = frozenset(node.ptr for node, _, _ in effects)
         self.geometry = any(effect.moves_length for _, _, effect in effects)
         self.shapes = frozenset(shape.ptr for shape in moved("shape"))
         self.light, self.index = bool(moved("emitter")), bool(moved("index"))

@@ -163,7 +163,7 @@ class Surface(Scattering):
         reached = smooth & reached & pi.is_valid()
         found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, reached)
         value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
-        guided = self.guided_density(world, path.depth, vertex.at.p, found, pi.shape, reached, pi.prim_index)
+        guided = self.guided_density(world, path.depth, ray.o, found, pi.shape, reached, pi.prim_index)
         pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
         # A guided sample stands for the point that was drawn, and for no other that its ray runs into before.
         way = dr.norm(step.point - vertex.at.p)

@@ -1,0 +1,249 @@
+"""Late light from shared chains: the same as that of paths, in every kind of capture, film and colour."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import torchtransient.plugins.around_corner.late_light as late_light
+from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
+from support.late_light_runs import agree, chains, density_of, rendered, scan_scene
+from support.third_bounce_runs import film_of, table_of, wall_of
+from torchtransient.errors import SceneError, UnitError
+
+VARIANT = "llvm_ad_mono"
+UP = (0.0, 0.0, 1.0)
+PATHS, CHAINS = 1 << 14, 1 << 10
+
+
+def curved_wall(folder):
+    """A part of a cylinder that points of it see each other across, as a file; scanned points are inside of facets."""
+    v, f = plate(1.6, 1.6, (0, 0, 0), 23)
+    v[:, 2] = 0.35 * v[:, 0] ** 2
+    name = str(folder / "wall.ply")
+    mesh("wall", (v, f[:, ::-1]), 0.9).write_ply(name)
+    return {"type": "ply", "filename": name, "face_normals": True, "bsdf": {"type": "diffuse", "reflectance": 0.9}}
+
+
+SCENES = {
+    "V and plate": lambda: [mesh("a", folded_plates())],
+    "two-sided": lambda: [mesh("a", folded_plates(), two_sided=True), mesh("b", ball((0, 0.2, 0.7), 0.1, 1), 0.5)],
+    "body before a wall": lambda: [mesh("a", mannequin(1)), mesh("b", plate(2, 2, (0, 0, 1.6)), 0.5)],
+    "interpolated normals": lambda: [
+        mesh("a", ball((0.1, 0, 1), (0.3, 0.4, 0.2), 1), vertex_normals=True),
+        mesh("b", plate(1.5, 1.5, (0, 0, 1.3)), 0.9),
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+@pytest.mark.parametrize("name", SCENES)
+def test_chains_bring_what_paths_do(name, kind):
+    size = (2, 1) if kind == "exhaustive" else (3, 2)
+    given = {"min_bounces": 4, "max_depth": 6, "kind": kind, "size": size}
+    # A tile of four pairs has less to average over.
+    count = 4 * CHAINS if kind == "exhaustive" else CHAINS
+    some = scan_scene(SCENES[name](), **given, late_light="chains")
+    other = scan_scene(SCENES[name](), **given, late_light="paths")
+    equal, z = agree(rendered(some, count, 12), rendered(other, PATHS, 8, first=50))
+    assert equal, z
+
+
+@pytest.mark.parametrize("bounces", [4, 5, 6, 7])
+def test_each_number_of_bounces(bounces):
+    """One by one, also where the walk goes by way of the relay wall: plates that do not see each other."""
+    shapes = [mesh("a", join(plate(0.5, 0.5, (-0.4, 0, 0.5)), plate(0.5, 0.5, (0.4, 0, 0.6))), 0.9)]
+    given = {"filter_bounces": bounces, "max_depth": 7}
+    some, other = (scan_scene(shapes, **given, late_light=choice) for choice in ("chains", "paths"))
+    a, b = rendered(some, 2 * CHAINS, 12), rendered(other, PATHS, 8, first=50)
+    equal, z = agree(a, b)
+    assert equal, z
+    assert (a.mean() > 0) == (b.mean() > 0)
+
+
+def test_a_curved_wall(tmp_path):
+    """Heads lie on the wall, too; light of two and three bounces goes on coming from paths."""
+    wall = curved_wall(tmp_path)
+    for given in ({"min_bounces": 4, "max_depth": 5}, {"max_depth": 5}):
+        shapes = [mesh("a", plate(0.8, 0.8, (0, 0, 1.0)))]
+        given |= {"wall": wall, "film": {"start_opl": 0.0}}
+        some = scan_scene(shapes, **given, late_light="chains")
+        other = scan_scene(shapes, **given)
+        equal, z = agree(rendered(some, 4 * CHAINS, 12), rendered(other, 4 * PATHS, 8, first=50))
+        assert equal, z
+
+
+def test_all_light_is_the_sum_of_its_parts():
+    """Shared third bounce, chains up to seven bounces, and paths beyond, against paths alone."""
+    given = {"max_depth": 9, "rr_depth": 100}
+    shapes = [mesh("a", folded_plates(), 0.9)]
+    whole = rendered(scan_scene(shapes, **given, late_light="paths", third_bounce="paths"), PATHS, 8, first=50)
+    for choice in ({}, {"third_bounce": "paths"}, {"late_light": "paths"}):
+        equal, z = agree(rendered(scan_scene(shapes, **given, **choice), CHAINS, 12), whole)
+        assert equal, (choice, z)
+
+
+# ------------------------------------------------------------------------------------------------ by themselves
+
+
+@pytest.fixture(scope="module")
+def corner():
+    shapes = [mesh("a", folded_plates(), two_sided=True)]
+    scene = scene_of(*shapes)
+    points, normals = wall_grid(2, 0.4)
+    elements = density_of(scene, table_of(shapes), points, normals)
+    return scene, elements, points, normals
+
+
+def histogram(points, **arguments):
+    return film_of(points, points, 1.2, 48, 0.05, **arguments)
+
+
+def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(corner):
+    """The same chains: to the last digits."""
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals, leg=[0.1, 0.2, 0.0, 0.3])
+    exhaustive = {"exhaustive_scan": True, "laser_scan_width": 2, "laser_scan_height": 2}
+    run = lambda film, lasers, kind: chains(scene, elements, film, sensors, lasers, kind, 200)[1]  # noqa: E731
+    every = run(histogram(2, **exhaustive), sensors, "exhaustive").reshape(4, 4, -1)
+    confocal = run(histogram(2), sensors, "confocal").reshape(4, -1)
+    spot = wall_of(points[2:3], normals[2:3], leg=0.0)
+    single = run(histogram(2), spot, "single").reshape(4, -1)
+    most = every.max()
+    assert np.abs(every[range(4), range(4)] - confocal).max() < 1e-5 * most
+    assert np.abs(every[:, 2] - single).max() < 1e-5 * most
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_phasors_are_the_transform_of_fine_bins(corner, kind):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
+    frequencies = [0.0, 0.5, 1.5]
+    film = film_of(2, 2, type="phasor_hdr_film", frequencies="0.0, 0.5, 1.5", start_opl=1.0)
+    phasors = chains(scene, elements, film, sensors, lasers, kind, 150)[1].reshape(2, 2, 3, 2)
+    fine = chains(scene, elements, film_of(2, 2, 1.0, 8000, 0.001), sensors, lasers, kind, 150)[1][..., 0]
+    middle = (np.arange(8000) + 0.5) * 0.001
+    for i, frequency in enumerate(frequencies):
+        expected = (fine * np.exp(-2j * np.pi * frequency * middle)).sum(-1)
+        found = phasors[:, :, i, 0] + 1j * phasors[:, :, i, 1]
+        # Half a bin is at most 2 pi 1.5 0.0005 of a turn's angle.
+        assert np.abs(found - expected).max() < 6e-3 * np.abs(fine.sum(-1)).max()
+
+
+def test_bins_and_what_is_outside_are_the_steady_image(corner):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    film = film_of(2, 2, 2.5, 10, 0.1)
+    steady, cube = chains(scene, elements, film, sensors, sensors, "confocal", 300)
+    outside = film.energy_before + film.energy_after
+    assert cube.sum() + outside == pytest.approx(steady.sum(), rel=1e-5)
+    assert outside > 0.01 * steady.sum()
+
+
+@pytest.mark.parametrize("busy", [1, 64])
+def test_groups_at_a_time_do_not_matter(corner, monkeypatch, busy):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    usual = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
+    for table in (late_light._BUSY,):
+        for backend in list(table):
+            monkeypatch.setitem(table, backend, busy)
+    again = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
+    assert np.allclose(usual, again, rtol=1e-4, atol=1e-6 * usual.max())
+
+
+@pytest.mark.parametrize("choices", [{"size": 1}, {"size": 4}, {"side": 1}, {"side": 2}])
+def test_groups_and_tiles_have_one_mean(corner, choices):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    run = lambda seed, **more: chains(  # noqa: E731
+        scene, elements, histogram(2), sensors, sensors, "confocal", 512, seed, **more
+    )[1]
+    a = np.array([run(seed) for seed in range(10)])
+    b = np.array([run(seed, **choices) for seed in range(20, 30)])
+    equal, z = agree(a, b, blocks=6)
+    assert equal, z
+
+
+def test_few_chains_and_no_light():
+    """One chain, and a convex body alone, of which nothing is scattered twice."""
+    points, normals = wall_grid(2, 0.4)
+    sensors = wall_of(points, normals)
+    shapes = [mesh("a", ball((0, 0, 1), 0.3, 1))]
+    scene = scene_of(*shapes)
+    elements = table_of(shapes)
+    for count in (1, 3, 64):
+        steady, cube = chains(scene, elements, histogram(2), sensors, sensors, "confocal", count)
+        assert steady.sum() == 0
+        assert cube.sum() == 0
+
+
+def test_chains_name_their_material_points(corner):
+    """Shape, primitive and barycentrics of every vertex give its place again."""
+    import drjit as dr
+
+    from torchtransient.plugins.around_corner.chains import ChainPlan, trace_chains
+
+    scene, elements, points, _ = corner
+    center, seed = mi.Point3f(*np.mean(points, 0).tolist()), dr.opaque(mi.UInt32, 5)
+    _, tails = trace_chains(scene, ChainPlan(elements, center, 32, 4, 3, seed), dr.arange(mi.UInt32, 128))
+    v = np.array(elements.shapes[0].vertex_positions_buffer()).reshape(-1, 3)
+    f = np.array(elements.shapes[0].faces_buffer()).reshape(-1, 3)
+    for vertex in tails:
+        alive = np.array(vertex.alive & (vertex.shape == mi.ShapePtr(elements.shapes[0])))
+        corners = v[f[np.array(vertex.primitive)[alive]]]
+        b = np.array(vertex.uv).T[alive]
+        place = corners[:, 0] + b[:, :1] * (corners[:, 1] - corners[:, 0]) + b[:, 1:] * (corners[:, 2] - corners[:, 0])
+        assert alive.any()
+        assert np.abs(place - np.array(vertex.p).T[alive]).max() < 1e-4
+
+
+def test_arguments_are_checked(corner):
+    scene, elements, points, normals = corner
+    sensors = wall_of(points, normals)
+    run = lambda **more: chains(scene, elements, histogram(2), sensors, sensors, "confocal", 8, **more)  # noqa: E731
+    for bounces in ((3, 5), (4, late_light.MOST + 1), (6, 5)):
+        with pytest.raises(SceneError, match="expected bounces"):
+            run(bounces=bounces)
+    with pytest.raises(UnitError, match="power of two"):
+        run(size=12)
+
+
+def test_the_choice_says_why_not():
+    shapes = [mesh("a", folded_plates())]
+    # Mitsuba's parser hands on what the plugin says.
+    with pytest.raises(RuntimeError, match="expected auto, chains or paths"):
+        scan_scene(shapes, late_light="walks")
+    metal = mi.load_dict({"type": "sphere", "center": [0, 0, 1], "radius": 0.2, "bsdf": {"type": "roughconductor"}})
+    scene = scan_scene([metal], late_light="chains")
+    with pytest.raises(SceneError, match=r"late_light is 'chains', but not all surfaces are diffuse"):
+        scene.integrator().render(scene, spp=1)
+    scene = scan_scene(shapes, late_light="chains", nlos_hidden_geometry_sampling=False)
+    with pytest.raises(SceneError, match="late_light is 'chains', but nlos_laser_sampling"):
+        scene.integrator().render(scene, spp=1)
+
+
+def test_progress_goes_up_to_one():
+    told = []
+    scene = scan_scene([mesh("a", folded_plates())], max_depth=8)
+    scene.integrator().render(scene, spp=64, progress_callback=told.append)
+    assert told == sorted(told)
+    assert told[-1] == pytest.approx(1)
+
+
+# ------------------------------------------------------------------------------------------------ colours
+
+
+def test_colours():
+    """Of red, green and blue albedos, each channel is that of paths."""
+    with mi.variant_context("llvm_ad_rgb"):
+        v, f = folded_plates()
+        shape = mesh("a", (v, f), {"type": "rgb", "value": [0.9, 0.5, 0.2]})
+        given = {"min_bounces": 4, "max_depth": 5}
+        some, other = (scan_scene([shape], **given, late_light=choice) for choice in ("chains", "paths"))
+        a, b = rendered(some, CHAINS, 12), rendered(other, PATHS, 8, first=50)
+        assert a.shape[-1] == 3
+        for channel in range(3):
+            equal, z = agree(a[..., channel : channel + 1], b[..., channel : channel + 1])
+            assert equal, z
+        assert a[..., 0].sum() > 3 * a[..., 2].sum()
