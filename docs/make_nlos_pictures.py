@@ -1,4 +1,4 @@
-"""Simulate and draw the captures of docs/nlos.md: `python docs/make_nlos_pictures.py [SCENE ...]`, a minute on two cores.
+"""Simulate and draw the captures of docs/nlos.md: `python docs/make_nlos_pictures.py [SCENE ...]`, a minute.
 
 Each scene is a confocal scan of a wall of 2 x 2 m (of the room: a part of its front), light of three bounces.
 """

@@ -161,7 +161,7 @@ class Finder:
             return depth
         if self.arrivals is None and self._around_a_corner:
             self.reasons.append(
-                f"max_depth: {own}, kept; what albedos leave of the emitted power says little about light around corners"
+                f"max_depth: {own}, kept; what albedos leave of emitted power says little about light around corners"
             )
             return None
         if self.arrivals is None:
