@@ -43,5 +43,3 @@ def test_there_and_back(kind, front, phasor, steady):
     assert (back.channels, back.polarized) == (made.channels, made.polarized)
     if not phasor:
         assert back.transient.data_ptr() == torch.from_numpy(rows).data_ptr()
-
-

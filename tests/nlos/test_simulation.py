@@ -287,6 +287,15 @@ def test_polarized_captures_have_their_shapes():
     assert whole.polarized and parts.polarized and parts.steady.shape == (4, 1, 2, 3)
 
 
+def test_tiles_of_exhaustive_captures_are_few(tmp_path):
+    """Each looks at all spots anew."""
+    for kind, count in (("confocal", 16), ("exhaustive", 4)):
+        forecast = tt.nlos.forecast(
+            tt.scenes.nlos_z(), scan(kind, (8, 4)), time_axis=AXIS, spp=1, part=tmp_path / "a.part"
+        )
+        assert forecast.parts == count and os.listdir(tmp_path) == []
+
+
 def test_a_capture_that_does_not_fit():
     axis = tt.TimeAxis(0.0, 1e-3, 100_000)
     large = tt.nlos.Scan.grid(WALL, (100, 100), kind="exhaustive")

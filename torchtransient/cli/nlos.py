@@ -26,7 +26,9 @@ INTERRUPTED = 130
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Capture, .h5 or .npz.  [default: SCENE.h5]")
 @click.option("--part", type=click.Path(path_type=Path), help="Keeps what is finished.  [default: OUTPUT.part]")
-@click.option("--parts", type=click.IntRange(min=1), help="How many; a kill loses one at most.  [default: 16]")
+@click.option(
+    "--parts", type=click.IntRange(min=1), help="How many; a kill loses one at most.  [default: 16; exhaustive 4]"
+)
 @click.option("--whole", is_flag=True, help="No part file: faster for small captures, and lost by a kill.")
 @click.option("--restart", is_flag=True, help="Delete a part file that is there, and start anew.")
 @click.option("--describe", is_flag=True, help="Say memory, time and what is chosen, and stop.")

@@ -35,8 +35,9 @@ from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
 from torchtransient.units import seconds_to_opl
 
-# Parts of a simulation with a part file: that many are lost by a kill at most.
-PARTS = 16
+# Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
+# all laser spots anew: 16 of them take three times as long as one, 4 a quarter more (256 x 256 pairs).
+PARTS, EXHAUSTIVE_PARTS = 16, 4
 BIN_WIDTH_S = 16e-12
 DEFAULT_SPP = 4096
 THIRD = (3,)
@@ -75,9 +76,9 @@ def simulate(
     ``sensor``: a module of ``tt.sensing`` that the transient goes through at last, with the noise of ``generator``.
     ``seed``: same seed and parts, same capture.
 
-    ``part``: name of a file that keeps finished parts (16, or ``tiles``): with it a simulation that was killed goes on
-    when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it. ``progress``: say memory
-    and time before it starts, and show a bar.
+    ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
+    that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
+    ``progress``: say memory and time before it starts, and show a bar.
 
     ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
     light was found), ``parts``.
@@ -87,7 +88,7 @@ def simulate(
     damaged, or is worked on by another process.
     """
     path = None if part is None else Path(part)
-    work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(path, tiles))
+    work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     checked_count("seed", seed, 0)
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
@@ -121,7 +122,7 @@ def forecast(
         raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
     of_light = given.pop("bounces"), given.pop("energy")
     path = None if part is None else Path(part)
-    work = _work(hidden, scan, *given.values(), of_light, variant, _parts(path, tiles))
+    work = _work(hidden, scan, *given.values(), of_light, variant, _parts(scan, path, tiles))
     with active_variant(work.variant.name):
         return forecast_of(work, timed=True)
 
@@ -190,9 +191,10 @@ def _is_complete(scene: Mapping[str, Any]) -> bool:
     return any("path" in kind for kind in kinds) or "integrator" in scene
 
 
-def _parts(part: Path | None, tiles: int | None) -> int:
+def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
     if tiles is None:
-        return 1 if part is None else PARTS
+        many = EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else PARTS
+        return 1 if part is None else many
     return checked_count("tiles", tiles)
 
 
