@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -98,6 +99,9 @@ class TransientNLOSPath(base.TransientIntegrator):
     confocal ones, whose spots lie at pixel centres).
 
     Gradients in both modes as in :class:`TransientIntegrator`.
+
+    Not supported: light that comes from the spot through smooth glass or by way of a mirror, which no connection finds
+    (as that of point lights elsewhere).
     """
 
     walks_through_media = True
@@ -231,8 +235,10 @@ class TransientNLOSPath(base.TransientIntegrator):
             parts.append(lambda run: self._shared(world, sensor, film, run.seed, run.samples).add(run.progress))
         if last >= FIRST:
             bounces = max(first, FIRST), last
-            late = Local(light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture)
-            parts.append(lambda run: add_late_light(late, world.scene, sensor, film, bounces, run))
+            of_scan = Local(
+                light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture
+            )
+            parts.append(lambda run: add_late_light(of_scan, world.scene, sensor, film, bounces, run))
         if self.walks(world):
             parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
         for i, part in enumerate(parts):
@@ -337,7 +343,12 @@ class TransientNLOSPath(base.TransientIntegrator):
             return scan_light(world.scene, sensor, spots, self.capture, self.legs)
 
     def _elements(self, world: Any, sensor: Any) -> HiddenElements:
-        return elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+        includes_wall = self.samples_wall or wall_lights_itself(sensor)
+        guides = [guide for guide in world.scattering.guides if isinstance(guide, HiddenGeometry)]
+        if guides and includes_wall == self.samples_wall:
+            # The paths' own table; a copy, of which elements may be put in another order.
+            return copy(guides[0].elements)
+        return elements_of(world.scene, sensor, includes_wall)
 
     def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
         light, elements = self._light(world, sensor), self._elements(world, sensor)

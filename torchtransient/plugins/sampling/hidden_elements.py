@@ -115,10 +115,10 @@ class HiddenElements:
         rows = np.concatenate([e.axes, np.concatenate([e.normal, e.kind[:, None]], 1)[:, :, None]], axis=2)
         self._rows = packed(rows)
         self._area = mi.Float(e.area.astype(np.float32))
-        self._shape, self._primitive = mi.UInt32(e.shape.astype(np.uint32)), mi.UInt32(e.primitive.astype(np.uint32))
+        numbers = np.array([registry_number(shape) for shape in self.shapes], dtype=np.uint32)
+        self._shape, self._primitive = mi.UInt32(numbers[e.shape.astype(int)]), mi.UInt32(e.primitive.astype(np.uint32))
         self._count = mi.UInt32(len(e))
-        self._pointers = mi.UInt32([registry_number(shape) for shape in self.shapes])
-        dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count, self._pointers)
+        dr.make_opaque(self._cdf, self._rows, self._area, self._shape, self._primitive, self._count)
 
     # ---------------------------------------------------------------------------------------- in kernels
 
@@ -128,6 +128,12 @@ class HiddenElements:
         """
         element, a = self.select_element(mi.Float64(u.x), active, tile)
         return self.point(element, a, u.y, active)
+
+    def draw_with_surface(self, u: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """A point as in :meth:`draw`, and the shape and primitive that it lies on."""
+        element, a = self.select_element(mi.Float64(u.x), active)
+        point, _ = self.point(element, a, u.y, active)
+        return point, *self.surface(element, active)
 
     def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
         """An element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number: uniform in
@@ -184,7 +190,7 @@ class HiddenElements:
 
     def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:
         """Shape (``ShapePtr``) and primitive (``UInt32``) of an element of the table."""
-        number = dr.gather(mi.UInt32, self._pointers, dr.gather(mi.UInt32, self._shape, element, active), active)
+        number = dr.gather(mi.UInt32, self._shape, element, active)
         return dr.reinterpret_array(mi.ShapePtr, number), dr.gather(mi.UInt32, self._primitive, element, active)
 
     def _row(self, element: Any, number: int, active: Any) -> Any:

@@ -254,7 +254,9 @@ class Guide(Strategy):
         return self.share
 
     def draw(self, world: Any, vertex: Vertex, u: Any) -> Any:
-        """A Point3f on a surface for two uniform numbers (Point2f)."""
+        """(a Point3f on a surface for two uniform numbers ``u`` (Point2f), the ShapePtr of that surface, the number of
+        its triangle or None where that does not matter).
+        """
         raise NotImplementedError
 
     def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:
