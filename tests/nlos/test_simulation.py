@@ -228,6 +228,44 @@ def test_a_camera_sees_points_of_the_wall():
     assert bool((capture.transient.sum((0, 1))[past] == 0).all()) and int(past.sum()) == 16
 
 
+OLDER = """<scene version="3.3.0">
+  <integrator type="transient_nlos_path">
+    <integer name="block_size" value="1"/><integer name="max_depth" value="-1"/>
+    <integer name="filter_depth" value="-1"/><boolean name="discard_direct_paths" value="false"/>
+    <boolean name="nlos_laser_sampling" value="true"/><boolean name="nlos_hidden_geometry_sampling" value="true"/>
+    <boolean name="nlos_hidden_geometry_sampling_includes_relay_wall" value="false"/>
+    <string name="temporal_filter" value="box"/>
+  </integrator>
+  <emitter type="projector"><rgb name="irradiance" value="1.0, 1.0, 1.0"/><float name="fov" value="0.2"/></emitter>
+  <shape type="rectangle"><transform name="to_world">
+    <scale value="0.4"/><rotate y="1" angle="180"/><translate z="1"/></transform></shape>
+  <shape type="rectangle" id="relay_wall">
+    <sensor type="nlos_capture_meter">
+      <sampler type="independent"><integer name="sample_count" value="32"/><integer name="seed" value="0"/></sampler>
+      <boolean name="confocal" value="false"/><boolean name="account_first_and_last_bounces" value="false"/>
+      <point name="sensor_origin" x="-0.5" y="0.0" z="0.25"/><point name="laser_origin" x="-0.5" y="0.0" z="0.25"/>
+      <point name="laser_lookat_pixel" x="6" y="1" z="0"/>
+      <film type="transient_hdr_film">
+        <integer name="width" value="8"/><integer name="height" value="4"/><integer name="temporal_bins" value="200"/>
+        <float name="bin_width_opl" value="0.02"/><float name="start_opl" value="1.85"/><rfilter type="box"/>
+      </film>
+    </sensor>
+  </shape>
+</scene>"""
+
+
+def test_an_older_scene_of_mitransient(tmp_path):
+    """As its examples are written: the spot at a place of the film, a projector, properties that say nothing."""
+    (tmp_path / "older.xml").write_text(OLDER)
+    capture = tt.nlos.simulate(tmp_path / "older.xml", progress=False)
+    assert capture.transient.shape == (1, 200, 4, 8) and float(capture.transient.sum()) > 0
+    assert capture.metadata["spp"] == 32 and capture.metadata["variant"] == "llvm_ad_mono"
+    found = capture.scan
+    torch.testing.assert_close(found.laser_points, torch.tensor([0.5, -0.5, 0.0]).double(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.sensor_points[0, 0], torch.tensor([-0.875, -0.75, 0]).double(), rtol=0, atol=1e-6)
+    assert found.laser_origin.tolist() == found.sensor_origin.tolist() == [-0.5, 0.0, 0.25]
+
+
 # ---------------------------------------------------------------------------------------------- variants, forecasts
 
 
@@ -266,6 +304,10 @@ def test_the_light_is_explained():
     metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
     assert "from paths, since not all surfaces are diffuse" in light(hidden=metal)
     assert "polarization" in light(variant="llvm_ad_mono_polarized")
+    bent = [[-1, -1, 0.1], [0, -1, 0], [1, -1, 0.1], [-1, 1, 0.1], [0, 1, 0], [1, 1, 0.1]]
+    wall = tt.nlos.Wall.mesh(bent, [[0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4]])
+    curved = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal", sensor_origin=[0, 0, 0.5], laser_origin=[0, 0, 0.5])
+    assert "from paths, since the wall is not flat" in light(of=curved)
 
 
 def test_a_forecast_is_what_comes(capsys):
