@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from dataclasses import dataclass
 
 import torch
 
-from torchtransient.errors import StorageError
+from torchtransient.errors import PhysicsWarning, StorageError
 from torchtransient.nlos.work import Work
 from torchtransient.render.memory import available_bytes
 from torchtransient.render.variant import active_variant
 
-# Shares of the samples that the time is estimated by.
-FEW, SOME = 128, 32
+# Shares of the samples that the time is estimated by, and the fewest that tell something.
+FEW, SOME, LEAST = 128, 32, 16
 _BYTES = 4
 
 
@@ -82,22 +83,28 @@ def _shape(work: Work) -> tuple[int, ...]:
 
 
 def _seconds(work: Work) -> float:
-    """Of all parts, from two runs of the first with few samples: what starts it, and what a sample costs."""
-    whole = work.film.spp
-    few, some = max(1, whole // FEW), max(1, whole // SOME)
+    """Of all parts, from runs of the first with few samples: what starts it, and what a sample costs."""
+    # Of few samples in all, those of a part: a render that has next to nothing to do says nothing of others.
+    of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
+    few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
+    few, some = (few, some) if some > few else (of_part, of_part)
     first, last = work.run(0)
     times = {}
-    with torch.no_grad():
-        for spp in (few, few, some) if some > few else (few, few):  # the first one compiles
+    told = work.renderer(0).scene.told
+    before = set(told)
+    with torch.no_grad(), warnings.catch_warnings():
+        # What few samples see of a window is no warning yet.
+        warnings.simplefilter("ignore", PhysicsWarning)
+        for spp in (few, some, few, some) if some > few else (few, few):  # compiled, then timed
             began = time.perf_counter()
             work.render(0, 0, spp=spp)
             times[spp] = time.perf_counter() - began
-    slope = (times[some] - times[few]) / (some - few) if some > few else times[few] / few
-    start = max(0.0, times[few] - slope * few)
+    told &= before
+    slope = max(0.0, (times[some] - times[few]) / (some - few)) if some > few else 0.0
+    of_one = times[some] + slope * (of_part - some)
     if work.sums:
-        return work.count * start + max(0.0, slope) * whole
-    points = math.prod(work.scan.sensor_shape)
-    return (start + max(0.0, slope) * whole) * points / (last - first)
+        return work.count * of_one
+    return of_one * math.prod(work.scan.sensor_shape) / (last - first)
 
 
 def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
