@@ -111,6 +111,21 @@ def test_options_replace_what_the_file_says(folder):
     assert torch.equal(found.transient, expected.transient) and found.channels == ("R", "G", "B")
 
 
+def test_a_device_counts_with_the_seed_of_the_file(folder):
+    response = {"kind": "GaussianResponse", "fwhm_s": 1e-10}
+    stages = [
+        {"kind": "ImpulseResponse", "response": response, "axis": "@axis"},
+        {"kind": "SynchronousSPAD", "cycles": 1000},
+    ]
+    device = {"name": "d", "description": "a detector", "sources": ["assumed: all of it"], "stages": stages}
+    (folder / "own.yaml").write_text(OWN % "confocal" + f"sensor: {json.dumps(device)}\n")
+    for name in ("a.h5", "b.h5"):
+        assert run("own.yaml", "-o", name, "--whole", "--quiet").exit_code == 0
+    assert run("own.yaml", "-o", "c.h5", "--whole", "--quiet", "--seed", 6).exit_code == 0
+    a, b, c = (tt.nlos.read_capture(f"{name}.h5").transient for name in "abc")
+    assert torch.equal(a, b) and not torch.equal(a, c) and torch.equal(a, a.round())
+
+
 def test_scenes_of_y_tal(folder):
     result = run("tal.yaml", "--whole", "--quiet")
     assert result.exit_code == 0, result.output

@@ -171,6 +171,27 @@ def test_a_sensor_sees_the_whole_capture(tmp_path):
         assert torch.equal(seen(**settings), 2 * simulated(**settings).transient + offset)
 
 
+def test_devices_are_sensors():
+    """As files name them: built for the capture's own bins."""
+    stage = {"kind": "ImpulseResponse", "response": {"kind": "GaussianResponse", "fwhm_s": 2e-10}, "axis": "@axis"}
+    device = tt.sensing.Device("d", "a detector", ("assumed: all",), (stage,))
+    chain, plain = device.sensor(AXIS), simulated()
+    expected = chain(plain.transient)
+    for settings in ({}, {"tiles": 2}):
+        bare = simulated(**settings)
+        seen = simulated(sensor=device, **settings)
+        torch.testing.assert_close(seen.transient, chain(bare.transient))
+        assert seen.axis == AXIS and not torch.equal(seen.transient, bare.transient)
+    renderer = tt.nlos.CaptureRenderer(
+        tt.scenes.nlos_z(), scan(), time_axis=AXIS, spp=64, sensor=device, variant="llvm_ad_mono"
+    )
+    torch.testing.assert_close(renderer(seed=0).transient.detach(), expected)
+    with pytest.raises(SceneError, match="takes transients"):
+        simulated(sensor=device, frequencies=FREQUENCIES)
+    with pytest.raises(SceneError, match="takes transients"):
+        tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan(), frequencies=[1.0], sensor=device)
+
+
 # -------------------------------------------------------------------------------------------------- complete scenes
 
 

@@ -15,7 +15,7 @@ from torchtransient.render.memory import available_bytes
 from torchtransient.render.variant import active_variant
 
 # Shares of the samples that the time is estimated by, and the fewest that tell something.
-FEW, SOME, LEAST = 128, 32, 16
+FEW, SOME, LEAST = 512, 128, 16
 _BYTES = 4
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
@@ -18,6 +19,7 @@ from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
+from torchtransient.sensing import Device, GradPolicy
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
@@ -32,7 +34,8 @@ class CaptureRenderer(nn.Module):
     ``nn.Parameter`` each, or a mapping to start values; hidden nodes keep their names (``chair.vertex_positions``,
     ``hidden.to_world``, ``hidden.bsdf.reflectance.value``), the wall is ``wall``. ``settings``: those of
     :class:`TransientRenderer`, ``time_axis`` or another film and ``spp`` (paths for each sensor point, or for each pair
-    of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through.
+    of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a
+    device, whose expected answer is taken (``device.sensor(axis, grad=...)`` makes modules with noise).
 
     Where points of the scan require gradients they get them. :meth:`forward` returns a :class:`Capture`.
     """
@@ -45,13 +48,13 @@ class CaptureRenderer(nn.Module):
         *,
         bounces: Sequence[int] | str = (3,),
         energy: Any = 1.0,
-        sensor: nn.Module | None = None,
+        sensor: nn.Module | Device | None = None,
         variant: str | None = None,
         **settings: Any,
     ):
         super().__init__()
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
-        self.scan, self.sensor, self.bounces = scan, sensor, bounces
+        self.scan, self.bounces = scan, bounces
         self._followed = _attached(scan)
         own = {key: None for key in self._followed if key not in parameters}
         wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
@@ -59,6 +62,9 @@ class CaptureRenderer(nn.Module):
         self.renderer = TransientRenderer(scene, {**wanted, **own}, **settings)
         for key in own:
             self.renderer.values[key].requires_grad_(requires_grad=False)
+        if sensor is not None and self.renderer.axis is None:
+            raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
+        self.sensor = None if sensor is None else as_module(sensor, self.renderer.axis)
         check_scan(self.renderer.scene, scan, self.renderer._options)
 
     @property
@@ -82,6 +88,11 @@ class CaptureRenderer(nn.Module):
         given = self._followed | dict(values or {})
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
         return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
+
+
+def as_module(sensor: nn.Module | Device, axis: TimeAxis | None, grad: GradPolicy = "expected") -> nn.Module:
+    """A sensor as the module that takes transients on ``axis``; ``grad``: what becomes of a device's noise."""
+    return sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
 
 
 def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:

@@ -26,13 +26,14 @@ from torchtransient.errors import SceneError
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
-from torchtransient.nlos.renderer import in_film_shape, in_scan_shape, measured
+from torchtransient.nlos.renderer import as_module, in_film_shape, in_scan_shape, measured
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, checked_count, seed_of
 from torchtransient.render.arguments import samples
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
+from torchtransient.sensing import Device
 from torchtransient.units import seconds_to_opl
 
 # Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
@@ -52,7 +53,7 @@ def simulate(
     spp: int | None = None,
     bounces: Sequence[int] | str | None = None,
     energy: Any = None,
-    sensor: torch.nn.Module | None = None,
+    sensor: torch.nn.Module | Device | None = None,
     seed: int = 0,
     variant: str | None = None,
     part: str | Path | None = None,
@@ -73,7 +74,8 @@ def simulate(
     is measured may.
 
     ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
-    ``sensor``: a module of ``tt.sensing`` that the transient goes through at last, with the noise of ``generator``.
+    ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
+    ``generator`` (devices draw their counts); its answer has the same bins.
     ``seed``: same seed and parts, same capture.
 
     ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
@@ -90,6 +92,8 @@ def simulate(
     path = None if part is None else Path(part)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     checked_count("seed", seed, 0)
+    if sensor is not None and work.axes()[0] is None:
+        raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
         forecast = forecast_of(work, timed=progress and not finished)
@@ -97,8 +101,10 @@ def simulate(
             print(forecast, file=sys.stderr)
         whole = kept is None and work.count == 1
         capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
-        if sensor is not None and capture.transient is not None:
-            capture = replace(capture, transient=_through(capture.transient, capture.scan, sensor, generator))
+        if sensor is not None:
+            # Counts as they are drawn: nothing of a simulation has gradients.
+            chain = as_module(sensor, capture.axis, "straight_through")
+            capture = replace(capture, transient=_through(capture.transient, capture.scan, chain, generator))
         if kept is not None and not keep_part:
             kept.remove()
     return replace(capture, metadata=_metadata(work, forecast, seed, seconds))
