@@ -40,7 +40,7 @@ from torchtransient.plugins.transport.scattering.guides.hidden_geometry import H
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
 from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local
@@ -256,7 +256,9 @@ class TransientNLOSPath(base.TransientIntegrator):
             return Media
         # Instances, and what Mitsuba leaves detached, are attached along rays alone.
         along_rays = contents.instances is not None or contents.detached_hits is not None
-        return Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
+        if along_rays or not self.laser_sampling:
+            return Vacuum
+        return FoundVacuum if self.hidden_sampling else MaterialVacuum
 
     def _connections(self, contents: Any) -> list[Any]:
         if not self.laser_sampling:

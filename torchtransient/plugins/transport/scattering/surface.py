@@ -167,7 +167,7 @@ class Surface(Scattering):
         smooth = vertex.goes_on & ~step.delta
         pi, reached = world.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
-        found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, reached)
+        found = world.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
         value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
         guided = self.guided_density(world, path.depth, ray.o, found, pi.shape, reached, pi.prim_index)
         pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
