@@ -62,7 +62,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
-        corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+        corner. -1 keeps all. (In mitransient 1.x, ``filter_bounces = b`` keeps paths of ``b + 1`` bounces with
+        ``nlos_laser_sampling``, and of ``b + 2`` without it.)
     ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
         ``filter_bounces + 1``, as in mitransient.
