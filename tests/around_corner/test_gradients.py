@@ -110,6 +110,34 @@ def test_shared_samples(case, kind):
         assert abs(reverse) > 1e-3 * scale
 
 
+@pytest.mark.parametrize("kind", ["confocal", "single"])
+def test_pose_of_the_laser(kind):
+    """It moves the spot of a single capture, and the first leg of any."""
+    scene = scan_scene(plate(), kind, film(3, **SMOOTH), account_first_and_last_bounces=True)
+    capture = Capture(scene, "laser.to_world", move(1, 0, 0))
+    spp = 2**14
+    reverse = capture.reverse(0, spp)
+    assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
+    assert reverse == pytest.approx(np.mean([capture.difference(4e-3, seed, spp) for seed in range(3)]), rel=2e-3)
+    assert abs(reverse) > 1e-3 * abs(capture.loss(0.0, 0, spp))
+
+
+def test_a_wall_moves_behind_points_that_are_given():
+    """The sensor is the wall's, but its rays go to the points and stay."""
+    scene = scan_scene(plate(), "single", film(2, **SMOOTH), third_bounce="paths")
+    grid = np.float32([[x, y, 0] for y in (-0.2, 0.2) for x in (-0.2, 0.2)])
+    scene["wall"]["sensor"] |= {"points": mi.TensorXf(grid)}
+    capture = Capture(scene, "wall.to_world", move(0, 0, 1))
+    runs = [
+        (capture.reverse(s, 2**14), capture.forward(s, 2**14), capture.difference(4e-3, s, 2**14)) for s in range(4)
+    ]
+    reverse, forward, difference = np.array(runs).T
+    np.testing.assert_allclose(forward, reverse, rtol=1e-3)
+    error = np.sqrt((reverse.var(ddof=1) + difference.var(ddof=1)) / 4)
+    assert abs(reverse.mean() - difference.mean()) < 4 * error
+    assert error < 0.1 * abs(reverse.mean())
+
+
 @pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
 @pytest.mark.parametrize("case", ["depth", "sideways", "albedo", "albedo of the wall", "the wall"])
 def test_general_paths(case, kind):

@@ -60,7 +60,8 @@ def letters(effect):
 
 # plugins, keys, what they move (length, silhouette, medium) and their role; all other keys move nothing
 MOVES = [
-    ("rectangle sphere disk cylinder sdfgrid instance irradiancemeter", "to_world", "LS", "shape"),
+    ("rectangle sphere disk cylinder sdfgrid instance irradiancemeter nlos_capture_meter",
+     "to_world", "LS", "shape"),
     ("area directionalarea diff_directionalarea angulararea", "to_world", "LS", "shape"),
     ("cube obj ply mesh_arrays instance", "vertex_positions vertex_normals", "LS", "shape"),
     ("cube obj ply mesh_arrays instance", "vertex_texcoords", "S", "value"),
@@ -71,6 +72,9 @@ MOVES = [
      "to_world x_fov principal_point_offset_x principal_point_offset_y", "LS", "sensor"),
     ("orthographic", "to_world", "LS", "sensor"),
     ("thinlens", "to_world x_fov aperture_radius focus_distance", "LS", "sensor"),
+    ("nlos_capture_meter", "sensor_origin points", "LS", "sensor"),
+    ("nlos_capture_meter", "laser_points laser_origin", "LS", "emitter"),
+    ("laser_beam", "to_world", "LS", "emitter"),
     ("point", "position", "LS", "emitter"),
     ("spot projector directional envmap sunsky sunsky_at_a_time timed_sunsky", "to_world", "LS", "emitter"),
     ("sunsky sunsky_at_a_time", "sun_direction", "LS", "sun"),

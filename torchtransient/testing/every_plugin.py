@@ -76,10 +76,27 @@ def sensors() -> dict[str, dict[str, Any]]:
         "thinlens": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 1.0},
         "batch": {"type": "batch", "first": camera, "second": camera},
         "irradiancemeter": {"type": "rectangle", "sensor": {"type": "irradiancemeter", "film": film}},
+        "nlos_capture_meter": _scan(),
         "transient_hdr_film": {**camera, "film": {"type": "transient_hdr_film"}},
         "phasor_hdr_film": {**camera, "film": {"type": "phasor_hdr_film"}},
         "gated_hdr_film": {**camera, "film": {"type": "gated_hdr_film", "gates": "gaussian 1 0.1"}},
     }
+
+
+def _scan() -> dict[str, Any]:
+    """A relay wall whose scan has all that one can have."""
+    import mitsuba as mi
+
+    points = mi.TensorXf([[0.1, 0.2, 0.0]])
+    meter = {
+        "type": "nlos_capture_meter",
+        "film": {"type": "transient_hdr_film", "width": 1, "height": 1, "rfilter": {"type": "box"}},
+        "sensor_origin": [0.0, 0.0, 1.0],
+        "points": points,
+        "laser_points": points,
+        "laser_origin": [0.5, 0.0, 1.0],
+    }
+    return {"type": "rectangle", "sensor": meter}
 
 
 def emitters() -> dict[str, dict[str, Any]]:
@@ -88,6 +105,7 @@ def emitters() -> dict[str, dict[str, Any]]:
     return {
         **{name: {"type": "rectangle", "emitter": {"type": name}} for name in on_shapes},
         "point": {"type": "point"},
+        "laser_beam": {"type": "laser_beam"},
         "spot": {"type": "spot", "texture": _bitmap()},
         "projector": {"type": "projector", "irradiance": _bitmap()},
         "directional": {"type": "directional", "direction": [0, 0, 1]},

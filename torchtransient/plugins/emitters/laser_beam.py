@@ -15,7 +15,8 @@ class LaserBeam(mi.Emitter):
     r"""A beam without width (:monosp:`laser_beam`), for the integrator ``transient_nlos_path``.
 
     ``to_world`` (transform): the laser stands at its origin and shines along its +z; scans that aim the laser
-    themselves use the origin alone. ``energy`` (spectrum, 1): what falls on the spot, per colour.
+    themselves use the origin alone. ``energy`` (spectrum, 1): what falls on the spot, per colour. Both are
+    differentiable.
 
     Nothing of it has an area or a solid angle: integrators that do not aim at its spot refuse it.
     """
@@ -25,11 +26,19 @@ class LaserBeam(mi.Emitter):
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.energy = props.get_emissive_texture("energy", 1.0)
+        # That of the base class cannot be set from Python.
+        self.to_world = mi.Transform4f(super().world_transform())
+        dr.make_opaque(self.to_world)
         self.m_flags = +mi.EmitterFlags.DeltaPosition
 
     def traverse(self, cb: Any) -> None:
         super().traverse(cb)
         cb.put("energy", self.energy, mi.ParamFlags.Differentiable)
+        cb.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
+
+    def world_transform(self) -> Any:
+        """The laser's pose."""
+        return self.to_world
 
     def energy_at(self, wavelengths: Any, active: Any) -> Any:
         """Energy per colour (UnpolarizedSpectrum) at a path's wavelengths."""
@@ -59,4 +68,6 @@ class LaserBeam(mi.Emitter):
 
 
 register("emitter", "laser_beam", LaserBeam)
-declare_effects(LaserBeam, {ANY_KEY: VALUE, "to_world": ParameterEffect(moves_length=True, role="emitter")})
+# What is lit changes with the spot.
+_POSE = ParameterEffect(moves_length=True, moves_silhouette=True, role="emitter")
+declare_effects(LaserBeam, {ANY_KEY: VALUE, "to_world": _POSE})

@@ -340,7 +340,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
         with dr.resume_grad():
             if world.wanted.sensor or dr.grad_enabled(rays.η):
-                dr.backward_from(objective_of(world, rays, adjoint))
+                # What carries a sensor may move without its rays: they go to points that are given.
+                flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+                dr.backward_from(objective_of(world, rays, adjoint), flags)
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):

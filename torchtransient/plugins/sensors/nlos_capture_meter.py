@@ -145,9 +145,10 @@ def _points_of(props: Any, name: str) -> Any:
 
 
 register("sensor", "nlos_capture_meter", NLOSCaptureMeter)
-_PLACE = ParameterEffect(moves_length=True, role="sensor")
+# What is seen from the scanned points, and lit from the spots, changes with them.
+_PLACE = ParameterEffect(moves_length=True, moves_silhouette=True, role="sensor")
 # The rays of the sensor do not follow the laser.
-_LASER = ParameterEffect(moves_length=True, role="emitter")
+_LASER = ParameterEffect(moves_length=True, moves_silhouette=True, role="emitter")
 declare_effects(
     NLOSCaptureMeter, {"sensor_origin": _PLACE, "points": _PLACE, "laser_points": _LASER, "laser_origin": _LASER}
 )

@@ -136,7 +136,7 @@ _LENGTH_STEP = 0.01
 # By the last name of a key: the size of a change in its entries that is worth 1.
 _SIZES = {
     "vertex_positions": 1.0, "vertex_normals": 0.2, "vertex_texcoords": 0.05, "control_points": 0.5,
-    "principal_point_offset_x": 0.5, "principal_point_offset_y": 0.5,
+    "principal_point_offset_x": 0.5, "principal_point_offset_y": 0.5, "points": 1.0, "laser_points": 1.0,
 }  # fmt: skip
 
 
@@ -148,7 +148,7 @@ _PIVOT = np.array([0.7, -0.5, 0.4])
 _FIXED_AXES = ("SDFGrid.to_world",)
 # Numbers that may be negative; of all others zero is the least.
 _SIGNED = ("g", "theta", "delta", "scale_tilt", *_SIZES)
-_PLACES = ("position", "sun_direction")
+_PLACES = ("position", "sun_direction", "sensor_origin", "laser_origin")
 # Shares, of which one is the largest.
 _SHARES = ("opacity", "weight")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.testing.gradient_sweep import bsdfs, lights, media, shapes, textures
+from torchtransient.testing.gradient_sweep import bsdfs, lights, media, scans, shapes, textures
 from torchtransient.testing.gradient_sweep.shapes import Maker
 from torchtransient.testing.gradient_sweep.stages import (
     Description,
@@ -275,6 +275,12 @@ def _fog(kind: str, sigma_t: Description, albedo: Description, phase: Descriptio
     return lambda _: filled(media.medium(kind, sigma_t, albedo, phase))
 
 
+def scan_settings() -> Iterator[Setting]:
+    """Captures around a corner: of every type, and of what light does there."""
+    for one in scans.captures():
+        yield Setting("scan", one.kind, one.words, lambda _, c=one: c.make(), one.keys, one.variant, one.without)
+
+
 def all_settings() -> list[Setting]:
     """The whole sweep."""
     return [
@@ -284,4 +290,5 @@ def all_settings() -> list[Setting]:
         *sensor_settings(),
         *texture_settings(),
         *medium_settings(),
+        *scan_settings(),
     ]

@@ -1,7 +1,7 @@
 """The scenes of the sweep: where a plugin stands so that its parameters matter and no silhouette moves.
 
 Plain data, lengths in metres. What could move is wider than the view, and nothing that has an edge in view hides
-something else.
+something else. Captures around a corner, whose outlines may move, are in :mod:`.scans`.
 """
 
 from __future__ import annotations
