@@ -52,4 +52,3 @@ def _why(integrator: Any, scene: Any, contents: Any, choice: str) -> str:
     if reason is None and wall_lights_itself(contents.sensor):
         reason = "the wall is not flat, and points of it that see each other from nearby weigh without bound"
     return f", since {reason}"
-
