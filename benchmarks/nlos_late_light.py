@@ -1,8 +1,8 @@
 """Light of four to six bounces of a confocal scan: chains that scan points share against paths, variance x time.
 
 Variance is that between renders of other seeds, which shared numbers cannot flatter: summed over the bins of every scan
-point, and over the bins of the sum of all scan points, which is what a reconstruction sees of noise that points have in
-common. Scenes: plates in a V with a small one before them, and a body of ellipsoids that touch; scans of one metre.
+point, and over the bins of the sum of all scan points, which is what a reconstruction sees of noise that points have
+in common. Scenes: plates in a V with a small one before them, and a body of ellipsoids that touch; scans of one metre.
 Time is that of whole renders, tables included.
 """
 

@@ -139,10 +139,10 @@ def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
     # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
-    # likelihoods are those of the sensors; captures are records with axes.
+    # likelihoods are those of the sensors; captures are records with axes; simulated ones have files.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"),
+        ("capture", "tensor_record"), ("nlos", "data"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 
@@ -242,7 +242,7 @@ def test_every_package_has_a_level():
         ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
         ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
         ("render", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("nlos", "from torchtransient.data import result_file", "imports 'data'"),
+        ("data", "from torchtransient.nlos import scene", "imports 'nlos'"),
         ("toolbox", "import os", "has no level"),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.data import result_file
+from torchtransient.data import array_file
 from torchtransient.data.result_file import check_target, read_result, write_result
 from torchtransient.errors import StorageError
 from torchtransient.render.output import RenderOutput, RenderStats
@@ -51,7 +51,7 @@ def phasors(leading=()):
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("leading", [(), (2,)])
 def test_round_trip_of_phasors(tmp_path, monkeypatch, ending, leading):
-    monkeypatch.setattr(result_file, "_PART_BYTES", 100)
+    monkeypatch.setattr(array_file, "_PART_BYTES", 100)
     made = phasors(leading)
     back = read_result(write_result(tmp_path / f"a.{ending}", made, {"scene": "box.xml"}))
     assert back.phasor.dtype == torch.complex64 and torch.equal(back.phasor, made.phasor)
@@ -70,7 +70,7 @@ def test_a_phasor_file_that_does_not_fit_together(tmp_path):
 
 
 def test_a_cube_written_in_many_parts(tmp_path, monkeypatch):
-    monkeypatch.setattr(result_file, "_PART_BYTES", 100)
+    monkeypatch.setattr(array_file, "_PART_BYTES", 100)
     made = output((2,))
     assert torch.equal(read_result(write_result(tmp_path / "a.h5", made)).transient, made.transient)
 

@@ -37,11 +37,19 @@ HIDDEN = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-@pytest.mark.parametrize("hidden", HIDDEN)
+QUICK = {("a corner", "confocal"), ("a ball before a plane", "single"), ("plastic", "confocal")}
+MATRIX = [
+    pytest.param(hidden, kind, marks=[] if (hidden, kind) in QUICK else [pytest.mark.slow])
+    for hidden in HIDDEN
+    for kind in ("confocal", "single")
+]
+
+
+@pytest.mark.parametrize(("hidden", "kind"), MATRIX)
 def test_hidden_geometry_sampling_is_unbiased(hidden, kind):
     """Paths that draw points over the hidden area, against paths that follow the BSDFs alone."""
-    guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, third_bounce="paths"), 1024, 8)
+    paths = {"third_bounce": "paths", "late_light": "paths"}
+    guided = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, **paths), 1024, 8)
     brute = captures(scan_scene(HIDDEN[hidden](), kind, max_depth=5, nlos_hidden_geometry_sampling=False), 4096, 8)
     agree(guided, brute, 0.02)
 
@@ -267,13 +275,37 @@ def test_wrong_parameters(name):
         captures(scan_scene({"a": plane()}, film=film(), **settings), 4, 1)
 
 
-def test_what_cannot_be_shared_says_why():
-    for hidden, words in (
-        ({"a": plane() | {"bsdf": {"type": "conductor"}}}, "diffuse"),
-        ({"a": plane(), "c": {"type": "bsplinecurve", "control_points": []}}, ""),
-    )[:1]:
-        with pytest.raises(SceneError, match=words):
-            captures(scan_scene(hidden, third_bounce="shared"), 4, 1)
+FOG = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+INSTANCE = {
+    "group": {"type": "shapegroup", "inner": {"type": "rectangle"}},
+    "copy": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
+}
+HALF = {"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}
+LATE = {"type": "delayed", "lifetime": 0.3, "b": {"type": "diffuse"}}
+NOT_SHARED = {
+    "metal": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "conductor"}}}, "not all surfaces are diffuse"),
+    "glass": (lambda: {"b": plane(0.8, 0.3) | {"bsdf": {"type": "thindielectric"}}}, "not all surfaces are diffuse"),
+    "a mask": (lambda: {"b": plane() | {"bsdf": HALF}}, "mixtures"),
+    "fog": (lambda: {"b": FOG}, "media"),
+    "instances": (lambda: INSTANCE, "cannot be drawn on copy"),
+    "delays": (lambda: {"b": plane() | {"bsdf": LATE}}, "late"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NOT_SHARED)
+def test_what_cannot_be_shared_says_why(name):
+    """It is an error where it was asked for, and otherwise comes from paths."""
+    make, words = NOT_SHARED[name]
+    with pytest.raises(SceneError, match=words):
+        captures(scan_scene({"a": plane()} | make(), third_bounce="shared"), 4, 1)
+    assert captures(scan_scene({"a": plane()} | make()), 64, 1).sum() > 0
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_variants_that_cannot_be_shared(variant):
+    mi.set_variant(variant)
+    with pytest.raises(SceneError, match=variant):
+        captures(scan_scene({"a": plane()}, third_bounce="shared"), 4, 1)
 
 
 def test_a_beam_is_seen_by_its_own_integrator_alone():

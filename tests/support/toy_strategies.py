@@ -100,7 +100,7 @@ class AreaOfShape(Guide):
         self.per_area = 1 / self.shape.surface_area()
 
     def draw(self, world, vertex, u):
-        return self.shape.sample_position(0.0, u).p
+        return self.shape.sample_position(0.0, u).p, mi.ShapePtr(self.shape), None
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))

@@ -24,6 +24,7 @@ COMMANDS = {
     "render": "Render a scene file to HDF5 or npz, with pictures and video.",
     "video": "Write the light in flight of a result as .mp4 or .gif.",
     "picture": "Draw a result: peak time, rainbow, streak, frames, polarization, ...",
+    "nlos": "Simulate a capture around a corner, going on where it was stopped.",
     "cost": "Measure what accuracy costs in time on a scene.",
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }

@@ -13,30 +13,24 @@ needed.
 from __future__ import annotations
 
 import json
-import os
-import secrets
-import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.data import array_file
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.errors import StorageError
 from torchtransient.gates import Gate
 from torchtransient.render.films.choices import of_entries, of_output
 from torchtransient.render.output import RenderOutput, named_fields
 from torchtransient.tensor_record import TensorRecord
 
 FORMAT = "torchtransient result 1"
-_HDF5 = (".h5", ".hdf5")
-_ENDINGS = (*_HDF5, ".npz")
-_PART_BYTES = 2**26
+_WHAT = "result file"
 
 
 @dataclass(frozen=True, repr=False)
@@ -71,24 +65,12 @@ class Result(TensorRecord):
 
 def check_target(path: str | Path) -> Path:
     """Return `path`, or raise StorageError when a result could not be written there. For before a long render."""
-    target = Path(path)
-    if target.suffix.lower() not in _ENDINGS:
-        raise StorageError(f"result file: expected a name that ends in {', '.join(_ENDINGS)}, got '{target}'.")
-    check_folder(target)
-    if target.suffix.lower() in _HDF5:
-        _h5py()
-    return target
+    return array_file.check_target(path, _WHAT)
 
 
 def check_folder(path: str | Path) -> None:
     """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
-    target = Path(path)
-    folder = target.parent
-    if not folder.is_dir():
-        raise StorageError(f"result file: the folder '{folder}' does not exist. Create it first.")
-    if target.is_dir() or not os.access(folder, os.W_OK):
-        what = "is a folder" if target.is_dir() else f"cannot be written: no permission in '{folder}'"
-        raise StorageError(f"result file: '{target}' {what}. Choose another place.")
+    array_file.check_folder(path, _WHAT)
 
 
 def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
@@ -118,21 +100,9 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
     entries: dict[str, Any] = {
         "format": FORMAT, **film.numbers(), "channels": json.dumps(output.channels), "metadata": note,
     }  # fmt: skip
-    arrays = {"steady": _array(output.steady), film.measures: _array(tensor), **film.arrays()}
-    with _replacing(target) as unfinished:
-        if target.suffix.lower() in _HDF5:
-            _write_hdf5(unfinished, arrays, entries)
-        else:
-            with unfinished.open("wb") as file:
-                # numpy writes arrays that are not contiguous through a small buffer
-                everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in entries.items()}}
-                np.savez(file, **everything)
+    arrays = {"steady": array_of(output.steady, _WHAT), film.measures: array_of(tensor, _WHAT), **film.arrays()}
+    write_arrays(target, arrays, entries, _WHAT)
     return target
-
-
-def _array(tensor: torch.Tensor) -> NDArray[Any]:
-    array: NDArray[Any] = tensor.detach().resolve_conj().cpu().numpy()
-    return array
 
 
 def read_result(path: str | Path) -> Result:
@@ -140,24 +110,9 @@ def read_result(path: str | Path) -> Result:
 
     Raises StorageError when the file is missing, damaged or not a result.
     """
-    source = Path(path)
-    if source.suffix.lower() not in _ENDINGS:
-        raise StorageError(f"result file: expected a name that ends in {', '.join(_ENDINGS)}, got '{source}'.")
-    if not source.is_file():
-        raise StorageError(f"result file: '{source}' does not exist.")
-    try:
-        values = _read_hdf5(source) if source.suffix.lower() in _HDF5 else _read_npz(source)
-        form = str(values["format"])
-        if form != FORMAT:
-            raise StorageError(f"result file: '{source}' is of format '{form}'; this version reads '{FORMAT}'.")
-        result = _result(values, source)
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, TorchTransientError):
-            raise
-        raise StorageError(
-            f"result file: '{source}' is not a result of torchtransient, or is damaged: {error}."
-        ) from error
-    return result
+    values = read_arrays(path, FORMAT, _WHAT)
+    with damage_said(Path(path), _WHAT):
+        return _result(values, Path(path))
 
 
 def _result(values: Mapping[str, Any], source: Path) -> Result:
@@ -172,58 +127,3 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
             f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
         )
     return Result(steady=steady, metadata=metadata, channels=channels, **named_fields(film, response))
-
-
-@contextmanager
-def _replacing(target: Path) -> Iterator[Path]:
-    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails."""
-    unfinished = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
-    try:
-        yield unfinished
-        unfinished.replace(target)
-    except OSError as error:
-        raise StorageError(f"result file: '{target}' could not be written: {error}.") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any]) -> None:
-    with _h5py().File(path, "w") as file:
-        for name, value in entries.items():
-            file.attrs[name] = value
-        for name, array in arrays.items():
-            dataset = file.create_dataset(name, shape=array.shape, dtype=array.dtype)
-            for part in _parts(array):
-                dataset[part] = array[part]
-
-
-def _parts(array: NDArray[Any]) -> Iterator[Any]:
-    """Indices of rows of an image: the film keeps H first, so they are read in order, and only they are copied."""
-    if array.ndim < 2:
-        yield ...
-        return
-    rows = array.shape[-2]
-    step = max(1, _PART_BYTES * rows // max(1, array.nbytes))
-    for row in range(0, rows, step):
-        yield ..., slice(row, row + step), slice(None)
-
-
-def _read_hdf5(path: Path) -> dict[str, Any]:
-    with _h5py().File(path, "r") as file:
-        return {**{name: file[name][()] for name in file if name != "edges_opl"}, **dict(file.attrs)}
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise StorageError(
-            "result file: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
-            "or choose a name that ends in .npz."
-        ) from error
-    return h5py

@@ -1,77 +1,264 @@
-"""The part file of a simulation: finished tiles on disk, and which they are.
+"""The part file of a simulation: what is finished, on disk.
 
-Two files: ``NAME.npy``, NumPy's own format with the sensor points first, and ``NAME`` itself, JSON that says whose the
-numbers are and which tiles are finished. A tile is written first and named afterwards, and the JSON replaces the one
-before in one step, so that a kill at any moment loses the tile in progress and nothing else.
+Three files: ``NAME``, JSON that says which simulation it is and which of its rows are finished; ``NAME.npy``, the rows
+in NumPy's own format; ``NAME.lock``, held while a process works on it. Rows are written first and named afterwards,
+with a checksum, and the JSON replaces the one before in one step: a kill at any moment, or a full disk, loses what was
+in progress and nothing else.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import zlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
 
-FORMAT = "torchtransient part 1"
+FORMAT = "torchtransient part 2"
+Rows = NDArray[np.float32]
 
 
 class PartFile:
-    """The finished tiles of the simulation that ``key`` stands for; ``points``: how many sensor points it has.
+    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with``
+    block, which holds the lock.
 
-    Raises StorageError where ``path`` is something else, or belongs to another simulation.
+    ``about``: plain data that was kept with them, empty at first. Raises StorageError where ``path`` is something else,
+    belongs to another simulation, is damaged, or is worked on by another process.
     """
 
-    def __init__(self, path: Path, key: str, points: int) -> None:
-        self._path, self._key, self._points = path, key, points
+    def __init__(self, path: Path, key: str) -> None:
+        self.path, self._key = path, key
         self._data = path.with_name(path.name + ".npy")
-        self._done: list[int] = []
-        self.cube: Any = None
-        if path.exists():
-            self._read()
+        self._lock = _Lock(path.with_name(path.name + ".lock"))
+        self._done: dict[int, list[int]] = {}
+        self._file: IO[bytes] | None = None
+        self._shape: tuple[int, int] = (0, 0)
+        self.about: dict[str, Any] = {}
+        self.seconds = 0.0
+
+    def __enter__(self) -> PartFile:
+        if not self.path.parent.is_dir():
+            raise StorageError(f"part file: the folder '{self.path.parent}' does not exist. Create it first.")
+        self._lock.take()
+        try:
+            if self.path.exists():
+                self._read()
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+        self._lock.release()
+
+    # -------------------------------------------------------------------------------------------------------- reading
 
     def _read(self) -> None:
         try:
-            said = json.loads(self._path.read_text(encoding="utf-8"))
-            fits = said["format"] == FORMAT
-            done = [int(n) for n in said["done"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise StorageError(f"{self._path}: expected a part file of a simulation ({FORMAT}), got another.") from error
-        if not fits or said.get("key") != self._key:
+            said = json.loads(self.path.read_text(encoding="utf-8"))
+            done = {int(number): [int(n) for n in entry] for number, entry in said["done"].items()}
+            form, key, about = said["format"], said["key"], dict(said["about"])
+            rows, columns = (int(n) for n in said["shape"])
+            seconds = float(said["seconds"])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise StorageError(
-                f"{self._path}: belongs to another simulation (another scene, scan, axis, spp or seed). Give another "
-                "part=, or delete it to start anew."
-            )
-        if not done:
+                f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: {error!r}. "
+                "Give another name, or delete it to start anew."
+            ) from error
+        if form == FORMAT and not self._key:
             return
+        if form != FORMAT or key != self._key:
+            raise StorageError(
+                f"part file: '{self.path}' belongs to another simulation: another scene, scan, axis, spp, seed or "
+                "number of tiles. Give another name, or delete it to start anew."
+            )
+        self._done, self._shape, self.about, self.seconds = done, (rows, columns), about, seconds
+        with self._errors_said():
+            self._file = self._data.open("r+b")
+            self._check()
+
+    def _check(self) -> None:
+        """Raise StorageError unless the rows are those that were written."""
+        for first, count, checksum in self._done.values():
+            if zlib.crc32(self._bytes(first, count)) != checksum:
+                raise StorageError(
+                    f"part file: '{self._data}' is damaged or cut off: rows {first} to {first + count - 1} are not "
+                    f"those that '{self.path}' tells of. Delete both to start anew."
+                )
+
+    def has(self, number: int) -> bool:
+        """Whether the part of that number is finished."""
+        return number in self._done
+
+    @property
+    def last(self) -> int | None:
+        """The highest number that is finished, None without one."""
+        return max(self._done, default=None)
+
+    def rows(self, first: int, count: int) -> Rows:
+        """Some rows, (count, columns)."""
+        with self._errors_said():
+            found = np.frombuffer(self._bytes(first, count), dtype=np.float32)
+            return found.reshape(count, self._shape[1]).copy()
+
+    def everything(self) -> Rows:
+        """All rows, read into memory."""
+        with self._errors_said():
+            return np.load(self._data, mmap_mode=None, allow_pickle=False)  # type: ignore[no-any-return]
+
+    def _bytes(self, first: int, count: int) -> bytes:
+        assert self._file is not None
+        size = 4 * self._shape[1]
+        self._file.seek(self._start() + first * size)
+        return self._file.read(count * size)
+
+    # -------------------------------------------------------------------------------------------------------- writing
+
+    def keep(
+        self, number: int, first: int, rows: Rows, *, total: int, seconds: float, about: Mapping[str, Any],
+        instead_of: int | None = None,
+    ) -> None:  # fmt: skip
+        """Keep the part of a number: its ``rows`` (N, columns), from row ``first`` of ``total``, that took ``seconds``.
+
+        ``instead_of``: the number of a part that it takes the place of. Raises StorageError for a full disk, which
+        leaves what was finished before.
+        """
+        with self._errors_said():
+            if self._file is None:
+                self._create(total, rows.shape[1])
+            assert self._file is not None
+            data = np.ascontiguousarray(rows, dtype=np.float32).tobytes()
+            self._file.seek(self._start() + first * 4 * self._shape[1])
+            self._file.write(data)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            done = {n: entry for n, entry in self._done.items() if n != instead_of}
+            done[number] = [first, len(rows), zlib.crc32(data)]
+            self._say(done, self.seconds + seconds, about)
+            self._done, self.seconds, self.about = done, self.seconds + seconds, dict(about)
+
+    def _create(self, total: int, columns: int) -> None:
+        self._shape = (total, columns)
+        self._file = self._data.open("w+b")
+        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False}
+        np.lib.format.write_array_header_1_0(self._file, header | {"shape": self._shape})
+        self._file.truncate(self._start() + 4 * total * columns)
+
+    def _start(self) -> int:
+        """Where the first row lies: behind the header, whose length it says itself."""
+        assert self._file is not None
+        self._file.seek(8)
+        return 10 + int.from_bytes(self._file.read(2), "little")
+
+    def _say(self, done: Mapping[int, list[int]], seconds: float, about: Mapping[str, Any]) -> None:
+        said = {
+            "format": FORMAT, "key": self._key, "shape": self._shape, "done": done, "seconds": seconds,
+            "about": dict(about),
+        }  # fmt: skip
+        fresh = self.path.with_name(self.path.name + ".new")
         try:
-            self.cube = np.lib.format.open_memmap(self._data, mode="r+")
-        except (OSError, ValueError) as error:
-            raise StorageError(f"{self._data}: expected the numbers of {self._path}, could not read them.") from error
-        self._done = done
-
-    def has(self, tile: int) -> bool:
-        """Whether a tile is finished."""
-        return tile in self._done
-
-    def write(self, tile: int, first: int, values: np.ndarray) -> None:
-        """Keep a tile whose sensor points start at ``first``."""
-        if self.cube is None:
-            shape = (self._points, *values.shape[1:])
-            self.cube = np.lib.format.open_memmap(self._data, mode="w+", dtype=values.dtype, shape=shape)
-        self.cube[first : first + len(values)] = values
-        self.cube.flush()
-        self._done.append(tile)
-        said = {"format": FORMAT, "key": self._key, "done": self._done}
-        fresh = self._path.with_name(self._path.name + ".new")
-        fresh.write_text(json.dumps(said), encoding="utf-8")
-        os.replace(fresh, self._path)
+            with fresh.open("w", encoding="utf-8") as file:
+                json.dump(said, file)
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self.path)
+        finally:
+            fresh.unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Delete both files."""
-        self.cube = None
-        for path in (self._path, self._data):
+        """Delete the files; the lock goes at the end of the ``with`` block."""
+        self._close()
+        self._done = {}
+        for path in (self.path, self._data):
             path.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        if self._file is not None:
+            # What a full disk has left in the buffer was not finished.
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    @contextlib.contextmanager
+    def _errors_said(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            if isinstance(error, StorageError):
+                raise
+            raise StorageError(
+                f"part file: '{self.path}' and '{self._data.name}' could not be read or written: {error}. What was "
+                "finished before is kept: with room on the disk the same call goes on."
+            ) from error
+
+
+def delete_part_file(path: Path) -> None:
+    """Delete the files of a simulation's parts, if there are any.
+
+    Raises StorageError for a file that is something else, or is worked on by another process.
+    """
+    if not path.exists():
+        return
+    with PartFile(path, "") as kept:
+        kept.remove()
+
+
+class _Lock:
+    """A file that one process at a time holds; the system lets go of it when the process ends, however it does."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._file = path, None  # type: Path, IO[str] | None
+
+    def take(self) -> None:
+        """Raise StorageError where another process holds it."""
+        while True:
+            try:
+                file = self._path.open("a+", encoding="utf-8")
+            except OSError as error:
+                raise StorageError(f"part file: '{self._path}' could not be opened: {error}.") from error
+            try:
+                _hold(file)
+            except OSError as error:
+                file.close()
+                raise StorageError(
+                    f"part file: another process works on '{self._path.with_suffix('')}'. Wait for it, or give another "
+                    "name to each simulation."
+                ) from error
+            # The one that held it before may have deleted it: then it is nobody's any more.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), self._path.stat()):
+                    self._file = file
+                    return
+            file.close()
+
+    def release(self) -> None:
+        """Delete the file, and let go of it."""
+        if self._file is None:
+            return
+        if os.name == "nt":  # which keeps files that are open
+            self._file.close()
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+        self._file.close()
+        self._file = None
+
+
+def _hold(file: IO[str]) -> None:
+    """Raise OSError where another process holds the file."""
+    if os.name == "nt":
+        import msvcrt
+
+        file.seek(0)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
+        import fcntl
+
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)

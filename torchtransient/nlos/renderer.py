@@ -8,13 +8,18 @@ from typing import Any
 import torch
 from torch import nn
 
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
+from torchtransient.nlos.scene_scan import check_scan_is_seen
+from torchtransient.render.build import BuildOptions
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import load
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.variant import active_variant
+from torchtransient.sensing import Device, GradPolicy
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
@@ -29,7 +34,8 @@ class CaptureRenderer(nn.Module):
     ``nn.Parameter`` each, or a mapping to start values; hidden nodes keep their names (``chair.vertex_positions``,
     ``hidden.to_world``, ``hidden.bsdf.reflectance.value``), the wall is ``wall``. ``settings``: those of
     :class:`TransientRenderer`, ``time_axis`` or another film and ``spp`` (paths for each sensor point, or for each pair
-    of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through.
+    of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a
+    device, whose expected answer is taken (``device.sensor(axis, grad=...)`` makes modules with noise).
 
     Where points of the scan require gradients they get them. :meth:`forward` returns a :class:`Capture`.
     """
@@ -40,15 +46,15 @@ class CaptureRenderer(nn.Module):
         scan: Scan,
         parameters: Sequence[str] | Mapping[str, Any] = (),
         *,
-        bounces: Sequence[int] = (3,),
+        bounces: Sequence[int] | str = (3,),
         energy: Any = 1.0,
-        sensor: nn.Module | None = None,
+        sensor: nn.Module | Device | None = None,
         variant: str | None = None,
         **settings: Any,
     ):
         super().__init__()
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
-        self.scan, self.sensor, self.bounces = scan, sensor, tuple(bounces)
+        self.scan, self.bounces = scan, bounces
         self._followed = _attached(scan)
         own = {key: None for key in self._followed if key not in parameters}
         wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
@@ -56,6 +62,10 @@ class CaptureRenderer(nn.Module):
         self.renderer = TransientRenderer(scene, {**wanted, **own}, **settings)
         for key in own:
             self.renderer.values[key].requires_grad_(requires_grad=False)
+        if sensor is not None and self.renderer.axis is None:
+            raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
+        self.sensor = None if sensor is None else as_module(sensor, self.renderer.axis)
+        check_scan(self.renderer.scene, scan, self.renderer._options)
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
@@ -80,6 +90,20 @@ class CaptureRenderer(nn.Module):
         return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
 
 
+def as_module(sensor: nn.Module | Device, axis: TimeAxis | None, grad: GradPolicy = "expected") -> nn.Module:
+    """A sensor as the module that takes transients on ``axis``; ``grad``: what becomes of a device's noise."""
+    return sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
+
+
+def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
+    """Raise SceneError where sensor or laser of a capture's scene look at something else than the points of its scan:
+    a hidden thing in their way, a wall that is elsewhere.
+    """
+    with active_variant(scene.variant):
+        built = scene.built(BuildOptions(transient=True) if options is None else options)
+        check_scan_is_seen(built.scene, scan)
+
+
 def _attached(scan: Scan) -> dict[str, torch.Tensor]:
     """The points of a scan that require gradients, by their keys in the scene."""
     points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin, LASER_ORIGIN: scan.laser_origin}
@@ -93,6 +117,7 @@ def as_capture(
     out: RenderOutput, scan: Scan, sensor: nn.Module | None = None, generator: torch.Generator | None = None
 ) -> Capture:
     """What a render of a capture's scene measured, in the scan's shape; views of its tensors."""
+
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
 
@@ -114,6 +139,12 @@ def as_capture(
     )  # fmt: skip
 
 
+def in_film_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
+    """From the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film."""
+    laser = laser_size(scan) if scan.kind == "exhaustive" else ()
+    return tensor.reshape(*tensor.shape[: tensor.ndim - len(scan.shape)], *laser, *film_size(scan))
+
+
 def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
     """From (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T."""
     film = 4 if scan.kind == "exhaustive" else 2
@@ -125,9 +156,7 @@ def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)
 
 
-def measured(
-    transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None
-) -> torch.Tensor:
+def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
     """What ``sensor`` makes of (..., T, [Lh, Lw,] H, W): each pair is a pixel of its own."""
     if scan.kind == "exhaustive":
         (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)

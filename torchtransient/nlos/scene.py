@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, UnitError
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.scene_handle import load
 from torchtransient.render.variant import active_variant
@@ -18,30 +19,40 @@ from torchtransient.render.variant import active_variant
 # Names of a capture's own nodes: those of hidden things must be others.
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
+ALL_BOUNCES = "all"
 _MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
-_CHAIN = ("sensor", "integrator", "emitter")
+# Plugins of emitters, Mitsuba's and ours.
+_LIGHTS = (
+    "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
+    "envmap", "sunsky", "timed_sunsky",
+)  # fmt: skip
 
 
-def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] = (3,), energy: Any = 1.0) -> dict[str, Any]:
+def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
     ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
     object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
-    numbers of bounces that count, without gaps; 3 is light around one corner. ``energy``: joules of the laser, a number
-    or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor ``wall.sensor``.
+    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the
+    laser, a number or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor
+    ``wall.sensor``.
 
-    Raises SceneError for what is no shape, for names that the capture needs itself, and for a scan without a wall.
+    Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
+    without a wall; UnitError for an energy below zero.
     """
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
             "or Scan.points(..., wall=...)."
         )
+    _check_energy(energy)
     first, last = _range(bounces)
     shapes = hidden_shapes(hidden)
     taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
     if taken:
-        raise SceneError(f"capture: the names {', '.join(taken)} belong to the capture itself; rename the hidden nodes.")
+        raise SceneError(
+            f"capture: the names {', '.join(taken)} belong to the capture itself; rename the hidden nodes."
+        )
     rows, columns = film_size(scan)
     film: dict[str, Any] = {
         "type": "transient_hdr_film", "width": columns, "height": rows, "rfilter": {"type": "box"}, "temporal_bins": 1,
@@ -82,10 +93,18 @@ def hidden_shapes(hidden: Any) -> dict[str, Any]:
     """Hidden things as a dictionary of Mitsuba shapes (and what they refer to) by name."""
     if isinstance(hidden, (str, Path)):
         plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
+        if Path(hidden).suffix.lower() == ".xml":
+            raise SceneError(
+                f"hidden: {str(hidden)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it "
+                "as it is: tt.nlos.simulate(path)."
+            )
         if plugin is None:
             raise SceneError(
-                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got {hidden!r}."
+                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got "
+                f"{str(hidden)!r}."
             )
+        if not Path(hidden).is_file():
+            raise SceneError(f"hidden: no file {str(hidden)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
         return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
     if isinstance(hidden, Mapping):
         if hidden.get("type") == "scene" or "type" not in hidden:
@@ -93,7 +112,7 @@ def hidden_shapes(hidden: Any) -> dict[str, Any]:
             _check_shapes(shapes)
             return shapes
         return {"hidden": dict(hidden)}
-    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:  # noqa: PLR2004 (vertices and faces)
+    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
         return {"hidden": _mesh(*hidden)}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
         return {"hidden": _mesh(hidden.vertices, hidden.faces)}
@@ -128,19 +147,46 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
                 f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
                 "it out, or render a complete scene with tt.TransientRenderer."
             )
+        _check_dark(node, name)
+
+
+def _check_dark(node: Mapping[str, Any], where: str) -> None:
+    """Raise SceneError for light among hidden things."""
+    if str(node.get("type")) in _LIGHTS:
+        raise SceneError(
+            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone: the one light of a capture is the "
+            "laser. Leave it out, or render a complete scene with tt.TransientRenderer."
+        )
+    for name, part in node.items():
+        if isinstance(part, Mapping):
+            _check_dark(part, f"{where}.{name}")
+
+
+def _check_energy(energy: Any) -> None:
+    """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
+    if isinstance(energy, Mapping):
+        return
+    if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
+        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {energy!r}.")
+    if not (math.isfinite(energy) and energy >= 0):
+        raise UnitError(f"energy: expected joules of at least 0, got {energy!r}.")
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
     return {"type": "mesh_arrays", "vertices": _numbers(vertices), "faces": _numbers(faces)}
 
 
-def _range(bounces: Sequence[int]) -> tuple[int, int]:
-    numbers = sorted(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in numbers)  # noqa: PLR2004
-    if not numbers or not whole or list(numbers) != list(range(numbers[0], numbers[0] + len(numbers))):
+def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
+    """The first and the last number that counts; -1 for no limit."""
+    if isinstance(bounces, str) and bounces == ALL_BOUNCES:
+        return 0, -1
+    given: list[Any] = list(bounces) if isinstance(bounces, (tuple, list, range)) else [bounces]
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 2 for n in given)
+    numbers = sorted(given) if whole else []
+    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise SceneError(
-            f"bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), got {bounces!r}. "
-            "The laser's spot is the first bounce, so light around one corner has 3."
+            "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
+            f"got {bounces!r}. The laser's spot is the first bounce, so light around one corner has 3."
         )
     return int(numbers[0]), int(numbers[-1])
 
@@ -151,9 +197,9 @@ def _numbers(values: Any) -> np.ndarray:
     return np.asarray(values, dtype=np.float64)
 
 
-def hidden_bounds(hidden: Any) -> np.ndarray:
+def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
     """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
-    scene = load({"type": "scene", **hidden_shapes(hidden)})
+    scene = load({"type": "scene", **hidden_shapes(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()
         return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)

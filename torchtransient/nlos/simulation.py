@@ -1,16 +1,18 @@
 """``tt.nlos.simulate``: a capture with a bar, told of memory and time before, and with a file that keeps what is done.
 
-With a part file the sensor points are rendered in tiles. A tile is in the file whole or not at all, so that a simulation
-that was killed goes on where it was, and ends with the bits that it would have had.
+With a part file, a scan of hidden things is rendered in tiles of sensor points, and a complete scene in passes over all
+of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was, and ends
+with the bits that it would have had.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
+import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,196 +23,274 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
+from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
-from torchtransient.nlos.renderer import POINTS, CaptureRenderer, measured
-from torchtransient.nlos.scene import hidden_bounds
+from torchtransient.nlos.point_rows import RowLayout, Rows
+from torchtransient.nlos.renderer import as_module, in_film_shape, in_scan_shape, measured
+from torchtransient.nlos.scene import capture_scene, hidden_bounds
+from torchtransient.nlos.variant_choice import choose_variant
+from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, checked_count, seed_of
+from torchtransient.render.arguments import samples
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.variant import active_variant
+from torchtransient.sensing import Device
 from torchtransient.units import seconds_to_opl
 
-# Tiles of a simulation with a part file: that many are lost by a kill at most.
-TILES = 16
+# Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
+# all laser spots anew: 16 of them take three times as long as one, 4 a quarter more (256 x 256 pairs).
+PARTS, EXHAUSTIVE_PARTS = 16, 4
 BIN_WIDTH_S = 16e-12
-# Share of the paths that the time is estimated by.
-PILOT_SHARE = 64
+DEFAULT_SPP = 4096
+THIRD = (3,)
 
 
 def simulate(
     hidden: Any,
-    scan: Scan,
+    scan: Scan | None = None,
     *,
     time_axis: TimeAxis | None = None,
     frequencies: FrequencyAxis | Sequence[float] | None = None,
-    spp: int = 4096,
-    bounces: Sequence[int] = (3,),
-    energy: Any = 1.0,
-    sensor: torch.nn.Module | None = None,
+    spp: int | None = None,
+    bounces: Sequence[int] | str | None = None,
+    energy: Any = None,
+    sensor: torch.nn.Module | Device | None = None,
     seed: int = 0,
     variant: str | None = None,
     part: str | Path | None = None,
     tiles: int | None = None,
+    keep_part: bool = False,
     progress: bool = True,
     generator: torch.Generator | None = None,
 ) -> Capture:
     """What a scan measures of hidden things: a :class:`Capture`, without gradients (see :class:`CaptureRenderer`).
 
-    ``hidden``, ``bounces``, ``energy``: as in :func:`~torchtransient.nlos.scene.capture_scene`. ``time_axis`` or
-    ``frequencies``: what is measured; without them bins of 16 ps that hold all light of three bounces. ``spp``: paths
-    for each sensor point, or for each pair of an exhaustive scan. ``sensor``: a module of ``tt.sensing`` that the
-    transient goes through at last, with the noise of ``generator``. ``seed``: same seed and tiles, same capture.
-    ``part``: name of a file that keeps finished tiles (16, or ``tiles``): with it a simulation that was killed goes on
-    when it is called again. It is deleted at the end, when the capture is returned. ``progress``: say memory and time
-    before it starts, and show a bar.
+    ``hidden``, ``bounces`` ((3,)), ``energy`` (1 joule): as in :func:`~torchtransient.nlos.scene.capture_scene`.
+    ``time_axis`` or ``frequencies``: what is measured; without them bins of 16 ps that hold all light of three bounces.
+    ``spp``: paths for each sensor point, or for each pair of an exhaustive scan (4096).
 
-    Raises SceneError, ShapeError; StorageError where the capture does not fit into memory, or the part file belongs to
-    another simulation.
+    Without a ``scan``, ``hidden`` is a complete scene (what :func:`tt.load` takes) with the integrator
+    ``transient_nlos_path``, a laser, a sensor of any kind and a film with its bins. The scan is read off the scene:
+    points are where the rays of pixel centres end. ``bounces`` and ``energy`` stand in the scene then; ``spp`` and what
+    is measured may.
+
+    ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
+    ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
+    ``generator`` (devices draw their counts); its answer has the same bins.
+    ``seed``: same seed and parts, same capture.
+
+    ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
+    that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
+    ``progress``: say memory and time before it starts, and show a bar.
+
+    ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
+    light was found), ``parts``.
+
+    Raises SceneError, ShapeError, UnitError and VariantError for what cannot be simulated; StorageError where the
+    capture does not fit into memory or the disk is full, and for a part file that belongs to another simulation, is
+    damaged, or is worked on by another process.
     """
-    if time_axis is not None and frequencies is not None:
-        raise SceneError("simulate: expected time_axis or frequencies, got both.")
-    if time_axis is None and frequencies is None:
-        time_axis = scan.detach().default_axis(hidden_bounds(hidden), seconds_to_opl(BIN_WIDTH_S))
-    count = _tile_count(tiles, part, scan)
-    film = {"time_axis": time_axis, "frequencies": frequencies, "spp": spp}
-    recipe = {"bounces": bounces, "energy": energy, "variant": variant, **film}
-    if count == 1:
-        renderer = CaptureRenderer(hidden, scan.detach(), sensor=sensor, **recipe)
+    path = None if part is None else Path(part)
+    work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
+    checked_count("seed", seed, 0)
+    if sensor is not None and work.axes()[0] is None:
+        raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
+    with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
+        finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
+        forecast = forecast_of(work, timed=progress and not finished)
         if progress:
-            _say(renderer, scan, spp, 1)
-        with torch.no_grad():
-            return renderer(seed=seed, progress=progress, generator=generator)
-    return _in_tiles(hidden, scan.detach(), recipe, _Tiles(count, seed, part, progress), sensor, generator)
+            print(forecast, file=sys.stderr)
+        whole = kept is None and work.count == 1
+        capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
+        if sensor is not None:
+            # Counts as they are drawn: nothing of a simulation has gradients.
+            chain = as_module(sensor, capture.axis, "straight_through")
+            capture = replace(capture, transient=_through(capture.transient, capture.scan, chain, generator))
+        if kept is not None and not keep_part:
+            kept.remove()
+    return replace(capture, metadata=_metadata(work, forecast, seed, seconds))
 
 
-class _Tiles:
-    """How many tiles, of which seed, kept where."""
-
-    def __init__(self, count: int, seed: int, part: str | Path | None, progress: bool) -> None:
-        self.count, self.seed, self.part, self.progress = count, seed, part, progress
-
-    def ranges(self, points: int) -> list[tuple[int, int]]:
-        """First and last sensor point of each, of equal sizes but for the last: a size is a scene to be built."""
-        size = -(-points // self.count)
-        return [(first, min(first + size, points)) for first in range(0, points, size)]
-
-    def seed_of(self, number: int) -> int:
-        """The seed of a tile."""
-        return int.from_bytes(hashlib.sha256(f"{self.seed}:{number}".encode()).digest()[:4], "little")
-
-
-def _in_tiles(
+def forecast(
     hidden: Any,
-    scan: Scan,
-    recipe: dict[str, Any],
-    tiles: _Tiles,
-    sensor: torch.nn.Module | None,
-    generator: torch.Generator | None,
-) -> Capture:
+    scan: Scan | None = None,
+    *,
+    part: str | Path | None = None,
+    tiles: int | None = None,
+    variant: str | None = None,
+    **settings: Any,
+) -> Forecast:
+    """What :func:`simulate` would take with the same arguments: memory, time, variant, how light is found. Errors as
+    there.
+    """
+    given = {name: settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")}
+    unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
+    if unknown:
+        raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
+    of_light = given.pop("bounces"), given.pop("energy")
+    path = None if part is None else Path(part)
+    work = _work(hidden, scan, *given.values(), of_light, variant, _parts(scan, path, tiles))
+    with active_variant(work.variant.name):
+        return forecast_of(work, timed=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------- work
+
+
+def _work(
+    hidden: Any, scan: Scan | None, time_axis: Any, frequencies: Any, spp: Any, of_light: tuple[Any, Any],
+    variant: str | None, parts: int,
+) -> Work:  # fmt: skip
+    if time_axis is not None and frequencies is not None:
+        raise SceneError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
+    samples("spp", spp)
+    if scan is None:
+        return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
+    if not isinstance(scan, Scan):
+        raise SceneError(f"simulate: expected scan as a tt.nlos.Scan, got {type(scan).__name__}.")
+    if isinstance(hidden, Scene):
+        raise SceneError(
+            "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
+            "simulate the scene as it is, or give shapes by name."
+        )
+    bounces, energy = of_light
+    settings = {"bounces": THIRD if bounces is None else bounces, "energy": 1.0 if energy is None else energy}
+    chosen = choose_variant(load(capture_scene(hidden, scan.detach(), **settings)), variant)
+    if time_axis is None and frequencies is None:
+        with active_variant(chosen.name):
+            bounds = hidden_bounds(hidden, chosen.name)
+        time_axis = scan.detach().default_axis(bounds, seconds_to_opl(BIN_WIDTH_S))
+    film = Film(time_axis, frequencies, DEFAULT_SPP if spp is None else spp)
+    return HiddenWork(hidden, scan, settings, film, chosen, parts)
+
+
+def _scene_work(
+    scene: Any, time_axis: Any, frequencies: Any, spp: Any, of_light: tuple[Any, Any], variant: str | None, parts: int
+) -> SceneWork:
+    for name, value, where in zip(
+        ("bounces", "energy"), of_light, ("its integrator's max_depth and filter_bounces", "its laser"), strict=True
+    ):
+        if value is not None:
+            raise SceneError(
+                f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out, or give scan= and "
+                "hidden shapes."
+            )
+    if isinstance(scene, Mapping) and not _is_complete(scene):
+        raise SceneError(
+            "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "
+            f"{', '.join(map(str, scene)) or 'nothing'} and no scan. Make one with tt.nlos.Scan.grid(wall, ...)."
+        )
+    if not isinstance(scene, str | os.PathLike | Mapping | Scene):
+        raise SceneError(
+            f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
+        )
+    loaded = load(scene)
+    given = variant
+    if given is None and isinstance(scene, Scene):
+        given = scene._requested_variant
+    chosen = choose_variant(loaded, given)
+    return SceneWork(load(loaded, variant=chosen.name), time_axis, frequencies, spp, chosen, parts)
+
+
+def _is_complete(scene: Mapping[str, Any]) -> bool:
+    """Whether a dictionary has an integrator: hidden things have none."""
+    kinds = [str(node.get("type", "")) for node in scene.values() if isinstance(node, Mapping)]
+    return any("path" in kind for kind in kinds) or "integrator" in scene
+
+
+def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
+    if tiles is None:
+        many = EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else PARTS
+        return 1 if part is None else many
+    return checked_count("tiles", tiles)
+
+
+# ------------------------------------------------------------------------------------------------------------- renders
+
+
+def _whole(work: Work, seed: int, progress: bool) -> tuple[Capture, float]:
+    began = time.perf_counter()
+    return work.render(0, seed, progress=progress), time.perf_counter() - began
+
+
+@contextmanager
+def _part_file(path: Path | None, work: Work, seed: int) -> Iterator[PartFile | None]:
+    if path is None:
+        yield None
+        return
+    with PartFile(path, work.key(seed)) as kept:
+        yield kept
+
+
+def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> tuple[Capture, float]:
+    """All parts that are not there yet, one after another."""
     from tqdm.auto import tqdm
 
-    points = scan.sensor_points.reshape(-1, 3)
-    ranges = tiles.ranges(len(points))
-    key = hashlib.sha256(repr((_digest(hidden), _digest(scan), recipe, tiles.seed, ranges)).encode()).hexdigest()
-    kept = None if tiles.part is None else PartFile(Path(tiles.part), key, len(points))
-    renderers: dict[int, CaptureRenderer] = {}
-    cube, capture = None, None
-    bar = tqdm(total=len(points), desc="capture", unit=" points", disable=not tiles.progress)
-    for number, (first, last) in enumerate(ranges):
-        if kept is None or not kept.has(number):
-            size = last - first
-            listed = _listed(scan, points[first:last])
-            if size not in renderers:
-                renderers[size] = CaptureRenderer(hidden, listed, (POINTS,), **recipe)
-                if tiles.progress and len(renderers) == 1:
-                    _say(renderers[size], scan, recipe["spp"], len(points) / size)
-            with torch.no_grad():
-                capture = renderers[size]({POINTS: points[first:last]}, seed=tiles.seed_of(number))
-            found = _points_first(capture)
+    points, done = math.prod(work.scan.sensor_shape), 0.0
+    layout = None if kept is None or not kept.about else RowLayout.from_plain(kept.about)
+    rows: Rows | None = None  # without a file, or the sum so far
+    with tqdm(total=work.count, desc="capture", unit=" part", disable=not progress) as bar:
+        for number in range(work.count):
+            if kept is not None and _has(kept, work, number):
+                bar.update(1)
+                continue
+            began = time.perf_counter()
+            capture = work.render(number, seed_of(seed, number))
+            layout = layout or RowLayout.of(capture)
+            found = layout.rows(capture)
+            seconds = time.perf_counter() - began
+            done += seconds
+            if work.sums:
+                rows = _sum_so_far(kept, number, points) if rows is None else rows
+                weighed = work.weight(number) * found
+                rows = weighed if rows is None else np.add(rows, weighed, out=rows)
+            elif kept is None:
+                rows = np.empty((points, layout.columns), np.float32) if rows is None else rows
+                rows[slice(*work.run(number))] = found
             if kept is not None:
-                kept.write(number, first, found.numpy())
-            else:
-                cube = torch.empty((len(points), *found.shape[1:]), dtype=found.dtype) if cube is None else cube
-                cube[first:last] = found
-        bar.update(last - first)
-    bar.close()
+                _keep(kept, work, number, rows if work.sums else found, seconds, layout)
+            bar.update(1)
+    assert layout is not None
     if kept is not None:
-        if capture is None:  # all tiles were there: what they are of is told by one of few paths
-            capture = CaptureRenderer(hidden, _listed(scan, points[:1]), **(recipe | {"spp": 1}))(seed=0)
-        cube = torch.from_numpy(np.array(kept.cube))
-    result = _assembled(capture, cube, scan, recipe["spp"])
-    if sensor is not None and result.transient is not None:
-        result = replace(result, transient=_through(result.transient, scan, sensor, generator))
-    if kept is not None:
-        kept.remove()
-    return result
+        rows, done = _everything(kept, work, points), kept.seconds
+    assert rows is not None
+    return Capture(**layout.capture(rows, work.scan, *work.axes()), metadata={}), done
 
 
-def _listed(scan: Scan, points: torch.Tensor) -> Scan:
-    """The scan of some of the sensor points alone."""
-    laser = points if scan.kind == "confocal" else scan.laser_points
-    normals = {"sensor_normals": None, "laser_normals": None}
-    return replace(scan, sensor_points=points, laser_points=laser, **normals)
+# A sum takes turns in two places, so that the one before is whole while the next is written.
+def _slot(number: int, points: int) -> int:
+    return (number % 2) * points
 
 
-def _points_first(capture: Capture) -> torch.Tensor:
-    """The measured tensor of a list of points with these first, in the order of memory."""
-    tensor = capture.transient if capture.transient is not None else capture.phasor
-    assert tensor is not None
-    return tensor.detach().cpu().movedim(-1, 0).contiguous()
+def _has(kept: PartFile, work: Work, number: int) -> bool:
+    return kept.last is not None and number <= kept.last if work.sums else kept.has(number)
 
 
-def _assembled(capture: Capture, cube: torch.Tensor, scan: Scan, spp: int) -> Capture:
-    tensor = cube.movedim(0, -1)
-    tensor = tensor.reshape(*tensor.shape[:-1], *scan.sensor_shape)
-    name = "transient" if capture.transient is not None else "phasor"
-    metadata = {"spp": spp, "variant": capture.metadata["variant"]}
-    return replace(capture, scan=scan, steady=None, metadata=metadata, **{name: tensor})
+def _sum_so_far(kept: PartFile | None, number: int, points: int) -> Rows | None:
+    return None if kept is None or number == 0 else kept.rows(_slot(number - 1, points), points)
 
 
-def _through(
-    transient: torch.Tensor, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None
-) -> torch.Tensor:
+def _keep(kept: PartFile, work: Work, number: int, rows: Any, seconds: float, layout: RowLayout) -> None:
+    points = math.prod(work.scan.sensor_shape)
+    first, total, before = work.run(number)[0], points, None
+    if work.sums:
+        first, total, before = _slot(number, points), 2 * points, number - 1
+    kept.keep(number, first, rows, total=total, seconds=seconds, about=layout.plain(), instead_of=before)
+
+
+def _everything(kept: PartFile, work: Work, points: int) -> Rows:
+    return kept.rows(_slot(work.count - 1, points), points) if work.sums else kept.everything()
+
+
+# -------------------------------------------------------------------------------------------------------------- results
+
+
+def _through(transient: Any, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None) -> torch.Tensor:
     """What a sensor makes of a capture's transient."""
-    dims = len(scan.shape)
-    rows = math.prod(scan.laser_shape) if scan.kind == "exhaustive" else 1
-    flat = transient.reshape(*transient.shape[: transient.ndim - dims], rows, -1)
-    seen: torch.Tensor = sensor(flat, generator=generator)
-    return seen.reshape(*seen.shape[:-2], *scan.shape)
+    return in_scan_shape(measured(in_film_shape(transient, scan), scan, sensor, generator), scan)
 
 
-def _say(renderer: CaptureRenderer, scan: Scan, spp: int, times: float) -> None:
-    """Memory and time of what is about to start, from a small share of its paths."""
-    some = max(1, spp // PILOT_SHARE)
-    with torch.no_grad():
-        renderer(seed=0, spp=some)  # compiles
-        began = time.perf_counter()
-        out = renderer(seed=0, spp=some)
-        seconds = (time.perf_counter() - began) * times * max(1.0, spp / some)
-    tensor = out.transient if out.transient is not None else out.phasor
-    assert tensor is not None
-    size = tensor.numel() * tensor.element_size() * times
-    print(f"{scan!r}: {size / 2**20:.4g} MiB, about {seconds:.3g} s", file=sys.stderr)
-
-
-def _tile_count(tiles: int | None, part: str | Path | None, scan: Scan) -> int:
-    if tiles is None:
-        tiles = 1 if part is None else TILES
-    if isinstance(tiles, bool) or not isinstance(tiles, int) or tiles < 1:
-        raise SceneError(f"simulate: tiles: expected a whole number of at least 1, got {tiles!r}.")
-    if tiles == 1 and part is not None:
-        tiles = min(2, math.prod(scan.sensor_shape))
-    return min(tiles, math.prod(scan.sensor_shape))
-
-
-def _digest(value: Any) -> str:
-    """A text that is the same for equal descriptions."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k}: {_digest(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_digest, value)) + "]"
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype}{value.shape}{hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
-    if isinstance(value, Scan):
-        return _digest({k: v for k, v in vars(value).items()})
-    if hasattr(value, "vertices") and hasattr(value, "faces"):
-        return _digest([np.asarray(value.vertices), np.asarray(value.faces)])
-    return repr(value)
+def _metadata(work: Work, forecast: Forecast, seed: int, seconds: float) -> dict[str, Any]:
+    return {
+        "spp": work.film.spp, "seed": seed, "seconds": seconds, "parts": work.count, "variant": work.variant.name,
+        "variant_reason": work.variant.why, "light": forecast.light,
+    }  # fmt: skip

@@ -28,6 +28,8 @@ _NUMBERS_IN_TEXT = (
 _ARRAY_KEYS = ("data", "bitmap", "grid")
 # The arrays of a mesh in the dictionary.
 _MESH, _MESH_KEYS = "mesh_arrays", ("vertices", "faces")
+# The arrays of a scan: three points in a row are no transform.
+_SCAN, _SCAN_KEYS = "nlos_capture_meter", ("points", "laser_points")
 
 
 @dataclass(frozen=True)
@@ -298,10 +300,9 @@ def _to_mitsuba(value: Any, key: str) -> Any:
     import mitsuba as mi
 
     if isinstance(value, dict):
-        rows = _MESH_KEYS if value.get("type") == _MESH else ()
-        return {
-            name: _mesh_rows(item, name) if name in rows else _to_mitsuba(item, name) for name, item in value.items()
-        }
+        special = {_MESH: (_MESH_KEYS, _mesh_rows), _SCAN: (_SCAN_KEYS, _scan_points)}
+        keys, convert = special.get(str(value.get("type")), ((), _to_mitsuba))
+        return {name: (convert if name in keys else _to_mitsuba)(item, name) for name, item in value.items()}
     if isinstance(value, Pixels):
         return value.to_bitmap()
     if isinstance(value, np.ndarray):
@@ -315,6 +316,17 @@ def _to_mitsuba(value: Any, key: str) -> Any:
             return value.tolist()
         return mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
     return value
+
+
+def _scan_points(value: Any, key: str) -> Any:
+    """Points (..., 3) as an array of three dimensions, which nothing else is."""
+    import mitsuba as mi
+
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" or array.ndim < 1 or array.shape[-1] != 3:
+        got = f"shape {array.shape} of {array.dtype}"
+        raise SceneError(f"{_SCAN}: expected {key} as points, an array (N, 3) or (H, W, 3), got {got}.")
+    return mi.TensorXf(np.ascontiguousarray(array, dtype=np.float32).reshape(1, -1, 3))
 
 
 def _mesh_rows(value: Any, key: str) -> Any:

@@ -36,9 +36,10 @@ _TRANSPARENT = frozenset((
     "normalmap", "null", "polarizer", "retarder", "circular", "delayed", "homogeneous", "heterogeneous",
     "isotropic", "hg", "rayleigh", "tabphase", "blendphase", "sggx", "constvolume", "checkerboard", "srgb",
     "uniform", "rawconstant", "d65", "volume", "cube", "sphere", "rectangle", "disk", "cylinder", "obj", "ply",
-    "serialized", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids",
-    "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens", "radiancemeter", "irradiancemeter",
-    "nlos_capture_meter", "distant", "batch", "hdrfilm", "specfilm",
+    "serialized", "mesh_arrays", "merge", "shapegroup", "instance", "bsplinecurve", "linearcurve", "sdfgrid",
+    "ellipsoids", "ellipsoidsmesh", "blender", "perspective", "orthographic", "thinlens", "radiancemeter",
+    "irradiancemeter",
+    "nlos_capture_meter", "laser_beam", "distant", "batch", "hdrfilm", "specfilm",
     "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent",
     "gaussian", "mitchell", "catmullrom", "lanczos",
 ))  # fmt: skip

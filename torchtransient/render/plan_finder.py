@@ -21,6 +21,7 @@ from torchtransient.render.variant import active_variant
 
 PILOT_PATHS = 32768
 PILOT_PIXELS = 2048
+_AROUND_CORNERS = "transient_nlos"
 # One bin for all times: far beyond the light of any scene when no pilot run says how far it goes.
 _ALL_TIMES = 1e9
 
@@ -83,6 +84,7 @@ class Finder:
         if pilot and (max_depth is None or wants_axis):
             self._run()
         depth = self._depth(max_depth)
+        self._note_light(depth)
         axis = self._axis(time_axis, bins, depth)
         filter_name = self._filter(temporal_filter)
         if self.report is not None:
@@ -157,6 +159,11 @@ class Finder:
             self._note_tail(depth)
             self.reasons.append(f"max_depth: {depth}, as asked for{self._beyond(depth)}")
             return depth
+        if self.arrivals is None and self._around_a_corner:
+            self.reasons.append(
+                f"max_depth: {own}, kept; what albedos leave of emitted power says little about light around corners"
+            )
+            return None
         if self.arrivals is None:
             depth, reason = choices.depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(reason)
@@ -185,6 +192,24 @@ class Finder:
         if self.arrivals is None or self.report is None or self.arrivals.dark or depth < 0:
             return ""
         return f"; {_share(self.report.tail, self.report.tail_error)} in deeper paths"
+
+    @property
+    def _around_a_corner(self) -> bool:
+        return self.draft.integrator.startswith(_AROUND_CORNERS) and self.inventory.integrator == self.draft.integrator
+
+    def _note_light(self, depth: int | None) -> None:
+        """How an integrator that has several ways finds which light."""
+        if not self._around_a_corner:
+            return
+        options = BuildOptions(max_depth=depth, merge=True, transient=True, integrator=self.draft.integrator)
+        with active_variant(self.draft.variant):
+            from torchtransient.plugins.around_corner.explanation import explanation
+
+            built = self.draft.scene.built(options).scene
+            integrator, sensors = built.integrator(), built.sensors()
+            contents = integrator.contents(built, sensors[self.draft.sensor])
+            self.reasons.append(f"light: {explanation(integrator, built, contents)}")
+            self.draft.scene.drop(options)
 
     # ----------------------------------------------------------------------------------------------------- window
 

@@ -24,6 +24,7 @@ from torchtransient.vis.scans import scan_layout as scan_layout
 from torchtransient.vis.scans import transients_grid as transients_grid
 from torchtransient.vis.scans import wall_frames as wall_frames
 from torchtransient.vis.scans import wall_video as wall_video
+from torchtransient.vis.shape_fit import plot_shape_fit as plot_shape_fit
 from torchtransient.vis.slices import frame_grid as frame_grid
 from torchtransient.vis.slices import histogram as histogram
 from torchtransient.vis.slices import streak as streak

@@ -111,7 +111,7 @@ def test_frequencies_are_the_densities_and_densities_integrate_to_one():
         # Equidistant points: every interval has its share of them, to one.
         assert np.abs(count - p * 2**18).max() < 2
         assert dr.min(rest)[0] >= 0 and dr.max(rest)[0] < 1
-    assert not np.allclose(table._probabilities(tiles[:1], normals[None], 0.1), p)
+    assert not np.allclose(table._probabilities(tiles[:1], normals[None]), p)
 
 
 def test_probabilities_are_those_of_the_formula():

@@ -159,7 +159,9 @@ def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any
     cos = dr.dot(start.n, d)
     vertex = _step(scene, plan, start, d, start.alive & (cos > 0))
     way = mi.Vector3f(vertex.p - origin)
-    arrived = dr.norm(vertex.p - point) < 1e-3 * dr.norm(to)
+    shape, primitive = plan.elements.surface(element, start.alive & guided)
+    arrived = (vertex.shape == shape) & (vertex.primitive == primitive)
+    arrived &= dr.norm(vertex.p - point) < 1e-3 * dr.norm(to)
     vertex.alive &= ~guided | arrived
     square = dr.squared_norm(way)
     there = dr.abs(dr.dot(vertex.geometric_n, way)) * dr.rsqrt(square)

@@ -15,7 +15,7 @@ from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.late_density import late_density
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.scan_job import ScanJob
-from torchtransient.plugins.around_corner.scan_table import LaserSpots, reference_points, scan_rays
+from torchtransient.plugins.around_corner.scan_table import ACROSS, LaserSpots, reference_points, scan_rays
 from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
@@ -23,7 +23,9 @@ from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import objects_below
+from torchtransient.plugins.sampling.area_elements import can_be_listed
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
+from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
 # Light of the laser's spot, of a hidden point, of the scanned point.
@@ -45,17 +47,20 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     others = [bsdf.id() or bsdf.class_name() for bsdf in contents.bsdfs if not is_lambertian(bsdf)]
     if others:
         return f"not all surfaces are diffuse ({', '.join(others[:3])})"
-    table = elements_of(scene, sensor, includes_wall=False)
-    if table.left_out:
-        return f"points cannot be drawn on {', '.join(table.left_out[:3])}"
+    unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
+    if unlisted:
+        return f"points cannot be drawn on {', '.join(unlisted[:3])}"
     return None
 
 
 def elements_of(scene: Any, sensor: Any, includes_wall: bool) -> HiddenElements:
     """The table of hidden elements; of the relay wall as well where it is asked for."""
+    return HiddenElements(_hidden(scene, sensor, includes_wall), *reference_points(scene, sensor))
+
+
+def _hidden(scene: Any, sensor: Any, includes_wall: bool) -> list[Any]:
     wall = None if includes_wall else sensor.get_shape()
-    hidden = [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-    return HiddenElements(hidden, *reference_points(scene, sensor))
+    return [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
 
 
 def wall_lights_itself(sensor: Any) -> bool:
@@ -174,7 +179,10 @@ class SharedThirdBounce:
         draw: tuple[Any, int],
     ) -> None:
         self.world, self.film, self.light, self.capture = world, film, light, capture
-        self._spare_rays(elements, draw[1])
+        self.tile = None
+        if world.wanted is None and capture is not CaptureType.EXHAUSTIVE:
+            elements = self._near(elements)
+        self._spare_rays(elements, draw[1] * elements.tile_count)
         self.samples = draw_samples(elements, draw[1], draw[0])
         self.gradients = None
         if world.wanted is not None:
@@ -193,6 +201,16 @@ class SharedThirdBounce:
                 samples = samples.detached()
             self.gradients = ThirdBounceGradients(world.scene, film, samples, points, self.samples.clear)
 
+    def _near(self, elements: HiddenElements) -> HiddenElements:
+        """With a density for each tile of the scan, where something hidden is nearer than half the scan's width."""
+        p, n = (_rows(getattr(self.light.sensors, name), self.light.sensors.width) for name in "pn")
+        some = np.linspace(0, len(p) - 1, min(len(p), ACROSS**2)).round().astype(int)
+        tiles = ScanTiles(p, n, distance_to(elements.elements.centers(), p[some]))
+        if tiles.count == 1:
+            return elements
+        self.tile = tiles.of_points()
+        return HiddenElements(elements.shapes, tiles.points, tiles.normals)
+
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
         """Leave out rays to what nothing hides, where that is found faster than they are traced."""
         points = (
@@ -204,7 +222,10 @@ class SharedThirdBounce:
 
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
-        third = ThirdBounce(self.world.scene, self.film, self.samples, self.light.sensors, self.light.energy, progress)
+        light = self.light
+        third = ThirdBounce(
+            self.world.scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile
+        )
         if self.capture is CaptureType.CONFOCAL:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:

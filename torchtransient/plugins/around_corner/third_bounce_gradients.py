@@ -47,11 +47,11 @@ class ThirdBounceGradients:
         geometric_n = sample.geometric_n if self.smooth else sample.n
         line = span(Local(p=sample.p, n=sample.n, geometric_n=geometric_n), point.p, point.n)
         if self.lit:
-            side, scattered, length = line.cos > 0, sample.front, line.r + sample.delay
+            side, reflected, length = line.cos > 0, sample.front, line.r + sample.delay
             g = dr.abs(line.geometric_cos) * line.wall_cos * line.inverse_square
         else:
             side, length = line.cos != 0, 2 * line.r
-            scattered = dr.select(line.cos > 0, sample.front, sample.back)
+            reflected = dr.select(line.cos > 0, sample.front, sample.back)
             g = dr.abs(line.cos * line.geometric_cos) * dr.square(line.wall_cos * line.inverse_square)
         length = length + point.leg
         active = dr.detach(side & (g > 0))
@@ -63,7 +63,7 @@ class ThirdBounceGradients:
             plain.geometric_n = plain.geometric_n if self.smooth else plain.n
             in_doubt = active & (k >= self.clear)
             active &= ~occluded(self.scene, plain, line, dr.detach(point.p), dr.detach(point.n), in_doubt)
-        return scattered * g * point.value, length, opl, active
+        return reflected * g * point.value, length, opl, active
 
     # ------------------------------------------------------------------------------------------------- reverse
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -39,7 +40,7 @@ from torchtransient.plugins.transport.scattering.guides.hidden_geometry import H
 from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.medium import SurfaceOrMedium
 from torchtransient.plugins.transport.scattering.surface import Surface
-from torchtransient.plugins.transport.segment.material import MaterialVacuum
+from torchtransient.plugins.transport.segment.material import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local
@@ -61,7 +62,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
-        corner. -1 keeps all. (mitransient 1.x calls paths of ``b + 2`` bounces ``filter_bounces = b``.)
+        corner. -1 keeps all. (In mitransient 1.x, ``filter_bounces = b`` keeps paths of ``b + 1`` bounces with
+        ``nlos_laser_sampling``, and of ``b + 2`` without it.)
     ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
         ``filter_bounces + 1``, as in mitransient.
@@ -97,6 +99,9 @@ class TransientNLOSPath(base.TransientIntegrator):
     confocal ones, whose spots lie at pixel centres).
 
     Gradients in both modes as in :class:`TransientIntegrator`.
+
+    Not supported: light that comes from the spot through smooth glass or by way of a mirror, which no connection finds
+    (as that of point lights elsewhere).
     """
 
     walks_through_media = True
@@ -230,8 +235,10 @@ class TransientNLOSPath(base.TransientIntegrator):
             parts.append(lambda run: self._shared(world, sensor, film, run.seed, run.samples).add(run.progress))
         if last >= FIRST:
             bounces = max(first, FIRST), last
-            late = Local(light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture)
-            parts.append(lambda run: add_late_light(late, world.scene, sensor, film, bounces, run))
+            of_scan = Local(
+                light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture
+            )
+            parts.append(lambda run: add_late_light(of_scan, world.scene, sensor, film, bounces, run))
         if self.walks(world):
             parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
         for i, part in enumerate(parts):
@@ -249,7 +256,9 @@ class TransientNLOSPath(base.TransientIntegrator):
             return Media
         # Instances, and what Mitsuba leaves detached, are attached along rays alone.
         along_rays = contents.instances is not None or contents.detached_hits is not None
-        return Vacuum if along_rays or not self.laser_sampling else MaterialVacuum
+        if along_rays or not self.laser_sampling:
+            return Vacuum
+        return FoundVacuum if self.hidden_sampling else MaterialVacuum
 
     def _connections(self, contents: Any) -> list[Any]:
         if not self.laser_sampling:
@@ -336,7 +345,12 @@ class TransientNLOSPath(base.TransientIntegrator):
             return scan_light(world.scene, sensor, spots, self.capture, self.legs)
 
     def _elements(self, world: Any, sensor: Any) -> HiddenElements:
-        return elements_of(world.scene, sensor, self.samples_wall or wall_lights_itself(sensor))
+        includes_wall = self.samples_wall or wall_lights_itself(sensor)
+        guides = [guide for guide in world.scattering.guides if isinstance(guide, HiddenGeometry)]
+        if guides and includes_wall == self.samples_wall:
+            # The paths' own table; a copy, of which elements may be put in another order.
+            return copy(guides[0].elements)
+        return elements_of(world.scene, sensor, includes_wall)
 
     def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
         light, elements = self._light(world, sensor), self._elements(world, sensor)

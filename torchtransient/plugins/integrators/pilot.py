@@ -121,7 +121,9 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots) -> tuple[Eve
         sink = EventListSink(size[0] * size[1] * spp, slots, lambda value: _energy(match, value, film.curves))
         # Without a window: what the sensor's film would not count is asked for, too.
         settings = integrator.settings()
-        settings = replace(settings, max_depth=PILOT_DEPTH, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
+        # Light of one number of bounces alone is not to be told apart by its depth.
+        deepest = settings.max_depth if getattr(integrator, "only_bounces", None) is not None else PILOT_DEPTH
+        settings = replace(settings, max_depth=deepest, rr_depth=min(settings.rr_depth, PILOT_RR_DEPTH))
         world = integrator.world(scene, contents, settings=settings)
         world.start(rays)
         walk(world, rays.sampler, ray, integrator.first_opl(film, rays), sink, dr.detach(rays.η), rays.leg)

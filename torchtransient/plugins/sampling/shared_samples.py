@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError, UnitError, VariantError
-from torchtransient.plugins.node_walk import objects_of
+from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.point_sets import plane_points
 from torchtransient.plugins.transport.scattering.geometry_terms import material_point
@@ -116,19 +116,8 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
 
 def not_diffuse(shapes: list[Any]) -> list[str]:
     """Names of the shapes, with their BSDFs, that scatter light in another way than a Lambertian surface."""
-    found = {}
-    for shape in shapes:
-        bsdf = shape.bsdf()
-        # Mixtures and normal maps, too, report diffuse lobes only.
-        name = bsdf.class_name()
-        nested = [bsdf] if name == "SmoothDiffuse" else _held(bsdf) if name == "TwoSidedBRDF" else []
-        if not nested or any(part.class_name() != "SmoothDiffuse" for part in nested):
-            found[shape.id()] = f"{shape.id() or shape.class_name()} ({name})"
-    return list(found.values())
-
-
-def _held(bsdf: Any) -> list[Any]:
-    return [value for _, value in objects_of(bsdf) if isinstance(value, mi.BSDF)]
+    others = [(shape, shape.bsdf()) for shape in shapes if not is_lambertian(shape.bsdf())]
+    return list(dict.fromkeys(f"{shape.id() or shape.class_name()} ({bsdf.class_name()})" for shape, bsdf in others))
 
 
 def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:

@@ -30,10 +30,16 @@ def cuts_of(elements: AreaElements, points: np.ndarray) -> np.ndarray:
     o, e1, e2 = (elements.axes[:, i] for i in range(3))
     longest = np.sqrt(np.max([(e * e).sum(1) for e in (e1, e2, e1 - e2)], axis=0))
     corners = np.stack([o, o + e1, o + e2, o + (e1 + e2) / 3], 1)
-    distance = np.full(len(elements), np.inf)
+    # No corner is nearer than the first by more than an edge: most are far enough by that.
+    least = np.full(len(elements), np.inf)
     for p in points:
-        distance = np.minimum(distance, np.linalg.norm(corners - p, axis=2).min(1))
-    wanted = longest / np.maximum(_RATIO * distance, 1e-30)
+        least = np.minimum(least, ((o - p) ** 2).sum(1))
+    near = np.flatnonzero(longest > _RATIO * (np.sqrt(least) - longest))
+    square = np.full(len(near), np.inf)
+    for p in points:
+        square = np.minimum(square, ((corners[near] - p) ** 2).sum(2).min(1))
+    wanted = np.ones(len(elements))
+    wanted[near] = longest[near] / np.maximum(_RATIO * np.sqrt(square), 1e-30)
     levels = np.clip(np.ceil(np.log2(np.maximum(wanted, 1))), 0, np.log2(_MOST_CUTS)).astype(int)
     levels = np.where((elements.kind == TRIANGLE) & (elements.area > 0), levels, 0)
     while (4**levels - 1).sum() > _BUDGET:

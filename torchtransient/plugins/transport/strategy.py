@@ -131,6 +131,14 @@ class Segment(Strategy):
         """(PreliminaryIntersection3f of the next surface, whether the leg ends there)."""
         raise NotImplementedError
 
+    def found(self, leg: Any, ray: Any, flags: Any, active: Any = True) -> Any:
+        """SurfaceInteraction3f of the next surface along ``ray``, with what the ``flags`` ask for at least."""
+        raise NotImplementedError
+
+    def known(self, pi: Any, ray: Any) -> Any:
+        """The leg of a primary ray whose PreliminaryIntersection3f is known."""
+        return pi
+
     def transmittance(self, world: Any, vertex: Vertex, ds: Any, u: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
         """(whether the point ``ds`` (``p, d, dist``) can be seen, factor per colour). ``u``: two uniform
         numbers that were drawn for this vertex and serve as the start of a generator.
@@ -254,7 +262,9 @@ class Guide(Strategy):
         return self.share
 
     def draw(self, world: Any, vertex: Vertex, u: Any) -> Any:
-        """A Point3f on a surface for two uniform numbers (Point2f)."""
+        """(a Point3f on a surface for two uniform numbers ``u`` (Point2f), the ShapePtr of that surface, the number of
+        its triangle or None where that does not matter).
+        """
         raise NotImplementedError
 
     def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:

@@ -48,11 +48,8 @@ def start(world, ray, first_opl, η) -> Path:
     )
 
 
-def bounce(world, path, kept, sampler, sink):
-    """One turn of the loop: changes ``path`` (at its end) and ``kept``.
-
-    Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
-    """
+def look_around(world, path, kept, sampler, sink):
+    """What a path finds at its next vertex: changes ``kept``; returns (vertex, next step, samples by strategy)."""
     # ------------------------------------------------------------------------- vertex
     vertex = world.segment.arrive(world, path)
     vertex.τ, vertex.η = path.τ + vertex.opl, path.η
@@ -70,7 +67,15 @@ def bounce(world, path, kept, sampler, sink):
         event.value = dr.select(event.active, event.value, 0)
         sink.event(kept, event)
         samples[c.name] = Local(proposal=proposal, event=event)
+    return vertex, step, samples
 
+
+def bounce(world, path, kept, sampler, sink):
+    """One turn of the loop: changes ``path`` (at its end) and ``kept``.
+
+    Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
+    """
+    vertex, step, samples = look_around(world, path, kept, sampler, sink)
     # ------------------------------------------------------------- to the next vertex
     onward = vertex.goes_on
     if not world.finds_light:  # nothing would be looked for at the last vertex
@@ -116,12 +121,17 @@ def roulette(world, path, vertex, step, sampler, goes_on, zeros):
 @dr.syntax
 def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     """Trace the paths of one pass into ``sink``; returns (number of vertices, what the sink kept). ``η``: index of
-    refraction where they start; ``leg``: how their first segment ends, None where that is not known.
+    refraction where they start; ``leg``: PreliminaryIntersection3f at the end of their first segment, None where that
+    is not known.
     """
     path = start(world, ray, first_opl, η)
-    path.leg = leg if leg is not None else world.segment.first(world, ray, sampler)
+    path.leg = world.segment.first(world, ray, sampler) if leg is None else world.segment.known(leg, ray)
     kept = sink.begin(world)
-    while dr.hint(path.active, max_iterations=world.max_depth, label="path"):
+    # Of the last vertex nothing is asked but its connections where no light is found: it needs no turn of the loop.
+    turns = world.max_depth if world.finds_light or sink.keeps_vertices else max(world.max_depth - 2, 0)
+    while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
         bounce(world, path, kept, sampler, sink)
+    if dr.hint(turns < world.max_depth, mode="scalar"):
+        look_around(world, path, kept, sampler, sink)
     sink.end(kept)
     return path.depth, kept

@@ -18,6 +18,9 @@ from torchtransient.plugins.polarized import (
 from torchtransient.plugins.transport.carry import Carry, slope_only
 from torchtransient.plugins.transport.strategy import Answer, Local, Scattering, Step
 
+# Number of a triangle where any will do.
+_ANY = 0xFFFFFFFF
+
 
 class Surface(Scattering):
     """What all vertices do in vacuum; those in media are told apart in :class:`.medium.SurfaceOrMedium`.
@@ -131,10 +134,13 @@ class Surface(Scattering):
         """
         u, below, own = sampler.next_1d(), 0.0, self.own_share(path.depth)
         step.guided, step.point = u < 1 - own, mi.Point3f(vertex.at.p)
+        step.shape, step.primitive = dr.zeros(mi.ShapePtr), mi.UInt32(_ANY)
         for guide in self.guides:
-            point, share = guide.draw(world, vertex, step.u_dir), guide.share_at(path.depth)
+            point, shape, primitive = guide.draw(world, vertex, step.u_dir)
+            share = guide.share_at(path.depth)
             chosen = (u >= below) & (u < below + share)
-            step.point = dr.select(chosen, point, step.point)
+            step.point, step.shape = dr.select(chosen, point, step.point), dr.select(chosen, shape, step.shape)
+            step.primitive = dr.select(chosen, _ANY if primitive is None else primitive, step.primitive)
             below += share
         # Rays start beside the surface, from where a near point lies in another direction.
         step.out = dr.select(step.guided, vertex.at.spawn_ray_to(step.point).d, step.out)
@@ -161,13 +167,15 @@ class Surface(Scattering):
         smooth = vertex.goes_on & ~step.delta
         pi, reached = world.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
-        found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, reached)
+        found = world.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
         value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
         guided = self.guided_density(world, path.depth, ray.o, found, pi.shape, reached, pi.prim_index)
         pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
-        # A guided sample stands for the point that was drawn, and for no other that its ray runs into before.
+        # A guided sample stands for the point that was drawn, and for no other that its ray runs into before: nor for
+        # one just above it, where a surface lies below another one.
         way = dr.norm(step.point - vertex.at.p)
-        arrived = reached & (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
+        arrived = reached & (pi.shape == step.shape) & ((step.primitive == _ANY) | (pi.prim_index == step.primitive))
+        arrived &= (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
         pdf = dr.select(step.guided & ~arrived, 0, pdf)
         kept = step.guided | ~is_black(step.weight)
         step.weight = dr.select(smooth, dr.select((pdf > 0) & kept, value / pdf, 0), step.weight)

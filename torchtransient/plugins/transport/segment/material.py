@@ -56,3 +56,25 @@ class MaterialVacuum(Vacuum):
             d=dr.replace_grad(mi.Vector3f(following.d), d), J=dr.relative_grad(measure), drag=mi.Vector3f(0),
             longer=lambda: longer,
         )  # fmt: skip
+
+
+class FoundVacuum(MaterialVacuum):
+    """The same for walks with guides, which look at the end of a segment before they weigh it: what was found there is
+    carried to the next turn of the loop. A leg is ``pi`` and ``si``, of which the loop keeps what is used.
+    """
+
+    def first(self, world, ray, sampler):
+        return self.known(super().first(world, ray, sampler), ray)
+
+    def known(self, pi, ray):
+        return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
+
+    def depart(self, world, ray, vertex, β, sampler, active):
+        pi = super().depart(world, ray, vertex, β, sampler, active)
+        return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
+
+    def surface_of(self, leg):
+        return leg["pi"], mi.Bool(True)
+
+    def found(self, leg, ray, flags, active=True):
+        return leg["si"]

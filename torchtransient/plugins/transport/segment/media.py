@@ -87,6 +87,9 @@ class Media(Vacuum):
             scatter=scatter, mei=mei, medium=leg["medium"], opl=self.optical_length(world, path, at.p, valid),
         )  # fmt: skip
 
+    def found(self, leg, ray, flags, active=True):
+        return leg["pi"].compute_surface_interaction(ray, flags, active)
+
     def surface_of(self, leg):
         return leg["pi"], ~leg["scatter"]
 

@@ -64,9 +64,9 @@ class Vacuum(Segment):
         return world.scene.ray_intersect_preliminary(ray, active=active)
 
     def arrive(self, world, path):
-        si = path.leg.compute_surface_interaction(path.ray, mi.RayFlags.All)
+        si, (leg, _) = self.found(path.leg, path.ray, mi.RayFlags.All), self.surface_of(path.leg)
         return Vertex(
-            si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=path.leg,
+            si=si, at=si, valid=si.is_valid(), surface=mi.Bool(True), β=path.β, ray=path.ray, leg=leg,
             opl=self.optical_length(world, path, si.p, si.is_valid()),
         )  # fmt: skip
 
@@ -81,6 +81,9 @@ class Vacuum(Segment):
 
     def surface_of(self, leg):
         return leg, mi.Bool(True)
+
+    def found(self, leg, ray, flags, active=True):
+        return leg.compute_surface_interaction(ray, flags, active)
 
     def transmittance(self, world, vertex, ds, u, sampler, active):
         return active & ~world.scene.ray_test(vertex.at.spawn_ray_to(ds.p), active), 1

@@ -13,6 +13,8 @@ class FilmSink(Sink):
     film's window.
     """
 
+    keeps_vertices = False
+
     def __init__(self, block):
         self.block = block
 

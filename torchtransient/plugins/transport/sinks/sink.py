@@ -12,6 +12,8 @@ class Sink:
 
     # Static: whether events of value zero matter, since their derivatives may not be zero.
     zeros = False
+    # Static: whether it does anything with vertices.
+    keeps_vertices = True
 
     def begin(self, world: Any) -> dict[str, Any]:
         """The loop state before the first vertex."""

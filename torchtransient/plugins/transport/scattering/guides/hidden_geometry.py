@@ -31,8 +31,7 @@ class HiddenGeometry(Guide):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
 
     def draw(self, world, vertex, u):
-        point, _ = self.elements.draw(u, vertex.goes_on)
-        return point
+        return self.elements.draw_with_surface(u, vertex.goes_on)
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))

@@ -1,0 +1,206 @@
+"""Captures that cannot be made, through every door: what was expected, what came, what to do."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError, VariantError
+
+VARIANT = "llvm_ad_mono"
+AXIS = tt.TimeAxis(1.9, 0.02, 50)
+WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.7)
+Z = tt.scenes.nlos_z()
+ASIDE = {"sensor_origin": [-0.5, 0.0, 0.25], "laser_origin": [-0.5, 0.0, 0.25]}
+
+
+def scan(kind="confocal", size=(3, 2), **settings):
+    return tt.nlos.Scan.grid(settings.pop("wall", WALL), size, kind=kind, **settings)
+
+
+def complete(kind="confocal", hidden=None, meter=None, integrator=None, without=()):
+    """A complete scene of a capture, with what is changed of it."""
+    settings = {"laser_grid": (2, 1)} if kind == "exhaustive" else {}
+    described = tt.nlos.capture_scene(Z if hidden is None else hidden, scan(kind, **settings))
+    sensor = described["wall"]["sensor"]
+    sensor["film"] |= {"start_opl": AXIS.start_opl, "bin_width_opl": AXIS.bin_width_opl, "temporal_bins": 50}
+    sensor |= meter or {}
+    described["integrator"] |= integrator or {}
+    return {name: node for name, node in described.items() if name not in without}
+
+
+def simulate(hidden=None, of=None, **settings):
+    settings = {"time_axis": AXIS, "spp": 4, "progress": False} | settings
+    return tt.nlos.simulate(Z if hidden is None else hidden, of or scan(), **settings)
+
+
+def renderer(hidden=None, of=None, **settings):
+    settings = {"time_axis": AXIS, "spp": 4} | settings
+    return tt.nlos.CaptureRenderer(Z if hidden is None else hidden, of or scan(), **settings)(seed=0)
+
+
+def scene(*given, **changed):
+    return tt.nlos.simulate(complete(*given, **changed), spp=4, progress=False)
+
+
+def plate(z, **settings):
+    to_world = np.diag([0.3, 0.3, 1.0, 1.0])
+    to_world[2, 3] = z
+    return {"plate": {"type": "rectangle", "to_world": to_world, **settings}}
+
+
+def broken_mesh():
+    mesh = dict(tt.scenes.triangle_mesh([[0, 0, 1], [1, 0, 1], [0, 1, 1]], [[0, 2, 1]]))
+    return {"letter": mesh | {"vertices": np.array([[0, 0, 1], [1, 0, np.nan], [0, 1, 1]])}}
+
+
+def shining():
+    hidden = copy.deepcopy(Z)
+    hidden["letter"]["emitter"] = {"type": "area", "radiance": 1.0}
+    return hidden
+
+
+def off_the_wall():
+    listed = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.1]])
+    on = tt.nlos.Scan.points(listed[:1], kind="confocal", wall=WALL, **ASIDE)
+    # Of points whose normals are not known, nobody has looked whether they lie on the wall.
+    return tt.nlos.Scan("confocal", listed, listed, on.sensor_origin, on.laser_origin, wall=on.wall)
+
+
+TWOSIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+HIDES = r"4 of 6 sensor points are not what the sensor looks at.*meets 'plate' 0.275 m away.*stands between"
+SHINES = r"'letter.emitter' \(area\) emits light; expected shapes alone.*Leave it out"
+NAN = r"expected finite numbers, got NaN or infinity in 'letter.vertices' \(1 of 9\)"
+BEHIND = r"expected something before the wall.*got nothing there.*turn the wall"
+NOTHING = "expected at least one shape beside the wall, got none"
+BOUNCES = r"whole numbers of at least 2 without gaps.*got {}.*light around one corner has 3"
+BACK = r"rays end on the back of 'wall'.*Move sensor_origin or laser_origin"
+LARGE = tt.TimeAxis(0.0, 1e-3, 100_000)
+MESH = (np.ones((3, 3)), np.array([[0, 1, 2]]))
+
+CASES = {
+    # points and origins
+    "points off the wall: simulate": (lambda: simulate(of=off_the_wall()), SceneError, r"1 of 2 sensor points.*Move"),
+    "points off the wall: renderer": (lambda: renderer(of=off_the_wall()), SceneError, r"1 of 2 sensor points.*Move"),
+    "points off the wall: tiles": (lambda: simulate(of=off_the_wall(), tiles=2), SceneError, r"1 of 2 sensor points"),
+    "points off the wall: scan": (
+        lambda: tt.nlos.Scan.points([[0, 0, 0.1]], kind="confocal", wall=WALL, **ASIDE), SceneError,
+        r"expected points on the wall, got 1 of 1 elsewhere.*Wall.at",
+    ),
+    "points off the wall: scene": (
+        lambda: scene(meter={"points": np.array([[5.0, 0, 0]] * 6)}), SceneError, "6 of 6 sensor points.*meets nothing",
+    ),
+    "a laser that misses: scan": (lambda: scan("single", laser=[3.0, 0, 0]), SceneError, "expected points on the wall"),
+    "a laser that misses: coordinates": (lambda: scan("single", laser=(1.5, 0)), SceneError, r"between 0 and 1"),
+    "a laser that misses: scene": (
+        lambda: scene("single", meter={"laser_points": np.array([[3.0, 0, 0]])}), SceneError,
+        r"1 of the laser's 1 beams meet nothing.*Aim the laser at the relay wall",
+    ),
+    "too many spots: scene": (
+        lambda: scene("single", meter={"laser_points": np.zeros((2, 3))}), SceneError, "a single capture has one laser",
+    ),
+    "a sensor behind the wall: scan": (
+        lambda: scan(sensor_origin=[0, 0, -1.0]), SceneError, "expected sensor_origin in front of the wall",
+    ),
+    "a sensor behind the wall: scene": (lambda: scene(meter={"sensor_origin": [0, 0, -1.0]}), SceneError, BACK),
+    "a laser behind the wall: scan": (
+        lambda: scan(laser_origin=[0, 0, -1.0]), SceneError, "expected laser_origin in front of the wall",
+    ),
+    "a laser behind the wall: scene": (
+        lambda: scene("single", meter={"laser_origin": [0, 0, -1.0]}), SceneError, BACK,
+    ),
+    "a grid of one point": (lambda: scan("exhaustive", size=1), SceneError, "grid of one point.*Give kind='single'"),
+    "a grid of no point": (lambda: scan(size=(0, 2)), ShapeError, "at least 1"),
+    "a scan without a wall": (
+        lambda: simulate(of=tt.nlos.Scan.points([[0, 0, 0]], kind="confocal", **ASIDE)), SceneError, "knows its wall",
+    ),
+    # hidden things
+    "nothing hidden: simulate": (lambda: simulate({}), SceneError, "expected at least one shape, got an empty"),
+    "nothing hidden: renderer": (lambda: renderer({}), SceneError, "expected at least one shape, got an empty"),
+    "nothing hidden: scene": (lambda: scene(without=("letter",)), SceneError, NOTHING),
+    "no shape among them": (lambda: simulate({"paint": {"type": "diffuse"}}), SceneError, NOTHING),
+    "in the sensor's way: simulate": (lambda: simulate(plate(0.1)), SceneError, HIDES),
+    "in the sensor's way: renderer": (lambda: renderer(plate(0.1)), SceneError, HIDES),
+    "in the sensor's way: scene": (lambda: scene(hidden=plate(0.1, **TWOSIDED)), SceneError, HIDES),
+    "behind the wall: simulate": (lambda: simulate(plate(-1.0)), SceneError, BEHIND),
+    "behind the wall: renderer": (lambda: renderer(plate(-1.0)), SceneError, BEHIND),
+    "behind the wall: scene": (lambda: scene(hidden=plate(-1.0)), SceneError, BEHIND),
+    "vertices that are no number: simulate": (lambda: simulate(broken_mesh()), SceneError, NAN),
+    "vertices that are no number: renderer": (lambda: renderer(broken_mesh()), SceneError, NAN),
+    "vertices that are no number: scene": (lambda: scene(hidden=broken_mesh()), SceneError, NAN),
+    "no area": (lambda: simulate(MESH), SceneError, "expected shapes with a surface"),
+    "hidden light: simulate": (lambda: simulate(shining()), SceneError, SHINES),
+    "hidden light: renderer": (lambda: renderer(shining()), SceneError, SHINES),
+    "hidden light: scene": (
+        lambda: tt.nlos.simulate(complete() | shining(), spp=4, progress=False), SceneError,
+        r"expected one emitter, the laser.*got 2 \('laser', 'emitter'\)",
+    ),
+    "a hidden sky": (lambda: simulate(Z | {"sky": {"type": "constant"}}), SceneError, r"'sky' \(constant\) emits"),
+    "no dictionary": (lambda: simulate({"a": 3}), SceneError, "expected 'a' as a dictionary with a type, got 3"),
+    "a name of the capture": (lambda: simulate({"wall": Z["letter"]}), SceneError, "names wall belong to the capture"),
+    "a mesh file that is not there": (lambda: simulate("no.obj"), SceneError, "no file 'no.obj'"),
+    "another file": (lambda: simulate("no.txt"), SceneError, r"expected a mesh file \(\.ply, \.obj, \.stl\)"),
+    # light and work
+    "one bounce": (lambda: simulate(bounces=(1,)), SceneError, BOUNCES.format(r"\(1,\)")),
+    "a gap in bounces": (lambda: renderer(bounces=(3, 5)), SceneError, BOUNCES.format(r"\(3, 5\)")),
+    "bounces that are no numbers": (lambda: renderer(bounces=(3, "a")), SceneError, BOUNCES.format(".*'a'")),
+    "no bounces": (lambda: simulate(bounces=()), SceneError, BOUNCES.format(r"\(\)")),
+    "bounces of a scene": (
+        lambda: tt.nlos.simulate(complete(), bounces=(3,), progress=False), SceneError, "max_depth and filter_bounces",
+    ),
+    "energy of a scene": (lambda: tt.nlos.simulate(complete(), energy=2.0), SceneError, "energy has no effect.*laser"),
+    "bounces that the depth leaves out": (
+        lambda: scene(integrator={"filter_bounces": 4, "min_bounces": 0}), SceneError, "Set max_depth to at least 4",
+    ),
+    "energy below zero": (lambda: simulate(energy=-1.0), UnitError, "expected joules of at least 0, got -1.0"),
+    "energy that is no number": (lambda: renderer(energy=math.nan), UnitError, "expected joules of at least 0"),
+    "energy in words": (lambda: simulate(energy="much"), SceneError, "expected joules, or a spectrum"),
+    "no samples: simulate": (lambda: simulate(spp=0), UnitError, "spp: expected a positive integer"),
+    "no samples: renderer": (lambda: renderer(spp=0), UnitError, "spp: expected a positive integer"),
+    "no samples: scene": (lambda: tt.nlos.simulate(complete(), spp=0), UnitError, "spp: expected a positive integer"),
+    "half a sample": (lambda: simulate(spp=1.5), UnitError, "spp: expected a positive integer"),
+    "a negative seed": (lambda: simulate(seed=-1), SceneError, "seed: expected a whole number of at least 0"),
+    "no tiles": (lambda: simulate(tiles=0), SceneError, "tiles: expected a whole number of at least 1"),
+    "memory: simulate": (
+        lambda: simulate(of=scan("exhaustive", (100, 100)), time_axis=LARGE), StorageError, "36.38 TiB.*Use fewer bins",
+    ),
+    "memory: renderer": (
+        lambda: renderer(of=scan("exhaustive", (100, 100)), time_axis=LARGE), StorageError, "36.38 TiB.*fewer bins",
+    ),
+    "bins and frequencies": (lambda: simulate(frequencies=[1.0]), SceneError, "expected time_axis or frequencies, got"),
+    "another variant": (lambda: simulate(variant="scalar_rgb"), VariantError, "llvm_ad_rgb"),
+    # what is no capture
+    "no scan": (lambda: tt.nlos.simulate(Z), SceneError, r"expected scan= beside hidden shapes.*got letter and"),
+    "a mesh without a scan": (lambda: tt.nlos.simulate(MESH), SceneError, "expected scan= beside a mesh"),
+    "a scan in words": (lambda: simulate(of="confocal"), SceneError, r"expected scan as a tt\.nlos\.Scan, got str"),
+    "a scene and a scan": (lambda: simulate(tt.load(complete())), SceneError, "Leave scan out to simulate the scene"),
+    "a dictionary of a scene and a scan": (lambda: simulate(complete()), SceneError, "is no hidden thing"),
+    "a file of a scene and a scan": (lambda: simulate("scene.xml"), SceneError, "leave scan out"),
+    "a scene without a laser": (lambda: scene(without=("laser",)), SceneError, "expected one emitter, the laser"),
+    "another integrator": (
+        lambda: tt.nlos.simulate(tt.scenes.cornell_box()), SceneError, "expected a scene with the integrator",
+    ),
+    "a laser without a spot": (
+        lambda: tt.nlos.simulate(complete() | {"laser": {"type": "constant"}}, spp=4, progress=False), SceneError,
+        "laser whose beam falls on a spot|expected one emitter",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_cannot_be_captured(case):
+    made, kind, message = CASES[case]
+    with pytest.raises(TorchTransientError, match=message) as caught:
+        made()
+    assert isinstance(caught.value, kind)
+    assert "Traceback" not in str(caught.value)
+
+
+def test_one_point_is_a_scan():
+    """As a grid, a list, and with its own laser."""
+    for of in (scan(size=1), scan("single", size=1, laser=(0.3, 0.3)), scan("exhaustive", size=1, laser_grid=(2, 2))):
+        assert float(simulate(of=of, spp=64).transient.sum()) > 0

@@ -1,0 +1,381 @@
+"""Simulated captures: against closed forms, whole and in parts, of hidden things and of complete scenes."""
+
+from __future__ import annotations
+
+import math
+import os
+
+import mitsuba as mi
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.nlos import work
+from torchtransient.nlos.setup_files import tal_bounces
+
+VARIANT = "llvm_ad_mono"
+AXIS = tt.TimeAxis(1.9, 0.02, 100)
+FREQUENCIES = [0.0, 0.5, 2.0]
+WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.9)
+pytestmark = pytest.mark.usefixtures("no_leftovers")
+
+
+def scan(kind="confocal", size=(3, 2), **settings):
+    if kind == "exhaustive":
+        settings.setdefault("laser_grid", (2, 1))
+    return tt.nlos.Scan.grid(WALL, size, kind=kind, **settings)
+
+
+def simulated(hidden=None, of=None, **settings):
+    settings = {"time_axis": AXIS, "spp": 64, "progress": False} | settings
+    if "frequencies" in settings:
+        settings.pop("time_axis")
+    return tt.nlos.simulate(tt.scenes.nlos_z() if hidden is None else hidden, of or scan(), **settings)
+
+
+def measured(capture):
+    return capture.transient if capture.transient is not None else capture.phasor
+
+
+def complete(kind="confocal", **settings):
+    """The scene of a capture, with a film of its own."""
+    description = tt.nlos.capture_scene(tt.scenes.nlos_z(), scan(kind, **settings))
+    film = description["wall"]["sensor"]["film"]
+    film |= {"start_opl": AXIS.start_opl, "bin_width_opl": AXIS.bin_width_opl, "temporal_bins": AXIS.num_bins}
+    return description
+
+
+# ------------------------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("tiles", [1, 3])
+def test_a_plane_in_closed_form(tiles):
+    """All light of a plane without end is rho_wall^2 rho / (3 pi^2 z^2); beyond 6 m there are 2e-5 of it."""
+    plane = {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])
+             @ tt.scenes.transforms.rotate([0, 1, 0], 180) @ tt.scenes.transforms.scale([6, 6, 1]),
+             "bsdf": {"type": "diffuse", "reflectance": 0.7}}  # fmt: skip
+    runs = [simulated(plane, spp=2**13, seed=seed, tiles=tiles).steady.flatten() for seed in range(6)]
+    found = torch.stack(runs).double()
+    exact = 0.9**2 * 0.7 / (3 * math.pi**2)
+    means = found.mean(1) / exact
+    assert abs(float(means.mean()) - 1) < 4 * float(means.std()) / len(means) ** 0.5 < 0.04
+
+
+# --------------------------------------------------------------------------------------------------------- in parts
+
+
+@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("film", [{}, {"frequencies": FREQUENCIES}], ids=["bins", "phasors"])
+def test_parts_in_a_file_and_without(tmp_path, kind, film):
+    path = tmp_path / "a.part"
+    kept = simulated(of=scan(kind), part=path, tiles=4, **film)
+    without = simulated(of=scan(kind), tiles=4, **film)
+    whole = simulated(of=scan(kind), **film)
+    assert torch.equal(measured(kept), measured(without)) and os.listdir(tmp_path) == []
+    assert (kept.axis, kept.frequencies, kept.scan, kept.channels) == (
+        whole.axis, whole.frequencies, whole.scan, whole.channels,
+    )  # fmt: skip
+    assert measured(kept).shape == measured(whole).shape == (1, 3 if film else 100, *whole.scan.shape)
+    assert (kept.steady is None) == (whole.steady is None) == (kind == "exhaustive")
+    if whole.steady is not None:
+        assert kept.steady.shape == whole.steady.shape
+    assert kept.metadata["parts"] == 3 and whole.metadata["parts"] == 1
+
+
+def test_parts_and_the_whole_have_the_same_mean():
+    """Point by point: points of parts are the points that they stand for."""
+    runs = {
+        tiles: torch.stack([simulated(tiles=tiles, spp=512, seed=seed).steady[0] for seed in range(8)]).double()
+        for tiles in (1, 4)
+    }
+    a, b = runs.values()
+    error = ((a.var(0) + b.var(0)) / 8).sqrt()
+    assert float(((a.mean(0) - b.mean(0)).abs() / error).max()) < 5
+    assert float((error / a.mean(0)).max()) < 0.05
+    assert float(a.mean(0).max() / a.mean(0).min()) > 1.05  # points differ
+
+
+@pytest.mark.parametrize("of", ["hidden things", "a complete scene"])
+@pytest.mark.parametrize("stops_at", [0, 1, 3])
+def test_a_simulation_that_was_stopped_goes_on(tmp_path, monkeypatch, of, stops_at):
+    settings = {"part": tmp_path / "a.part", "tiles": 4, "progress": False, "spp": 10, "seed": 3}
+    given = (complete(),) if of == "a complete scene" else (tt.scenes.nlos_z(), scan(size=(4, 2)))
+    settings |= {} if of == "a complete scene" else {"time_axis": AXIS}
+    expected = tt.nlos.simulate(*given, **(settings | {"part": None}))
+    rendered = []
+    for kind in (work.HiddenWork, work.SceneWork):
+        real = kind.render
+
+        def render(self, number, *rest, real=real, **more):
+            if len(rendered) == stops_at:
+                raise KeyboardInterrupt
+            rendered.append(number)
+            return real(self, number, *rest, **more)
+
+        monkeypatch.setattr(kind, "render", render)
+    with pytest.raises(KeyboardInterrupt):
+        tt.nlos.simulate(*given, **settings)
+    assert rendered == list(range(stops_at))
+    stops_at = 99
+    capture = tt.nlos.simulate(*given, **settings)
+    assert rendered == list(range(4))
+    assert torch.equal(capture.transient, expected.transient) and torch.equal(capture.steady, expected.steady)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_finished_part_file_is_the_capture(tmp_path, monkeypatch):
+    settings = {"part": tmp_path / "a.part", "keep_part": True, "tiles": 2}
+    first = simulated(**settings)
+    monkeypatch.setattr(work.HiddenWork, "render", None)
+    again = simulated(**settings)
+    assert torch.equal(first.transient, again.transient) and again.metadata["seconds"] == first.metadata["seconds"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"seed": 1}, {"spp": 65}, {"tiles": 3}, {"time_axis": tt.TimeAxis(1.9, 0.02, 101)}, {"bounces": (3, 4)},
+     {"energy": 2.0}, {"of": scan(size=(2, 3))}, {"hidden": tt.scenes.nlos_z(depth=1.1)},
+     {"variant": "llvm_ad_rgb"}, {"frequencies": [0.0, 1.0]}],
+)  # fmt: skip
+def test_other_settings_are_another_simulation(tmp_path, changed):
+    settings = {"part": tmp_path / "a.part", "keep_part": True, "tiles": 2}
+    simulated(**settings)
+    with pytest.raises(StorageError, match="belongs to another simulation"):
+        simulated(**(settings | changed))
+    assert (tmp_path / "a.part").exists()
+
+
+def test_a_mesh_file_that_changed_is_another_simulation(tmp_path):
+    obj = tmp_path / "a.obj"
+    obj.write_text("v 0 0 1\nv 0 1 1\nv 1 0 1\nf 1 2 3\n")
+    settings = {"part": tmp_path / "a.part", "keep_part": True, "tiles": 2}
+    simulated(obj, **settings)
+    simulated(obj, **settings)
+    obj.write_text("v 0 0 1\nv 0 1 1\nv 1 0 1.1\nf 1 2 3\n")
+    with pytest.raises(StorageError, match="belongs to another simulation"):
+        simulated(obj, **settings)
+
+
+def test_a_sensor_sees_the_whole_capture(tmp_path):
+    class Twice(torch.nn.Module):
+        def forward(self, transient, generator=None):
+            assert transient.shape[-3:] == (AXIS.num_bins, 2, 3)
+            return 2 * transient + torch.rand((), generator=generator)
+
+    def seen(**settings):
+        return simulated(sensor=Twice(), generator=torch.Generator().manual_seed(1), **settings).transient
+
+    offset = torch.rand((), generator=torch.Generator().manual_seed(1))
+    for settings in ({}, {"tiles": 2}):
+        assert torch.equal(seen(**settings), 2 * simulated(**settings).transient + offset)
+
+
+def test_devices_are_sensors():
+    """As files name them: built for the capture's own bins."""
+    stage = {"kind": "ImpulseResponse", "response": {"kind": "GaussianResponse", "fwhm_s": 2e-10}, "axis": "@axis"}
+    device = tt.sensing.Device("d", "a detector", ("assumed: all",), (stage,))
+    chain, plain = device.sensor(AXIS), simulated()
+    expected = chain(plain.transient)
+    for settings in ({}, {"tiles": 2}):
+        bare = simulated(**settings)
+        seen = simulated(sensor=device, **settings)
+        torch.testing.assert_close(seen.transient, chain(bare.transient))
+        assert seen.axis == AXIS and not torch.equal(seen.transient, bare.transient)
+    renderer = tt.nlos.CaptureRenderer(
+        tt.scenes.nlos_z(), scan(), time_axis=AXIS, spp=64, sensor=device, variant="llvm_ad_mono"
+    )
+    torch.testing.assert_close(renderer(seed=0).transient.detach(), expected)
+    with pytest.raises(SceneError, match="takes transients"):
+        simulated(sensor=device, frequencies=FREQUENCIES)
+    with pytest.raises(SceneError, match="takes transients"):
+        tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan(), frequencies=[1.0], sensor=device)
+
+
+# -------------------------------------------------------------------------------------------------- complete scenes
+
+
+@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+def test_a_complete_scene_is_its_scan(kind):
+    """The scene that a capture is made of, handed over as it is: the same numbers, and the scan read off it."""
+    capture = tt.nlos.simulate(complete(kind), spp=64, progress=False)
+    expected = simulated(of=scan(kind))
+    assert torch.equal(capture.transient, expected.transient)
+    found, wanted = capture.scan, expected.scan
+    assert (found.kind, found.shape, found.first_and_last_leg) == (wanted.kind, wanted.shape, False)
+    for name in ("sensor_points", "laser_points", "sensor_normals", "laser_normals", "sensor_origin", "laser_origin"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=0, atol=1e-6)
+    assert found.wall is None and capture.metadata["spp"] == 64
+
+
+def test_samples_of_passes_add_up(monkeypatch):
+    """10 samples in 4 passes of 3, 3, 2, 2: the mean of all of them."""
+    real, runs = work.SceneWork.render, []
+
+    def render(self, number, seed, **more):
+        runs.append((self.share(number), real(self, number, seed, **more)))
+        return runs[-1][1]
+
+    monkeypatch.setattr(work.SceneWork, "render", render)
+    capture = tt.nlos.simulate(complete(), spp=10, tiles=4, progress=False)
+    assert [share for share, _ in runs] == [3, 3, 2, 2]
+    mean = sum(share * run.transient.double() for share, run in runs) / 10
+    torch.testing.assert_close(capture.transient.double(), mean, rtol=1e-6, atol=1e-12)
+
+
+def test_a_camera_sees_points_of_the_wall():
+    """Pixel centres of a perspective sensor; those that look past the wall are put on the wall's plane."""
+    description = complete("single")
+    meter = description["wall"].pop("sensor")
+    look = mi.ScalarTransform4f().look_at([0, 0, 0.8], [0, 0, 0], [0, 1, 0])
+    film = meter["film"] | {"width": 8, "height": 4}
+    description["camera"] = {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(2 / 0.8)),
+        "fov_axis": "x",
+        "to_world": look,
+        "film": film,
+    }
+    description["laser"] |= {"to_world": mi.ScalarTransform4f().look_at([0, 0, 0.8], [0.3, 0.1, 0], [0, 1, 0])}
+    with pytest.warns(tt.errors.TorchTransientWarning, match="16 of the sensor's 32 rays look past the wall"):
+        capture = tt.nlos.simulate(description, spp=4, progress=False)
+    points = capture.scan.sensor_points
+    x, y = 2 * ((torch.arange(8) + 0.5) / 4 - 1), 2 * (0.5 - (torch.arange(4) + 0.5) / 4)
+    # Cameras of Mitsuba look along +z with x to the left.
+    expected = torch.stack([-x[None, :].expand(4, 8), y[:, None].expand(4, 8), torch.zeros(4, 8)], -1).double()
+    torch.testing.assert_close(points.abs(), expected.abs(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(capture.scan.laser_points, torch.tensor([0.3, 0.1, 0.0]).double(), rtol=0, atol=1e-5)
+    past = (points[..., 0].abs() > 1) | (points[..., 1].abs() > 0.8)
+    assert bool((capture.transient.sum((0, 1))[past] == 0).all()) and int(past.sum()) == 16
+
+
+OLDER = """<scene version="3.3.0">
+  <integrator type="transient_nlos_path">
+    <integer name="block_size" value="1"/><integer name="max_depth" value="-1"/>
+    <integer name="filter_depth" value="-1"/><boolean name="discard_direct_paths" value="false"/>
+    <boolean name="nlos_laser_sampling" value="true"/><boolean name="nlos_hidden_geometry_sampling" value="true"/>
+    <boolean name="nlos_hidden_geometry_sampling_includes_relay_wall" value="false"/>
+    <string name="temporal_filter" value="box"/>
+  </integrator>
+  <emitter type="projector"><rgb name="irradiance" value="1.0, 1.0, 1.0"/><float name="fov" value="0.2"/></emitter>
+  <shape type="rectangle"><transform name="to_world">
+    <scale value="0.4"/><rotate y="1" angle="180"/><translate z="1"/></transform></shape>
+  <shape type="rectangle" id="relay_wall">
+    <sensor type="nlos_capture_meter">
+      <sampler type="independent"><integer name="sample_count" value="32"/><integer name="seed" value="0"/></sampler>
+      <boolean name="confocal" value="false"/><boolean name="account_first_and_last_bounces" value="false"/>
+      <point name="sensor_origin" x="-0.5" y="0.0" z="0.25"/><point name="laser_origin" x="-0.5" y="0.0" z="0.25"/>
+      <point name="laser_lookat_pixel" x="6" y="1" z="0"/>
+      <film type="transient_hdr_film">
+        <integer name="width" value="8"/><integer name="height" value="4"/><integer name="temporal_bins" value="200"/>
+        <float name="bin_width_opl" value="0.02"/><float name="start_opl" value="1.85"/><rfilter type="box"/>
+      </film>
+    </sensor>
+  </shape>
+</scene>"""
+
+
+def test_an_older_scene_of_mitransient(tmp_path):
+    """As its examples are written: the spot at a place of the film, a projector, properties that say nothing."""
+    (tmp_path / "older.xml").write_text(OLDER)
+    capture = tt.nlos.simulate(tmp_path / "older.xml", progress=False)
+    assert capture.transient.shape == (1, 200, 4, 8) and float(capture.transient.sum()) > 0
+    assert capture.metadata["spp"] == 32 and capture.metadata["variant"] == "llvm_ad_mono"
+    found = capture.scan
+    torch.testing.assert_close(found.laser_points, torch.tensor([0.5, -0.5, 0.0]).double(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.sensor_points[0, 0], torch.tensor([-0.875, -0.75, 0]).double(), rtol=0, atol=1e-6)
+    assert found.laser_origin.tolist() == found.sensor_origin.tolist() == [-0.5, 0.0, 0.25]
+
+
+# ---------------------------------------------------------------------------------------------- variants, forecasts
+
+
+def test_the_cheapest_variant():
+    grey = simulated()
+    assert grey.channels == ("L",) and grey.metadata["variant"] == "llvm_ad_mono"
+    assert "every spectrum is grey" in grey.metadata["variant_reason"]
+    for settings in (
+        {"hidden": tt.scenes.nlos_z(albedo=(0.1, 0.5, 0.9))},
+        {"energy": {"type": "rgb", "value": [1.0, 0.5, 0.2]}},
+        {"of": tt.nlos.Scan.grid(tt.nlos.Wall.plane(albedo=(0.1, 0.5, 0.9)), (3, 2), kind="confocal")},
+    ):
+        capture = simulated(**settings)
+        assert capture.channels == ("R", "G", "B") and "colour" in capture.metadata["variant_reason"]
+    assert simulated(variant="llvm_ad_rgb").channels == ("R", "G", "B")
+    assert mi.variant() == VARIANT
+
+
+def test_colours_agree_with_one_channel():
+    a = torch.stack([simulated(spp=256, seed=s).steady[0] for s in range(4)])
+    b = torch.stack([simulated(spp=256, seed=s, variant="llvm_ad_rgb").steady for s in range(4)])
+    assert torch.equal(b[:, 0], b[:, 1])
+    torch.testing.assert_close(a.sum(), b[:, 0].sum(), rtol=1e-5, atol=0)
+
+
+def test_the_light_is_explained():
+    def light(**settings):
+        return simulated(spp=4, **settings).metadata["light"]
+
+    assert light() == "light of three bounces from hidden samples that all scanned points share; no later light"
+    assert light(bounces=(3, 4, 5)).endswith("; light of 4 to 5 bounces from chains that they share")
+    assert light(bounces=(3, 4)).endswith("; light of 4 bounces from chains that they share")
+    assert light(bounces="all").endswith("from chains that they share; light of 8 and more bounces from paths")
+    assert light(bounces=(4,)).startswith("light of three bounces is not asked for; light of 4 bounces from chains")
+    metal = tt.scenes.nlos_z()
+    metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    assert "from paths, since not all surfaces are diffuse" in light(hidden=metal)
+    assert "polarization" in light(variant="llvm_ad_mono_polarized")
+    bent = [[-1, -1, 0.1], [0, -1, 0], [1, -1, 0.1], [-1, 1, 0.1], [0, 1, 0], [1, 1, 0.1]]
+    wall = tt.nlos.Wall.mesh(bent, [[0, 1, 3], [1, 4, 3], [1, 2, 4], [2, 5, 4]])
+    curved = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal", sensor_origin=[0, 0, 0.5], laser_origin=[0, 0, 0.5])
+    assert "from paths, since the wall is not flat" in light(of=curved)
+
+
+def test_a_forecast_is_what_comes(capsys):
+    forecast = tt.nlos.forecast(tt.scenes.nlos_z(), scan("exhaustive"), time_axis=AXIS, spp=256)
+    capture = simulated(of=scan("exhaustive"), spp=256, progress=True)
+    assert forecast.shape == tuple(capture.transient.shape)
+    assert forecast.bytes == capture.transient.numel() * 4 and forecast.seconds >= 0
+    told = capsys.readouterr().err
+    assert "1 x 100 x 1 x 2 x 2 x 3: 4.688 KiB, about" in told and "variant: llvm_ad_mono" in told
+    phasors = tt.nlos.forecast(tt.scenes.nlos_z(), scan(), frequencies=FREQUENCIES, spp=1, variant="llvm_ad_rgb")
+    assert phasors.shape == (3, 3, 2, 3) and phasors.bytes == 54 * 8
+
+
+def test_polarized_captures_have_their_shapes():
+    settings = {"variant": "llvm_ad_mono_polarized", "spp": 8}
+    forecast = tt.nlos.forecast(tt.scenes.nlos_z(), scan(), time_axis=AXIS, **settings)
+    whole, parts = simulated(**settings), simulated(tiles=3, **settings)
+    assert forecast.shape == tuple(whole.transient.shape) == tuple(parts.transient.shape) == (4, 1, 100, 2, 3)
+    assert whole.polarized and parts.polarized and parts.steady.shape == (4, 1, 2, 3)
+
+
+def test_tiles_of_exhaustive_captures_are_few(tmp_path):
+    """Each looks at all spots anew."""
+    for kind, count in (("confocal", 16), ("exhaustive", 4)):
+        forecast = tt.nlos.forecast(
+            tt.scenes.nlos_z(), scan(kind, (8, 4)), time_axis=AXIS, spp=1, part=tmp_path / "a.part"
+        )
+        assert forecast.parts == count and os.listdir(tmp_path) == []
+
+
+def test_a_capture_that_does_not_fit():
+    axis = tt.TimeAxis(0.0, 1e-3, 100_000)
+    large = tt.nlos.Scan.grid(WALL, (100, 100), kind="exhaustive")
+    with pytest.raises(StorageError, match=r"would take .* TiB \(1 x 100000 x 100 x 100 x 100 x 100.*Use fewer bins"):
+        simulated(of=large, time_axis=axis)
+
+
+@pytest.mark.parametrize(
+    ("settings", "bounces"),
+    [((-1, -1, False), "all"), ((-1, -1, True), "all"), ((-1, 2, False), (3,)), ((3, -1, False), (2, 3)),
+     ((4, -1, True), (3, 4)), ((6, 3, True), (4,))],
+)  # fmt: skip
+def test_bounces_of_mitransient(settings, bounces):
+    assert tal_bounces(*settings) == bounces
+
+
+@pytest.mark.parametrize("settings", [(3, 3, False), (2, -1, True), (-1, 1, True), (1, -1, False)])
+def test_bounces_of_mitransient_that_leave_nothing(settings):
+    with pytest.raises(SceneError, match="leave no light"):
+        tal_bounces(*settings)

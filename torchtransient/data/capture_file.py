@@ -1,0 +1,144 @@
+"""A capture around a corner on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Both hold the same names, arrays in torch's order as :class:`~torchtransient.capture.Capture` has them: `transient` (C,
+T, ...) with `start_opl`, `bin_width_opl` (metres of optical path), `num_bins`; `phasor` (C, F, ...) with
+`frequencies_per_metre` float64 (F,) and `phasor_start_opl`; `steady` (C, ...); polarized captures with the four Stokes
+components before C. The scan is float64, in metres: `sensor_points`, `laser_points`, `sensor_origin`, `laser_origin`,
+where they are known `sensor_normals` and `laser_normals`, and `sensor_legs`, `laser_legs`, the ways to the sensor and
+from the laser, whether or not `first_and_last_leg` says that they count. `kind`, `channels`, `metadata` and `wall` are
+texts, the last three JSON; arrays in the wall stand beside it as `wall_0`, `wall_1`, .... What is not there is left
+out. Numbers and texts are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.data import array_file
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.errors import StorageError
+
+FORMAT = "torchtransient capture 1"
+_WHAT = "capture file"
+_MEASURED = ("transient", "phasor", "steady")
+_POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
+# Keys of JSON objects that stand for what JSON does not have.
+_ARRAY, _TUPLE = "__array__", "__tuple__"
+
+
+def check_capture_target(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when a capture could not be written there. For before a long simulation."""
+    return array_file.check_target(path, _WHAT)
+
+
+def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any] | None = None) -> Path:
+    """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
+
+    `metadata`: plain data stored beside the capture's own, which goes before. Gradients are not stored. Raises
+    StorageError for an unknown ending, a folder that is missing, a full disk, metadata or a wall that is not plain
+    data.
+    """
+    target = check_capture_target(path)
+    if not isinstance(capture, Capture):
+        raise StorageError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
+    try:
+        note = json.dumps({**(metadata or {}), **capture.metadata})
+    except (TypeError, ValueError) as error:
+        raise StorageError(f"capture file: metadata must be plain data ({error}).") from error
+    scan = capture.scan
+    entries: dict[str, Any] = {
+        "format": FORMAT, "metadata": note, "channels": json.dumps(capture.channels), "kind": scan.kind,
+        "polarized": int(capture.polarized), "first_and_last_leg": int(scan.first_and_last_leg),
+    }  # fmt: skip
+    given = {name: getattr(capture, name) for name in _MEASURED} | {name: getattr(scan, name) for name in _POINTS}
+    given |= {"sensor_legs": scan.sensor_legs, "laser_legs": scan.laser_legs}
+    arrays = {name: array_of(tensor, _WHAT) for name, tensor in given.items() if tensor is not None}
+    if capture.axis is not None:
+        axis = capture.axis
+        entries |= {"start_opl": axis.start_opl, "bin_width_opl": axis.bin_width_opl, "num_bins": axis.num_bins}
+    if capture.frequencies is not None:
+        arrays["frequencies_per_metre"] = capture.frequencies.per_metre.numpy()
+        entries["phasor_start_opl"] = capture.frequencies.start_opl
+    if scan.wall is not None:
+        parts: list[NDArray[Any]] = []
+        entries["wall"] = json.dumps(_plain(scan.wall, parts, "wall"))
+        arrays |= {f"wall_{number}": part for number, part in enumerate(parts)}
+    write_arrays(target, arrays, entries, _WHAT)
+    return target
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read what `write_capture` wrote, bit by bit, as tensors on the CPU.
+
+    Raises StorageError when the file is missing, damaged or not a capture.
+    """
+    values = read_arrays(path, FORMAT, _WHAT)
+    with damage_said(Path(path), _WHAT):
+        return _capture(values)
+
+
+def _capture(values: Mapping[str, Any]) -> Capture:
+    def tensor(name: str) -> torch.Tensor | None:
+        return torch.from_numpy(np.asarray(values[name])) if name in values else None
+
+    axis = frequencies = None
+    if "num_bins" in values:
+        axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+    if "frequencies_per_metre" in values:
+        found = tuple(np.asarray(values["frequencies_per_metre"]).tolist())
+        frequencies = FrequencyAxis(found, float(values["phasor_start_opl"]))
+    wall = _restored(json.loads(str(values["wall"])), values) if "wall" in values else None
+    points = {name: tensor(name) for name in _POINTS}
+    scan = Scan(str(values["kind"]), **points, first_and_last_leg=bool(values["first_and_last_leg"]), wall=wall)  # type: ignore[arg-type]
+    return Capture(
+        transient=tensor("transient"), axis=axis, scan=scan, metadata=json.loads(str(values["metadata"])),
+        phasor=tensor("phasor"), frequencies=frequencies, steady=tensor("steady"),
+        channels=tuple(json.loads(str(values["channels"]))), polarized=bool(values["polarized"]),
+    )  # fmt: skip
+
+
+# -------------------------------------------------------------------------------------------------------------- walls
+
+
+def _plain(value: Any, parts: list[NDArray[Any]], where: str) -> Any:
+    """What JSON can hold; arrays are put into `parts` and numbered."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry, parts, f"{where}.{name}") for name, entry in value.items()}
+    if isinstance(value, tuple):
+        return {_TUPLE: [_plain(entry, parts, where) for entry in value]}
+    if isinstance(value, list):
+        return [_plain(entry, parts, where) for entry in value]
+    if isinstance(value, torch.Tensor):
+        value = array_of(value, _WHAT)
+    # Transforms of Mitsuba keep their numbers in `matrix`.
+    array = np.asarray(getattr(value, "matrix", value))
+    if array.dtype.kind not in "biufc":
+        raise StorageError(
+            f"capture file: {where} is a {type(value).__name__}, which no file can hold; expected numbers, texts, "
+            "lists, dictionaries and arrays. Write the capture with a scan whose wall is None or of plain data."
+        )
+    parts.append(array)
+    return {_ARRAY: f"wall_{len(parts) - 1}"}
+
+
+def _restored(value: Any, values: Mapping[str, Any]) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {_ARRAY}:
+            return np.asarray(values[value[_ARRAY]])
+        if set(value) == {_TUPLE}:
+            return tuple(_restored(entry, values) for entry in value[_TUPLE])
+        return {name: _restored(entry, values) for name, entry in value.items()}
+    return [_restored(entry, values) for entry in value] if isinstance(value, list) else value

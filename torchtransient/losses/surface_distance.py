@@ -1,0 +1,73 @@
+"""How far two triangle meshes are apart, whatever their vertices are: a loss of shapes and a measure of fits."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torchtransient.errors import ShapeError
+
+# Numbers held at a time of one of the tensors (points, triangles, 3, 3).
+_MOST = 1 << 24
+
+
+def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, cells: int = 4) -> Tensor:
+    """Mean distance of two surfaces, in the unit of the vertices: scalar, differentiable in both.
+
+    From points of each to the nearest point of the other, over the area, and the mean of both ways. `vertices` and
+    `others`: (V, 3), (W, 3); `faces`, `other_faces`: (F, 3), (G, 3), of any order and sense. Points are the middles of
+    `cells`^2 equal parts of each triangle; to the other surface distances are exact. Triangles without area weigh
+    nothing. Time and memory grow with F times G. Raises ShapeError.
+    """
+    for name, mesh, index in (("vertices", vertices, faces), ("others", others, other_faces)):
+        if mesh.ndim != 2 or mesh.shape[1] != 3 or index.ndim != 2 or index.shape[1] != 3 or not len(index):
+            raise ShapeError(
+                f"surface_distance: expected {name} (V, 3) with one or more faces (F, 3), got {tuple(mesh.shape)} and "
+                f"{tuple(index.shape)}."
+            )
+    if cells < 1:
+        raise ShapeError(f"surface_distance: expected cells of at least 1, got {cells}.")
+    first, second = vertices[faces], others[other_faces]
+    return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
+
+
+def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
+    """(N,): distance of points (N, 3) to the nearest of triangles (F, 3, 3), exact and differentiable."""
+    size = max(1, _MOST // (9 * len(triangles)))
+    return torch.cat([_distance(part, triangles) for part in torch.split(points, size)])
+
+
+def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
+    """Mean distance of points of some triangles (F, 3, 3) to others, over the area."""
+    weights = _middles(cells).to(triangles)
+    points = torch.einsum("kc,fcd->fkd", weights, triangles)
+    distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
+    area = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).norm(dim=1)
+    mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
+    return mean
+
+
+def _middles(cells: int) -> Tensor:
+    """Barycentric coordinates (cells^2, 3) of the middles of equal parts of a triangle, upright ones and others."""
+    upright = [(i + 1 / 3, j + 1 / 3) for i in range(cells) for j in range(cells - i)]
+    turned = [(i + 2 / 3, j + 2 / 3) for i in range(cells - 1) for j in range(cells - 1 - i)]
+    u, v = torch.tensor(upright + turned, dtype=torch.float64).T / cells
+    return torch.stack([1 - u - v, u, v], 1)
+
+
+def _distance(points: Tensor, triangles: Tensor) -> Tensor:
+    edges = triangles.roll(-1, 1) - triangles
+    normal = functional.normalize(torch.linalg.cross(edges[:, 0], edges[:, 1]), dim=1)
+    from_corner = points[:, None, None] - triangles
+    squared = edges.square().sum(-1).clamp_min(torch.finfo(edges.dtype).tiny)
+    along = ((from_corner * edges).sum(-1) / squared).clamp(0, 1)
+    to_edges = (from_corner - along[..., None] * edges).square().sum(-1).amin(-1)
+    height = (from_corner[:, :, 0] * normal).sum(-1)
+    inwards = torch.linalg.cross(normal[:, None].expand_as(edges), edges)
+    # A triangle without area has no normal, and its edges are all of it.
+    inside = ((from_corner * inwards).sum(-1) >= 0).all(-1) & (normal.square().sum(-1) > 0)
+    nearest = torch.where(inside, height.square(), to_edges).amin(1)
+    # The root has no slope at zero: there it is taken as zero.
+    apart = nearest > 0
+    return torch.where(apart, torch.where(apart, nearest, torch.ones_like(nearest)).sqrt(), 0.0)

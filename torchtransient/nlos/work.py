@@ -1,0 +1,174 @@
+"""What a simulation has to render, as a whole or in parts: a scan of hidden things, or a complete scene."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import SceneError
+from torchtransient.nlos.recipe_key import recipe_key
+from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
+from torchtransient.nlos.scene import capture_scene
+from torchtransient.nlos.scene_scan import scan_of_scene
+from torchtransient.nlos.variant_choice import VariantChoice
+from torchtransient.render.renderer import TransientRenderer
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.variant import active_variant
+
+
+@dataclass(frozen=True)
+class Film:
+    """What is measured: ``time_axis`` or ``frequencies``, and how well: ``spp``."""
+
+    time_axis: TimeAxis | None
+    frequencies: FrequencyAxis | Sequence[float] | None
+    spp: int
+
+
+class HiddenWork:
+    """A scan of hidden things. Its parts are runs of sensor points: ``tiles`` of them, or less where points are few."""
+
+    sums = False
+
+    def __init__(
+        self, hidden: Any, scan: Scan, settings: dict[str, Any], film: Film, variant: VariantChoice, tiles: int
+    ) -> None:
+        self.hidden, self.scan, self.film, self.variant = hidden, scan.detach(), film, variant
+        self._settings = settings | vars(film) | {"variant": variant.name}
+        self._points = self.scan.sensor_points.reshape(-1, 3)
+        size = -(-len(self._points) // min(tiles, len(self._points)))
+        # Of equal sizes but for the last: a size is a scene to be built.
+        self._runs = [(k, min(k + size, len(self._points))) for k in range(0, len(self._points), size)]
+        self._renderers: dict[int, CaptureRenderer] = {}
+        if self.count > 1:
+            # Of all points before the first part, not of some when their turn comes.
+            check_scan(load(capture_scene(hidden, self.scan, **settings), variant=variant.name), self.scan)
+
+    @property
+    def count(self) -> int:
+        """The number of parts."""
+        return len(self._runs)
+
+    def run(self, number: int) -> tuple[int, int]:
+        """The first sensor point of a part, and the one behind its last."""
+        return self._runs[number]
+
+    def key(self, seed: int) -> str:
+        """What a part file of this work is known by."""
+        return recipe_key(self.hidden, self.scan, self._settings, seed, self._runs)
+
+    def weight(self, number: int) -> float:
+        """Parts are not added up."""
+        return 1.0
+
+    def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
+        """Of the film: one of them."""
+        return self.renderer(0).axis, self.renderer(0).frequencies
+
+    def renderer(self, number: int) -> TransientRenderer:
+        """What renders a part."""
+        return self._of(number).renderer
+
+    def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
+        """A part as a capture: of a list of points where there are several parts."""
+        first, last = self._runs[number]
+        values = {} if self.count == 1 else {POINTS: self._points[first:last]}
+        return self._of(number)(values, seed=seed, spp=spp, progress=progress)
+
+    def _of(self, number: int) -> CaptureRenderer:
+        first, last = self._runs[number]
+        if last - first not in self._renderers:
+            scan, parameters = self.scan, ()  # type: Scan, tuple[str, ...]
+            if self.count > 1:
+                scan, parameters = _listed(self.scan, first, last), (POINTS,)
+            self._renderers[last - first] = CaptureRenderer(self.hidden, scan, parameters, **self._settings)
+        return self._renderers[last - first]
+
+
+class SceneWork:
+    """A complete scene. Its parts are ``passes`` over all sensor points, with a share of the samples each."""
+
+    sums = True
+
+    def __init__(
+        self, scene: Scene, time_axis: TimeAxis | None, frequencies: Any, spp: int | None, variant: VariantChoice,
+        passes: int,
+    ) -> None:  # fmt: skip
+        self._renderer = TransientRenderer(scene, time_axis=time_axis, frequencies=frequencies, spp=spp)
+        used = spp or self._renderer._scene_spp
+        self.film = Film(self._renderer.axis, self._renderer.frequencies, used)
+        self.variant = variant
+        self.count = min(passes, used)
+        with active_variant(scene.variant):
+            self.scan = scan_of_scene(scene.built(self._renderer._options).scene)
+
+    def run(self, number: int) -> tuple[int, int]:
+        """All sensor points."""
+        return 0, math.prod(self.scan.sensor_shape)
+
+    def share(self, number: int) -> int:
+        """The samples of a pass."""
+        whole, more = divmod(self.film.spp, self.count)
+        return whole + (number < more)
+
+    def key(self, seed: int) -> str:
+        """What a part file of this work is known by."""
+        description = self._renderer.scene._description
+        named = re.findall(r'"filename"\s+value\s*=\s*"([^"]+)"', getattr(description, "text", ""))
+        files = [Path(getattr(description, "path", ".")).parent / name for name in named]
+        return recipe_key(description, files, self.film, self.variant.name, seed, self.count)
+
+    def weight(self, number: int) -> float:
+        """What a pass counts in the mean of all samples."""
+        return self.share(number) / self.film.spp
+
+    def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
+        """Of the film: one of them."""
+        return self._renderer.axis, self._renderer.frequencies
+
+    def renderer(self, number: int) -> TransientRenderer:
+        """What renders all parts."""
+        return self._renderer
+
+    def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
+        """A pass as a capture."""
+        out = self._renderer(seed=seed, spp=spp or self.share(number), progress=progress)
+        return as_capture(out, self.scan)
+
+
+Work = HiddenWork | SceneWork
+
+
+def seed_of(seed: int, number: int) -> int:
+    """The seed of a part: independent of those of others."""
+    return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:4], "little")
+
+
+def checked_count(name: str, value: Any, least: int = 1) -> int:
+    """A whole number. Raises SceneError."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise SceneError(f"simulate: {name}: expected a whole number of at least {least}, got {value!r}.")
+    return value
+
+
+def _listed(scan: Scan, first: int, last: int) -> Scan:
+    """The scan of a run of its sensor points."""
+
+    def part(values: torch.Tensor | None) -> torch.Tensor | None:
+        return None if values is None else values.reshape(-1, 3)[first:last]
+
+    points, normals = part(scan.sensor_points), part(scan.sensor_normals)
+    assert points is not None
+    changed: dict[str, Any] = {"sensor_points": points, "sensor_normals": normals}
+    if scan.kind == "confocal":
+        changed |= {"laser_points": points, "laser_normals": normals}
+    return replace(scan, **changed)
