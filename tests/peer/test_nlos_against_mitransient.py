@@ -98,6 +98,23 @@ def test_legs_and_late_light(peer):
     agree(ours(description, 2**15), theirs)
 
 
+@pytest.mark.parametrize("of_theirs, of_ours", [
+    ({"filter_depth": 4}, {"filter_depth": 4}), ({"filter_bounces": 3}, {"filter_bounces": 4}),
+])  # fmt: skip
+def test_light_of_some_bounces(peer, of_theirs, of_ours):
+    """A depth is the same in both; the peer counts one bounce less than there are."""
+    side = plane(0.0) | {
+        "to_world": translate([0.6, 0.0, 0.8]) @ rotate([0, 1, 0], -90) @ scale([0.3, 0.3, 1.0]),
+    }  # fmt: skip
+    settings = {"nlos_hidden_geometry_sampling": False, "max_depth": 5}
+    description = scene({"a": plane(1.0), "b": side}, "single", 3, **settings)
+    theirs = description | {"integrator": description["integrator"] | of_theirs}
+    _, theirs = peer(theirs, range(100, 100 + RUNS), 2**15, VARIANT)
+    mine = ours(description, 2**15, **of_ours)
+    assert 0.95 < mine.sum() / theirs.sum() < 1.05
+    agree(mine, theirs)
+
+
 def test_a_camera_instead_of_a_scan(peer):
     """A perspective sensor that sees the wall from before its near clip plane: the clock starts at the wall."""
     description = scene({"a": plane(1.0, 0.6)}, "single", 4, camera=True)

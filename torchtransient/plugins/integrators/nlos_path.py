@@ -62,11 +62,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         Whether the way from the laser to its spot and from the scanned point to the sensor counts in time.
     ``filter_bounces`` (int, -1)
         Keep only light of so many bounces: 1 is what the laser lights, 2 goes from wall to wall, 3 is light around one
-        corner. -1 keeps all. (In mitransient 1.x, ``filter_bounces = b`` keeps paths of ``b + 1`` bounces with
-        ``nlos_laser_sampling``, and of ``b + 2`` without it.)
+        corner. -1 keeps all. (In mitransient 1.x, ``filter_bounces = b`` keeps paths of ``b + 1`` bounces.)
     ``min_bounces`` (int, 0): leave out light of fewer bounces.
     ``filter_depth`` (int, -1)
-        ``filter_bounces + 1``, as in mitransient.
+        Keep only light of the depth that ``max_depth`` counts: with ``nlos_laser_sampling`` a depth is a number of
+        bounces, as in mitransient; without it, as for Mitsuba's other integrators, one more.
     ``discard_direct_paths`` (bool, false): leave out light of one bounce.
     ``nlos_laser_sampling`` (bool, false)
         Connect every vertex to the laser's spot. Without it lights are sampled as in ``transient_path``, and a laser's
@@ -138,15 +138,16 @@ class TransientNLOSPath(base.TransientIntegrator):
         depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
         if depth != -1 and bounces != -1:
             raise SceneError(
-                "transient_nlos_path: filter_depth and filter_bounces say the same; give one of them, got both."
+                "transient_nlos_path: filter_depth and filter_bounces choose the same light; give one, not both."
             )
-        bounces = depth - 1 if depth != -1 else bounces
-        if bounces == -1:
+        if depth != -1:
+            bounces = depth if self.laser_sampling else depth - 1
+        if bounces == -1 and depth == -1:
             return None
         if bounces < 1:
             raise SceneError(
-                "transient_nlos_path: filter_bounces: expected -1 or a number >= 1 (filter_depth: >= 2), got "
-                f"{bounces} bounces."
+                "transient_nlos_path: filter_bounces, filter_depth: expected -1, or a number that leaves light of at "
+                f"least one bounce, got {bounces} bounces."
             )
         depth = bounces if self.laser_sampling else bounces + 1
         if depth > self.max_depth:
