@@ -158,15 +158,15 @@ def test_general_paths(case, kind):
 @pytest.mark.parametrize("key", ["a.to_world", "b.to_world", "b.bsdf.reflectance.value"])
 def test_late_light(key):
     """Light of four and five bounces, which a second plate sends to the first one."""
-    change = add if key.endswith("value") else move(0, 0, 1) if key[0] == "a" else move(1, 0, 0)
+    change = add if key.endswith("value") else move(1, 0, 0)
     scene = scan_scene(plate() | {"b": side()}, "confocal", film(2, **SMOOTH), max_depth=5, min_bounces=4)
     capture = Capture(scene, key, change)
-    seeds, spp, h = 8, 2**15, 0.02 if key.endswith("value") else 1e-2
+    seeds, spp, h = 8, 2**15, 0.02 if key.endswith("value") else 3e-2
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     differences = np.array([capture.difference(h, 10 + seed, spp) for seed in range(seeds)])
     error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / seeds)
     assert abs(reverse.mean() - differences.mean()) < 4 * error
-    assert error < 0.2 * abs(reverse.mean())
+    assert error < 0.05 * abs(reverse.mean())
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
 
 
