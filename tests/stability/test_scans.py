@@ -31,11 +31,13 @@ def far_scene(scale, how):
 def test_scenes_of_every_size(how, scale):
     """From a millimetre to a kilometre: the same bins, and a brightness that falls with the area.
 
-    Rays of general paths start 1.5e-5 m beside a surface, as all of Mitsuba's: not for scenes of millimetres.
+    Rays of general paths start 9e-5 m (1 + largest coordinate) beside a surface, as all of Mitsuba's. Light that leaves
+    there is nearer to what it falls on: 1.3e-4 brighter at a metre, 2.5e-3 at 5 cm. Not for scenes of millimetres.
     """
+    offset = 8.94e-5 * (1 + scale / 2) / (0.9 * scale) if how == "paths" and scale < 1 else 0
     here = captures(far_scene(1.0, how), 2**12, 1)[0]
     there = captures(far_scene(scale, how), 2**12, 1)[0] * scale**2
-    assert there.sum() == pytest.approx(here.sum(), rel=1e-3)
+    assert there.sum() == pytest.approx(here.sum(), rel=1e-3 + 2 * offset)
     # A point may fall on the other side of the edge of a bin.
     assert np.abs(there - here).sum() < 0.02 * here.sum()
 
