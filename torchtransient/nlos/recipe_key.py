@@ -32,6 +32,9 @@ def _text(value: Any) -> str:
     # Transforms of Mitsuba keep their numbers in `matrix`.
     if hasattr(value, "matrix"):
         value = np.asarray(value.matrix)
+    # Dr.Jit's arrays and all that numpy can read; as text large ones are abbreviated.
+    if hasattr(value, "__array__") or hasattr(value, "__dlpack__"):
+        value = np.asarray(value)
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}{hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
     if hasattr(value, "vertices") and hasattr(value, "faces"):

@@ -23,7 +23,7 @@ from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import objects_below
-from torchtransient.plugins.sampling.area_elements import can_be_listed
+from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
 from torchtransient.plugins.sampling.shared_samples import draw_samples
@@ -47,6 +47,9 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     others = [bsdf.id() or bsdf.class_name() for bsdf in contents.bsdfs if not is_lambertian(bsdf)]
     if others:
         return f"not all surfaces are diffuse ({', '.join(others[:3])})"
+    wall = sensor.get_shape()
+    if wall is not None and has_shading_normals(wall):
+        return f"normals are interpolated on the relay wall ({wall.id() or wall.class_name()})"
     unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
     if unlisted:
         return f"points cannot be drawn on {', '.join(unlisted[:3])}"

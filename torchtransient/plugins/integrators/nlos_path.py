@@ -128,11 +128,20 @@ class TransientNLOSPath(base.TransientIntegrator):
         props.get("block_size", 0)
         self.min_bounces = int(props.get("min_bounces", 0))
         self.only_bounces = self._bounces_of(props)
-        if self.min_bounces > (self.max_depth if self.only_bounces is None else self.only_bounces):
+        settings = self.settings()
+        if self.only_bounces is not None and self.only_bounces < self._fewest():
             raise SceneError(
-                f"transient_nlos_path: min_bounces {self.min_bounces} leaves out everything up to max_depth "
-                f"{self.max_depth} or filter_bounces; the picture would be black."
+                f"transient_nlos_path: filter_bounces chooses light of {self.only_bounces} bounces, which min_bounces "
+                "or discard_direct_paths leaves out: the picture would be black."
             )
+        if settings.min_depth > settings.max_depth:
+            raise SceneError(
+                f"transient_nlos_path: min_bounces {self._fewest()} leaves out everything up to max_depth "
+                f"{self.max_depth}: the picture would be black. Set max_depth to at least {settings.min_depth}."
+            )
+
+    def _fewest(self) -> int:
+        return max(2 if self.discard_direct_paths else 0, self.min_bounces)
 
     def _bounces_of(self, props: Any) -> int | None:
         depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
@@ -181,7 +190,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     def settings(self) -> PathSettings:
         # The light's own way is a segment where lights are sampled, and none where its spot is.
         light = 0 if self.laser_sampling else 1
-        first, last = max(2 if self.discard_direct_paths else 0, self.min_bounces), None
+        first, last = self._fewest(), None
         if self.only_bounces is not None:
             first = last = self.only_bounces
         most = self.max_depth if last is None else last + light
@@ -383,7 +392,7 @@ def capture_type(given: Any) -> CaptureType:
         names = {c.name.lower(): c for c in CaptureType}
         if given.lower() in names:
             return names[given.lower()]
-    elif int(given) in (c.value for c in CaptureType):
+    elif float(given) in (c.value for c in CaptureType):
         return CaptureType(int(given))
     raise SceneError(
         f"transient_nlos_path: capture_type: expected single, confocal or exhaustive (or 1, 2, 3), got {given!r}."
