@@ -209,4 +209,4 @@ def test_second_backward_and_batches():
     """Adjoints accumulate; nothing of one pass is left in the next."""
     capture = Capture(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
     first, again = capture.reverse(1, 4096), capture.reverse(1, 4096)
-    assert first == again
+    assert first == pytest.approx(again, rel=1e-5)  # threads add in the order they come

@@ -84,8 +84,9 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def same_bits(a, b):
-    torch.testing.assert_close(a, b, rtol=0, atol=0)
+def same(a, b):
+    """To the rounding of sums that threads add to in the order they come."""
+    torch.testing.assert_close(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
 
 
 def run(*arguments):
@@ -99,7 +100,7 @@ def test_a_capture_of_a_description(folder, kind):
     assert result.exit_code == 0, result.output
     found = tt.nlos.read_capture("own.h5")
     expected = tt.nlos.simulate(**tt.nlos.read_setup("own.yaml"), tiles=3, progress=False)
-    same_bits(found.transient, expected.transient)
+    same(found.transient, expected.transient)
     assert found.scan == expected.scan
     assert found.metadata["scene"] == "own.yaml" and found.metadata["seed"] == 5 and found.metadata["spp"] == 16
     sizes = " x ".join(map(str, expected.transient.shape))
@@ -113,7 +114,7 @@ def test_options_replace_what_the_file_says(folder):
     found = tt.nlos.read_capture("a.npz")
     setup = tt.nlos.read_setup("own.yaml") | {"spp": 8, "seed": 2, "variant": "llvm_ad_rgb"}
     expected = tt.nlos.simulate(**setup, progress=False)
-    same_bits(found.transient, expected.transient)
+    same(found.transient, expected.transient)
     assert found.channels == ("R", "G", "B")
 
 
@@ -156,7 +157,7 @@ def test_scenes_of_mitsuba(folder):
     found = tt.nlos.read_capture("a.h5")
     assert found.transient.shape == (1, 60, 2, 5) and found.scan.kind == "confocal"
     expected = tt.nlos.simulate(tt.load("scene.xml", res=5), tiles=2, progress=False)
-    same_bits(found.transient, expected.transient)
+    same(found.transient, expected.transient)
     assert found.metadata["parameters"] == ["res=5"] and "share" in found.metadata["light"]
 
 
@@ -259,7 +260,7 @@ def test_a_killed_simulation_goes_on(folder, signal_name):
     found = tt.nlos.read_capture(folder / "a.h5")
     setup = tt.nlos.read_setup(folder / "own.yaml") | {"spp": 200000}
     expected = tt.nlos.simulate(**setup, tiles=6, progress=False)
-    same_bits(found.transient, expected.transient)
+    same(found.transient, expected.transient)
     first = [number for number, count, _ in kept.values() for number in range(number, number + count)]
     cube = found.transient.flatten(2)[0].T.numpy()
     np.testing.assert_array_equal(rows[first, :60], cube[first])

@@ -262,7 +262,7 @@ WRONG = {
     "two filters": ({"filter_bounces": 3, "filter_depth": 4}, "give one"),
     "a filter that leaves nothing": ({"filter_bounces": 4}, "max_depth"),
     "min_bounces that leaves nothing": ({"min_bounces": 4}, "black"),
-    "min_bounces by other lights": ({"nlos_laser_sampling": False, "min_bounces": 3, "max_depth": 3}, "at least 4"),
+    "min_bounces by other lights": ({"nlos_laser_sampling": False, "min_bounces": 3, "max_depth": 3}, "4 at least"),
     "a filter of what is left out": ({"filter_bounces": 1, "discard_direct_paths": True}, "discard_direct_paths"),
     "a filter below min_bounces": ({"filter_bounces": 2, "min_bounces": 3}, "min_bounces"),
     "a half capture type": ({"capture_type": 2.7}, "single, confocal or exhaustive"),

@@ -27,6 +27,11 @@ def scan(kind="confocal", size=(3, 2), **settings):
     return tt.nlos.Scan.grid(WALL, size, kind=kind, **settings)
 
 
+def same(a, b):
+    """To the rounding of sums that threads add to in the order they come."""
+    torch.testing.assert_close(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
+
+
 def simulated(hidden=None, of=None, **settings):
     settings = {"time_axis": AXIS, "spp": 64, "progress": False} | settings
     if "frequencies" in settings:
@@ -72,7 +77,8 @@ def test_parts_in_a_file_and_without(tmp_path, kind, film):
     kept = simulated(of=scan(kind), part=path, tiles=4, **film)
     without = simulated(of=scan(kind), tiles=4, **film)
     whole = simulated(of=scan(kind), **film)
-    assert torch.equal(measured(kept), measured(without)) and os.listdir(tmp_path) == []
+    same(measured(kept), measured(without))
+    assert os.listdir(tmp_path) == []
     assert (kept.axis, kept.frequencies, kept.scan, kept.channels) == (
         whole.axis, whole.frequencies, whole.scan, whole.channels,
     )  # fmt: skip
@@ -120,8 +126,8 @@ def test_a_simulation_that_was_stopped_goes_on(tmp_path, monkeypatch, of, stops_
     stops_at = 99
     capture = tt.nlos.simulate(*given, **settings)
     assert rendered == list(range(4))
-    for a, b in ((capture.transient, expected.transient), (capture.steady, expected.steady)):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    same(capture.transient, expected.transient)
+    same(capture.steady, expected.steady)
     assert os.listdir(tmp_path) == []
 
 
@@ -169,7 +175,7 @@ def test_a_sensor_sees_the_whole_capture(tmp_path):
 
     offset = torch.rand((), generator=torch.Generator().manual_seed(1))
     for settings in ({}, {"tiles": 2}):
-        assert torch.equal(seen(**settings), 2 * simulated(**settings).transient + offset)
+        same(seen(**settings), 2 * simulated(**settings).transient + offset)
 
 
 def test_devices_are_sensors():
@@ -201,7 +207,7 @@ def test_a_complete_scene_is_its_scan(kind):
     """The scene that a capture is made of, handed over as it is: the same numbers, and the scan read off it."""
     capture = tt.nlos.simulate(complete(kind), spp=64, progress=False)
     expected = simulated(of=scan(kind))
-    assert torch.equal(capture.transient, expected.transient)
+    same(capture.transient, expected.transient)
     found, wanted = capture.scan, expected.scan
     assert (found.kind, found.shape, found.first_and_last_leg) == (wanted.kind, wanted.shape, False)
     for name in ("sensor_points", "laser_points", "sensor_normals", "laser_normals", "sensor_origin", "laser_origin"):

@@ -1,8 +1,8 @@
 """``tt.nlos.simulate``: a capture with a bar, told of memory and time before, and with a file that keeps what is done.
 
 With a part file, a scan of hidden things is rendered in tiles of sensor points, and a complete scene in passes over all
-of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was, and ends
-with the bits that it would have had.
+of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was; parts that
+were done keep their bits.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def simulate(
     ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
     ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
     ``generator`` (devices draw their counts); its answer has the same bins.
-    ``seed``: same seed and parts, same capture.
+    ``seed``: same seed and parts, same capture, to the rounding of sums that threads add to in the order they come.
 
     ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
     that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.

@@ -136,8 +136,8 @@ class TransientNLOSPath(base.TransientIntegrator):
             )
         if settings.min_depth > settings.max_depth:
             raise SceneError(
-                f"transient_nlos_path: min_bounces {self._fewest()} leaves out everything up to max_depth "
-                f"{self.max_depth}: the picture would be black. Set max_depth to at least {settings.min_depth}."
+                f"transient_nlos_path: min_bounces {self._fewest()} needs a max_depth of {settings.min_depth} at least, "
+                f"got {self.max_depth}: the picture would be black."
             )
 
     def _fewest(self) -> int:
@@ -146,9 +146,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     def _bounces_of(self, props: Any) -> int | None:
         depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
         if depth != -1 and bounces != -1:
-            raise SceneError(
-                "transient_nlos_path: filter_depth and filter_bounces choose the same light; give one, not both."
-            )
+            raise SceneError("transient_nlos_path: filter_depth and filter_bounces choose the same: give one of them.")
         if depth != -1:
             bounces = depth if self.laser_sampling else depth - 1
         if bounces == -1 and depth == -1:
