@@ -1,8 +1,8 @@
 """``tt.nlos.simulate``: a capture with a bar, told of memory and time before, and with a file that keeps what is done.
 
 With a part file, a scan of hidden things is rendered in tiles of sensor points, and a complete scene in passes over all
-of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was; parts that
-were done keep their bits.
+of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was; parts
+that were done keep their bits.
 """
 
 from __future__ import annotations

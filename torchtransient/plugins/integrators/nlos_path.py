@@ -136,7 +136,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             )
         if settings.min_depth > settings.max_depth:
             raise SceneError(
-                f"transient_nlos_path: min_bounces {self._fewest()} needs a max_depth of {settings.min_depth} at least, "
+                f"transient_nlos_path: min_bounces {self._fewest()} needs max_depth {settings.min_depth} at least, "
                 f"got {self.max_depth}: the picture would be black."
             )
 
