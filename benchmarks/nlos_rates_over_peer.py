@@ -66,7 +66,7 @@ def main() -> None:
     parser = comparison_arguments(__doc__)
     parser.set_defaults(variant="llvm_ad_mono", peer_python=os.environ.get("TORCHTRANSIENT_PEER_PYTHON"))
     options = parser.parse_args()
-    scan, spp = (4, 16) if options.quick else (32, 1024)
+    scan, spp = (4, 16) if options.quick else (32, 4096)
     hidden = {"Z": letter(), "plane": plate(1, 1, (0, 0, 1)), "body": body(1 if options.quick else 3)}
     comparison = Comparison(options, spp)
     with tempfile.TemporaryDirectory() as folder:

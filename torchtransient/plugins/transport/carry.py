@@ -25,11 +25,13 @@ class Carry:
     d: Any      # Vector3f    ray direction, likewise
     x: Any      # Point3f     start of the segment, where its transmittance matters
     w: Any      # Vector3f    direction at the far end of the segment, for ``si.wi`` there
+    p: Any      # Point3f     far end of the segment, where segments say where their ends are
+    n: Any      # Normal3f    normal there, likewise
 
     @staticmethod
     def zeros() -> Carry:
         """No adjoint or tangent."""
-        vectors = (mi.Vector3f(0) for _ in range(4))
+        vectors = (mi.Vector3f(0) for _ in range(6))
         return Carry(mi.Spectrum(0), mi.Float(0), mi.Float(0), *vectors)
 
 

@@ -114,6 +114,8 @@ class Segment(Strategy):
     """
 
     name = "segment"
+    # Fields of the Carry that derivatives go through for its sake.
+    carried: tuple[str, ...] = ()
 
     def first(self, world: Any, ray: Any, sampler: Any) -> Any:
         """The leg of a primary ray."""

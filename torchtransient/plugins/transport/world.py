@@ -58,6 +58,8 @@ class World:
         with dr.resume_grad():  # tables are attached where the parameters are
             for strategy in self.strategies():
                 strategy.prepare(self)
+        # The fields of the Carry that derivatives go through.
+        self.carried = () if wanted is None else wanted.carried + self.segment.carried
         self._built = True
 
     def __setattr__(self, name: str, value: Any) -> None:

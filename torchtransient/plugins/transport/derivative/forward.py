@@ -49,16 +49,16 @@ def vertex_tangents(world, v, tangent):
     """
     wanted = world.wanted
     with dr.resume_grad():
-        carry = attached_carry(v, wanted, tangent)
+        carry = attached_carry(v, world.carried, tangent)
         terms, out, _ = vertex_terms(world, v, carry, wanted)
         values = [term.value for term in terms]
         slopes = [term.slope for term in terms]
-        carried = [getattr(out, name) for name in wanted.carried]
+        carried = [getattr(out, name) for name in world.carried]
         found = tangents_of(values + slopes + carried)
     n = len(terms)
     for term, d_value, d_opl in zip(terms, found[:n], found[n : 2 * n], strict=True):
         term.value, term.d_value, term.d_opl, term.slope = dr.detach(term.value), d_value, d_opl, None
-    return terms, with_fields(Carry.zeros(), wanted.carried, found[2 * n :])
+    return terms, with_fields(Carry.zeros(), world.carried, found[2 * n :])
 
 
 def step_on(world, layout, store, block, events, ray, k, live, tangent, dL):

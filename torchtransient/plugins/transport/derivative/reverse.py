@@ -25,17 +25,17 @@ def step_back(world, layout, store, block, ray, k, live, adjoint, following):
     v = RecordedVertex(layout, store, k, live, ray)
     v.next = following
     with dr.resume_grad():
-        carry = attached_carry(v, wanted)
+        carry = attached_carry(v, world.carried)
         terms, out, vertex = vertex_terms(world, v, carry, wanted)
-        objective = inner(adjoint, out, wanted.carried)
+        objective = inner(adjoint, out, world.carried)
         for term in terms:
             A, slope = block.read(term.opl, term.active)
             objective += total_of(A, term.value)
             if wanted.geometry:
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
         dr.backward_from(dr.select(live, objective, 0))
-        before = adjoint_of(carry, wanted.carried)
-    return choose(live, before, adjoint, wanted.carried), vertex.end
+        before = adjoint_of(carry, world.carried)
+    return choose(live, before, adjoint, world.carried), vertex.end
 
 
 @dr.syntax

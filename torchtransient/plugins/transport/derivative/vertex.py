@@ -44,13 +44,17 @@ class AttachedVertex(Local):
     """
 
 
-def attached_carry(v, wanted, tangents=None):
-    """The recorded Carry that arrives at a vertex, with leaves for what is wanted."""
+def attached_carry(v, names, tangents=None):
+    """The recorded Carry that arrives at a vertex, with leaves for the fields ``names``."""
     # A leaf has the width of the lanes, or its gradient would be summed up over them.
     zero = dr.zeros(mi.Float, dr.width(v.ray.d))
     o, d = mi.Point3f(v.ray.o), mi.Vector3f(v.ray.d)
-    carry = Carry(β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d))
-    return attach(carry, wanted.carried, tangents)
+    # Of its ends, the derivatives alone are asked for.
+    carry = Carry(
+        β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d), p=mi.Point3f(o),
+        n=mi.Normal3f(d),
+    )  # fmt: skip
+    return attach(carry, names, tangents)
 
 
 def vertex_terms(world, v, carry, wanted):

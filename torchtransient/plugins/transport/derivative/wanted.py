@@ -20,7 +20,7 @@ class Wanted:
     ``sensor``: the sensor moves. ``index``: an index of refraction changes. ``ray``: the ray itself is handed on,
     behind delta lobes or a sensor that moves. ``plain``: where a point slides on its surface, nothing but its place
     changes. ``extinction``: that of a medium changes. ``carried``: the fields of the :class:`~..carry.Carry` that
-    derivatives go through.
+    derivatives go through, beside those of the segments.
 
     ``effects``: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
     """

@@ -12,7 +12,9 @@ from torchtransient.plugins.transport.strategy import Answer, Step
 
 
 class Lambertian(Surface):
-    """:class:`.surface.Surface` for scenes that :meth:`fits`; derivatives are those of surfaces."""
+    """:class:`.surface.Surface` for scenes that :meth:`fits`."""
+
+    turns_freely = True
 
     @staticmethod
     def fits(contents):
@@ -25,10 +27,8 @@ class Lambertian(Surface):
         vertex.u_delay = vertex.u_part = None
         vertex.bsdf = si.bsdf(path.ray)
         vertex.delay, vertex.scattered_si = DelaySample(vertex.bsdf), si
-        # On the back of a one-sided surface nothing scatters.
-        vertex.side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(vertex.bsdf) & (si.wi.z < 0), -1, 0))
-        ρ = mi.unpolarized_spectrum(vertex.bsdf.eval_diffuse_reflectance(si, vertex.goes_on))
-        vertex.ρ = dr.select(vertex.goes_on, ρ, 0)
+        vertex.side = _side(vertex.bsdf, si)
+        vertex.ρ = _albedo(vertex.bsdf, si, vertex.goes_on)
         vertex.connectable = mi.Bool(True)
 
     def scatter(self, world, path, vertex, proposals, sampler):
@@ -53,10 +53,34 @@ class Lambertian(Surface):
     @staticmethod
     def _towards(vertex, d):
         """The :class:`~..strategy.Answer` towards the world direction ``d``."""
-        pdf = dr.maximum(dr.dot(vertex.si.sh_frame.n, d) * vertex.side, 0) * dr.inv_pi
+        cos = dr.dot(vertex.si.sh_frame.n, d) * vertex.side
+        pdf = dr.select(cos > 0, cos, 0) * dr.inv_pi
         value = vertex.ρ * pdf
         return Answer(value=value, matrix=value, pdf=pdf, eta=mi.Float(1))
 
     def value_towards(self, world, path, vertex, out, active):
         answer = self._towards(vertex, out)
         return answer.value, answer.pdf
+
+    # ----------------------------------------------------------------------------------------------- attached
+
+    def look_up_attached(self, world, vertex, wanted):
+        super().look_up_attached(world, vertex, wanted)
+        vertex.side = _side(vertex.bsdf, vertex.sid)
+        vertex.ρ = _albedo(vertex.bsdf, vertex.si, vertex.v.active & vertex.sid.is_valid())
+
+    def eval_pdf(self, vertex, wo, out, active, sampled):
+        towards = self._towards(vertex, out)
+        return dr.select(active, towards.value, 0), dr.select(active, towards.pdf, 0)
+
+
+def _side(bsdf, si):
+    """1 where light comes from the front, -1 from the back, 0 where nothing scatters: on the back of a one-sided
+    surface.
+    """
+    wi_z = dr.detach(si.wi.z)
+    return dr.select(wi_z > 0, 1, dr.select(scatters_behind(bsdf) & (wi_z < 0), -1, 0))
+
+
+def _albedo(bsdf, si, active):
+    return dr.select(active, mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, active)), 0)

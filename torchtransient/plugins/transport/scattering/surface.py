@@ -28,6 +28,9 @@ class Surface(Scattering):
     ``guides``: a list of :class:`~..strategy.Guide`, whose shares sum to less than one.
     """
 
+    # Whether light scatters alike around the normal, whatever the tangents are.
+    turns_freely = False
+
     def __init__(self, guides=()):
         self.guides = list(guides)
         if sum(guide.share for guide in self.guides) >= 1 or any(guide.share <= 0 for guide in self.guides):
@@ -294,9 +297,11 @@ class Surface(Scattering):
                 far_away = slope_only(world.contents.distant.length(si.p, following.d))
                 longer = dr.select(smooth & ~ahead, far_away, longer)
             slope = slope + dr.detach(η) * longer
+        p, n = (motion.p, motion.n) if "p" in world.carried else (mi.Point3f(0), mi.Normal3f(0))
         carry = Carry(
-            β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w
-        )
+            β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w, p=p,
+            n=n,
+        )  # fmt: skip
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
 
 

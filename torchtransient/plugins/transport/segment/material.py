@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import distance, material_point
+from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local
 
@@ -25,18 +26,55 @@ class MaterialVacuum(Vacuum):
     behind delta lobes: all others are points of their shapes.
     """
 
+    def prepare(self, world):
+        moving = frozenset() if world.wanted is None or not world.wanted.geometry else world.wanted.shapes
+        self.triangles = AttachedTriangles(world.scene.shapes(), moving)
+        # A point and its normal are all that Lambertian surfaces ask for: whoever has gathered a triangle's vertices to
+        # go there hands them on, and each is back-propagated to once.
+        self.carried = ("p", "n") if moving and self.triangles.holds_all and world.scattering.turns_freely else ()
+
+    def tables(self):
+        return [table for table in self.triangles.tables() if dr.grad_enabled(table)]
+
     def attached(self, world, v, carry, wanted):
         vertex = super().attached(world, v, carry, wanted)
-        if not wanted.geometry:
-            return vertex
-        free = self._free(world, v)
-        followed, _ = material_point(v.pi, v.ray, free & vertex.sid.is_valid(), world.contents.meshes)
-        si = dr.select(free, dr.replace_grad(vertex.sid, followed), vertex.si)
-        si.wi = dr.select(vertex.sid.is_valid(), si.to_local(-carry.w), -carry.w)
-        vertex.si = si
-        # The vertex before has counted the segment between two material points.
-        vertex.slope = dr.select(free, carry.slope, vertex.slope)
+        if wanted.geometry:
+            # The vertex before has counted the segment between two material points.
+            vertex.slope = dr.select(self._free(world, v), carry.slope, vertex.slope)
         return vertex
+
+    def attached_surface(self, world, v, carry, ray, wanted, active):
+        if not wanted.geometry:
+            return super().attached_surface(world, v, carry, ray, wanted, active)
+        # Each lane asks for one of the two: what is back-propagated to a surface is scattered for every active lane.
+        free = self._free(world, v)
+        found = super().attached_surface(world, v, carry, ray, wanted, active & ~free)
+        return dr.select(free, self._material(v, carry, active & free), found)
+
+    def _material(self, v, carry, active):
+        """Hit points that follow their shapes."""
+        flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+        if not self.carried:
+            return v.pi.compute_surface_interaction(v.ray, flags, active)
+        with dr.suspend_grad():
+            si = v.pi.compute_surface_interaction(v.ray, flags, active)
+        si.p, si.n = dr.replace_grad(si.p, carry.p), dr.replace_grad(si.n, carry.n)
+        si.sh_frame.n = dr.replace_grad(si.sh_frame.n, carry.n)
+        return si
+
+    def _place(self, world, pi, ray, n, active):
+        """(point, normal, area element) of hit points that follow their shapes, whose normals are ``n``."""
+        with dr.suspend_grad():
+            listed = active & self.triangles.lists(pi.shape)
+        point = self.triangles.point(pi, listed)
+        twice = dr.norm(point.across)
+        if self.triangles.holds_all:
+            with dr.suspend_grad():
+                si, area = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & ~listed), 1
+        else:
+            si, area = material_point(pi, ray, active & ~listed, world.contents.meshes)
+        across = dr.mulsign(point.across / twice, dr.dot(dr.detach(point.across), n))
+        return dr.select(listed, point.p, si.p), dr.select(listed, across, si.n), dr.select(listed, twice, area)
 
     @staticmethod
     def _free(world, v):
@@ -45,16 +83,16 @@ class MaterialVacuum(Vacuum):
     def motion(self, world, vertex, following, ahead):
         v, si = vertex.v, vertex.scattered_si
         after = v.after()
-        point, area = material_point(after.pi, after.ray, ahead, world.contents.meshes)
-        to = dr.select(ahead, point.p - si.p, mi.Vector3f(following.d))
+        p, n, area = self._place(world, after.pi, after.ray, following.n, ahead)
+        to = dr.select(ahead, p - si.p, mi.Vector3f(following.d))
         r2 = dr.squared_norm(to)
         d = to * dr.rsqrt(r2)
-        cos = dr.abs_dot(dr.select(ahead, point.n, mi.Normal3f(dr.detach(d))), d)
+        cos = dr.abs_dot(dr.select(ahead, n, mi.Normal3f(dr.detach(d))), d)
         measure = dr.select(ahead & (cos > 0), area * cos / r2, 1)
-        longer = slope_only(distance(si.p, point.p, ahead))
+        longer = slope_only(distance(si.p, p, ahead))
         return Local(
             d=dr.replace_grad(mi.Vector3f(following.d), d), J=dr.relative_grad(measure), drag=mi.Vector3f(0),
-            longer=lambda: longer,
+            longer=lambda: longer, p=dr.select(ahead, p, 0), n=dr.select(ahead, n, 0),
         )  # fmt: skip
 
 

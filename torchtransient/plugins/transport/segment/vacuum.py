@@ -117,10 +117,14 @@ class Vacuum(Segment):
         ray = mi.Ray3f(v.ray)
         if not wanted.plain:
             ray.o, ray.d = carry.o, carry.d
-        si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, v.active)
+        return self.arrived(world, v, carry, ray, self.attached_surface(world, v, carry, ray, wanted, v.active), wanted)
+
+    def attached_surface(self, world, v, carry, ray, wanted, active):
+        """What ``ray`` finds where ``active``: attached to it and to the surface, along the ray."""
+        si = surface_interaction(world.surfaces, v.pi, ray, mi.RayFlags.All, active)
         if wanted.plain:  # an attached ray would have every shape differentiated
-            si.p = si.p + slide(displacement(carry.o, v.active), v.ray.d, dr.detach(si.n), v.active)
-        return self.arrived(world, v, carry, ray, si, wanted)
+            si.p = si.p + slide(displacement(carry.o, active), v.ray.d, dr.detach(si.n), active)
+        return si
 
     def arrived(self, world, v, carry, ray, si, wanted):
         """The attached vertex at ``si``, behind the optical length of its segment."""
