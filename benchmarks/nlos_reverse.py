@@ -36,7 +36,8 @@ def built(name: str, kind: str, how: str, points: int):
     film |= {"temporal_bins": 512, "bin_width_opl": 0.0048, "start_opl": 1.6, "temporal_filter": "tent"}
     scene = mi.load_dict(as_mitsuba(description))
     parameters = mi.traverse(scene)
-    key = next(key for key in parameters.keys() if key.endswith("vertex_positions") and not key.startswith("wall"))
+    found = (key for key in parameters.keys() if key.endswith("vertex_positions"))  # noqa: SIM118 (not a dictionary)
+    key = next(key for key in found if not key.startswith("wall"))
     return scene, parameters, key
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.around_corner.geometry import occluded
+from torchtransient.plugins.around_corner.geometry import OFFSET, occluded
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 from torchtransient.plugins.sampling.shared_samples import samples_at
 from torchtransient.plugins.sampling.sobol import DIMENSIONS, sobol, unit_double, unit_float
@@ -120,7 +120,7 @@ def _cosine_direction(n: Any, numbers: list[Any], which: tuple[int, int]) -> Any
 def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> Vertices:
     """What a ray meets. Offsets as in :func:`.geometry.occluded`, by the size of the hidden scene."""
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
-    offset = dr.mulsign(mi.math.RayEpsilon * reach, dr.dot(start.geometric_n, d))
+    offset = dr.mulsign(OFFSET * reach, dr.dot(start.geometric_n, d))
     ray = mi.Ray3f(mi.Point3f(start.p + start.geometric_n * offset), d)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -153,7 +153,7 @@ def _guided_step(scene: Any, plan: ChainPlan, start: Vertices, numbers: list[Any
     cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(mi.Float(x), unit_float(v)))
     reach = dr.max(dr.abs(start.p)) + dr.norm(plan.center - start.p)
     side = dr.select(guided, dr.dot(start.geometric_n, point - start.p), 1)
-    origin = mi.Point3f(start.p + start.geometric_n * dr.mulsign(mi.math.RayEpsilon * reach, side))
+    origin = mi.Point3f(start.p + start.geometric_n * dr.mulsign(OFFSET * reach, side))
     to = mi.Vector3f(point - origin)
     d = dr.select(guided, dr.normalize(to), mi.Frame3f(mi.Normal3f(start.n)).to_world(cosine))
     cos = dr.dot(start.n, d)

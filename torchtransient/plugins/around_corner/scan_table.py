@@ -11,18 +11,98 @@ import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.mitsuba_compat import is_flat_shape
+from torchtransient.plugins.node_walk import shown_by
+from torchtransient.plugins.pointer_table import registry_number
 
-# A beam that ends so much before its target, in parts of its length, was stopped by something else.
-SAME_PLACE = 1e-3
 # Wall points along each side of a scan that stand for all of it in densities.
 ACROSS = 5
+# Height of points over a plane, in parts of their extent, that single precision cannot tell from none.
+FLAT = 1e-6
 _FIELDS = ("p", "n", "sh_frame", "uv", "dp_du", "dp_dv")
+
+
+class ScanTable:
+    """What a scan looks at and where its laser falls, traced once a job.
+
+    ``scene``, ``sensor``; ``rays`` (Ray3f, one a pixel, attached where the sensor is), ``found``
+    (PreliminaryIntersection3f of those); ``spots`` (:class:`LaserSpots`), None where lights are sampled. Built with
+    gradients enabled, outside of traced code.
+    """
+
+    def __init__(self, scene: Any, sensor: Any, capture: CaptureType, fov: float | None, laser: bool) -> None:
+        self.scene, self.sensor = scene, sensor
+        self.rays, self.spots = scan_rays(sensor), None
+        with dr.suspend_grad():
+            self.found = scene.ray_intersect_preliminary(dr.detach(self.rays), coherent=True)
+            dr.eval(self.found)
+        if laser:
+            aims = aims_of(scene, sensor, capture, fov)
+            check_count(aims, sensor, capture)
+            self.spots = LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
+        self.wall = self._wall()
+
+    def seen(self) -> Any:
+        """What the rays meet (SurfaceInteraction3f), attached where sensor or shape are."""
+        return self.found.compute_surface_interaction(self.rays, mi.RayFlags.All)
+
+    def reference_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Some 5 x 5 points of the relay wall, spread over the scan, and the normals there on the sensor's side: ``(P,
+        3)``.
+        """
+        size = self.sensor.film().crop_size()
+        columns, rows = (np.unique(np.linspace(0, int(n) - 1, min(int(n), ACROSS)).round().astype(int)) for n in size)
+        index = mi.UInt32((rows[:, None] * int(size[0]) + columns).ravel().astype(np.uint32))
+        with dr.suspend_grad():
+            found = dr.gather(mi.PreliminaryIntersection3f, self.found, index)
+            si = found.compute_surface_interaction(dr.gather(mi.Ray3f, dr.detach(self.rays), index), mi.RayFlags.All)
+            n = dr.select(si.wi.z < 0, -si.n, si.n)
+            dr.eval(si.p, n, si.t)
+        valid = np.isfinite(np.array(si.t))
+        if not valid.any():
+            _check_hit(np.array(si.t), "sensor")
+        return np.array(si.p).T[valid], np.array(n).T[valid]
+
+    def _wall(self) -> list[Any] | None:
+        """The shapes that rays and beams end on, where all of these lie in one plane: no point of such a wall lights
+        another. None where they do not, or where no laser says where beams end.
+        """
+        if self.spots is None:
+            return None
+        met = {int(k) for each in (self.found.shape, self.spots.shape) for k in np.unique(_numbers(each))} - {0}
+        shapes = [shape for shape in self.scene.shapes() if registry_number(shape) in met]
+        return shapes if len(shapes) == len(met) and _in_one_plane(shapes) else None
+
+
+def _numbers(pointers: Any) -> np.ndarray:
+    return np.array(dr.reinterpret_array(mi.UInt32, pointers))
+
+
+def _in_one_plane(shapes: list[Any]) -> bool:
+    corners = [_corners(shape) for shape in shapes]
+    if not shapes or any(each is None for each in corners):
+        return False
+    v = np.concatenate(corners)
+    spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
+    return len(spread) < 3 or bool(spread[2] <= FLAT * max(spread[0], np.abs(v).max()))
+
+
+def _corners(shape: Any) -> np.ndarray | None:
+    """Points that span a shape (N, 3), None for one that is curved."""
+    if shape.is_mesh():
+        return np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
+    if not is_flat_shape(shape):
+        return None
+    shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
+    m = np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
+    return m[:3, 3] + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]) @ m[:3, :3].T
 
 
 class LaserSpots:
     """The spots of a laser on what its beam meets first.
 
-    ``si`` (SurfaceInteraction3f of all spots), ``length`` (Float, from the laser), ``origin`` (Point3f).
+    ``si`` (SurfaceInteraction3f of all spots), ``length`` (Float, from the laser), ``origin`` (Point3f),
+    ``shape`` (ShapePtr: what they lie on).
     """
 
     def __init__(self, scene: Any, laser: Any, aims: Any, origin: Any) -> None:
@@ -34,6 +114,7 @@ class LaserSpots:
             pi = scene.ray_intersect_preliminary(dr.detach(self.ray), coherent=True)
             dr.eval(pi)
         si = pi.compute_surface_interaction(self.ray, mi.RayFlags.All)
+        self.shape = pi.shape
         _check_hit(np.array(pi.t), "laser")
         self.length = dr.norm(si.p - self.origin)
         # What lanes read of it and may be attached, see :meth:`arrays`; its other fields are told by the lanes.
@@ -132,22 +213,6 @@ def scanned_points(scene: Any, sensor: Any) -> Any:
         dr.eval(pi)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
     return dr.select(si.is_valid(), si.p, ray.o + ray.d)
-
-
-def reference_points(scene: Any, sensor: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Some 5 x 5 points of the relay wall, spread over the scan, and the normals there on the sensor's side: ``(P,
-    3)``.
-    """
-    size = sensor.film().crop_size()
-    columns, rows = (np.unique(np.linspace(0, int(n) - 1, min(int(n), ACROSS)).round().astype(int)) for n in size)
-    index = (rows[:, None] * int(size[0]) + columns).ravel()
-    rays = dr.gather(mi.Ray3f, dr.detach(scan_rays(sensor)), mi.UInt32(index.astype(np.uint32)))
-    si = scene.ray_intersect(rays)
-    p, n = np.array(si.p).T, np.array(dr.select(si.wi.z < 0, -si.n, si.n)).T
-    found = np.array(si.is_valid())
-    if not found.any():
-        _check_hit(np.array(si.t), "sensor")
-    return p[found], n[found]
 
 
 def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:

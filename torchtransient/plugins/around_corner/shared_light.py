@@ -15,21 +15,17 @@ from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.late_density import late_density
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.scan_job import ScanJob
-from torchtransient.plugins.around_corner.scan_table import ACROSS, LaserSpots, reference_points, scan_rays
+from torchtransient.plugins.around_corner.scan_table import ACROSS, ScanTable
 from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
-from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
 from torchtransient.plugins.sampling.shared_samples import draw_samples
-
-# Light of the laser's spot, of a hidden point, of the scanned point.
-BOUNCES = 3
 
 
 def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
@@ -53,31 +49,17 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
     if unlisted:
         return f"points cannot be drawn on {', '.join(unlisted[:3])}"
+    if contents.doubled_faces:
+        faces = [f"{count} of {name}" for name, count in contents.doubled_faces.items()]
+        return f"some triangles lie in others, and areas would count twice ({', '.join(faces[:3])})"
     return None
 
 
-def elements_of(scene: Any, sensor: Any, includes_wall: bool) -> HiddenElements:
-    """The table of hidden elements; of the relay wall as well where it is asked for."""
-    return HiddenElements(_hidden(scene, sensor, includes_wall), *reference_points(scene, sensor))
-
-
-def _hidden(scene: Any, sensor: Any, includes_wall: bool) -> list[Any]:
-    wall = None if includes_wall else sensor.get_shape()
-    return [shape for shape in scene.shapes() if wall is None or shape.ptr != wall.ptr]
-
-
-def wall_lights_itself(sensor: Any) -> bool:
-    """Whether points of the relay wall can see each other, as far as its kind says: whether it is not flat."""
-    wall = sensor.get_shape()
-    return wall is not None and not is_flat_shape(wall) and not _is_flat_mesh(wall)
-
-
-def _is_flat_mesh(shape: Any) -> bool:
-    if not shape.is_mesh():
-        return False
-    v = np.array(dr.detach(shape.vertex_positions_buffer()), dtype=np.float64).reshape(-1, 3)
-    spread = np.linalg.svd(v - v.mean(0), compute_uv=False)
-    return len(spread) < 3 or bool(spread[2] <= 1e-6 * spread[0])
+def elements_of(table: ScanTable, without: list[Any] | None) -> HiddenElements:
+    """The table of hidden elements of a scan, but for those of the shapes ``without``."""
+    left_out = {shape.ptr for shape in without or []}
+    shapes = [shape for shape in table.scene.shapes() if shape.ptr not in left_out]
+    return HiddenElements(shapes, *table.reference_points())
 
 
 @dataclass
@@ -92,10 +74,9 @@ class ScanLight:
     energy: Any
 
 
-def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType, legs: bool) -> ScanLight:
+def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
     """Of the scene as it is now."""
-    origin = mi.Point3f(sensor.origin)
-    seen = seen_points(scene, sensor)
+    origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.seen()
     looked_at = _points(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
     si = dr.copy(spots.si)
     si.wi = si.to_local(-spots.ray.d)
@@ -110,15 +91,6 @@ def scan_light(scene: Any, sensor: Any, spots: LaserSpots, capture: CaptureType,
     else:
         factor = spots.energy([], index, cos, si.is_valid()) * cos
     return ScanLight(looked_at, _points(si, factor * dr.inv_pi, spots.length if legs else mi.Float(0)), energy)
-
-
-def seen_points(scene: Any, sensor: Any) -> Any:
-    """What the rays of a scan meet (SurfaceInteraction3f), attached where sensor or shape are."""
-    ray = scan_rays(sensor)
-    with dr.suspend_grad():
-        pi = scene.ray_intersect_preliminary(dr.detach(ray), coherent=True)
-        dr.eval(pi)
-    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _same(spots: Any, points: Any) -> bool:
@@ -157,13 +129,14 @@ def _rows(vectors: Any, width: int) -> np.ndarray:
     return np.broadcast_to(np.array(dr.detach(vectors), dtype=np.float64).T, (width, 3))
 
 
-def add_late_light(job: Any, scene: Any, sensor: Any, film: Any, bounces: tuple[int, int], run: Any) -> None:
-    """Add the light of these bounces (first, last) to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
+def add_late_light(table: ScanTable, film: Any, job: Any, bounces: range, run: Any) -> None:
+    """Add the light of these numbers of bounces to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
     ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
     """
-    elements = late_density(scene, job.elements, *reference_points(scene, sensor))
-    film_job = ScanJob(scene, film, job.light.sensors, job.light.energy, run.progress)
-    LateLight(film_job, elements, job.light.spots, job.capture, bounces).add(run.samples, run.seed)
+    elements = late_density(table.scene, job.elements, *table.reference_points())
+    film_job = ScanJob(table.scene, film, job.light.sensors, job.light.energy, run.progress)
+    ends = bounces[0], bounces[-1]
+    LateLight(film_job, elements, job.light.spots, job.capture, ends).add(run.samples, run.seed)
 
 
 class SharedThirdBounce:
@@ -226,9 +199,7 @@ class SharedThirdBounce:
     def add(self, progress: Any = None) -> None:
         """Add the light to the film."""
         light = self.light
-        third = ThirdBounce(
-            self.world.scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile
-        )
+        third = ThirdBounce(self.world.scene, self.film, self.samples, light.sensors, light.energy, progress, self.tile)
         if self.capture is CaptureType.CONFOCAL:
             third.add_confocal(self.light.spots)
         elif self.capture is CaptureType.SINGLE:

@@ -217,10 +217,6 @@ class TransientIntegrator(mi.CppADIntegrator):
             length = dr.detach(rays.length())
         return mi.Float64(length) - film.start_opl
 
-    def walks(self, world):
-        """Whether paths bring some of a job's light."""
-        return True
-
     def beside(self, world, sensor, film, seed, samples):
         """What derivatives of a job have beside its paths: objects with ``tables()`` (attached to the parameters),
         ``backward(incoming)`` and ``forward()``. Raises GradientError where one is needed and cannot be computed.
@@ -297,7 +293,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
             # edges, and the first pass would be the only one to arrive.
             with dr.isolate_grad(), contents.hidden_from_mitsuba():
-                for job in jobs if self.walks(world) else ():
+                for job in jobs if world.walks else ():
                     self._backward_pass(world, sensor, film, job, incoming)
                     dr.eval()
                 for part in beside:
@@ -362,7 +358,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 propagate_tangents(self.parameters(scene), world.tables() + tables)
             film.prepare(self.aov_names(), samples)
             with contents.hidden_from_mitsuba():
-                for job in jobs if self.walks(world) else ():
+                for job in jobs if world.walks else ():
                     self._forward_pass(world, sensor, film, job)
                     dr.eval(film.bands[job.band][2], film.steady)
                 for part in beside:

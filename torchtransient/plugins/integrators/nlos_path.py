@@ -12,26 +12,19 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.around_corner.division import BOUNCES, Division
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
 from torchtransient.plugins.around_corner.outlines import follows_outlines, mutual_occlusion, silhouettes
-from torchtransient.plugins.around_corner.scan_table import (
-    LaserSpots,
-    aims_of,
-    check_count,
-    laser_of,
-    origin_of,
-    scan_rays,
-)
+from torchtransient.plugins.around_corner.scan_table import ScanTable, laser_of, scan_rays
 from torchtransient.plugins.around_corner.shared_light import (
-    BOUNCES,
     SharedThirdBounce,
     add_late_light,
     elements_of,
     scan_light,
-    wall_lights_itself,
     why_not,
 )
 from torchtransient.plugins.integrators import base
+from torchtransient.plugins.integrators.base import UNLIMITED
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -44,10 +37,14 @@ from torchtransient.plugins.transport.segment.material import FoundVacuum, Mater
 from torchtransient.plugins.transport.segment.media import Media
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 from torchtransient.plugins.transport.strategy import Local
-from torchtransient.plugins.transport.world import PathSettings
+from torchtransient.plugins.transport.world import PathSettings, World
 
 # Share of the samples drawn over the hidden area: at the relay wall, and beyond it.
 AT_WALL, BEYOND = 0.9, 0.25
+NOT_FLAT = (
+    "the wall is not flat, or scanned points and laser spots lie off it, and points of walls that see each other from "
+    "nearby weigh without bound"
+)
 
 
 class TransientNLOSPath(base.TransientIntegrator):
@@ -186,78 +183,95 @@ class TransientNLOSPath(base.TransientIntegrator):
         return self.laser_sampling
 
     def settings(self) -> PathSettings:
-        # The light's own way is a segment where lights are sampled, and none where its spot is.
-        light = 0 if self.laser_sampling else 1
         first, last = self._fewest(), None
         if self.only_bounces is not None:
             first = last = self.only_bounces
-        most = self.max_depth if last is None else last + light
-        least = first + light if first else 0
+        most = self.max_depth if last is None else last + self._light_segments
+        least = first + self._light_segments if first else 0
         return PathSettings(
             most, self.rr_depth, bool(self.hide_emitters), bool(self.discard_direct_light), not self.legs, least
         )
 
-    def beside_paths(self, scene: Any, contents: Any, wanted: Any = None) -> tuple[int, int] | None:
-        """First and last number of bounces whose light comes from shared samples and chains, None where all comes from
-        paths. Raises SceneError where it has to come from those and cannot.
+    @property
+    def _light_segments(self) -> int:
+        """By how much depths exceed numbers of bounces: where lights are sampled, their own way is a segment."""
+        return 0 if self.laser_sampling else 1
+
+    def asked_bounces(self) -> tuple[int, int | None]:
+        """The smallest and the largest number of bounces whose light is asked for, the latter None without a limit."""
+        settings, light = self.settings(), self._light_segments
+        most = None if settings.max_depth == UNLIMITED else settings.max_depth - light
+        return max(settings.min_depth - light, 0), most
+
+    def scan_table(self, scene: Any, sensor: Any) -> ScanTable:
+        """What the scan of a job looks at and where its laser falls."""
+        fov = None if self.equal_grids or self.capture is not CaptureType.EXHAUSTIVE else self.laser_fov
+        with dr.resume_grad():
+            return ScanTable(scene, sensor, self.capture, fov, self.laser_sampling)
+
+    def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
+        """Who finds which light. ``table``: the :class:`ScanTable` of the job, where it is known. Raises SceneError
+        where light has to come from shared samples and cannot.
         """
         settings = self.settings()
         asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}
         if wanted is not None:  # chains have no derivatives, nor have exhaustive captures from shared samples
             asked = {} if self.capture is CaptureType.EXHAUSTIVE else {"third_bounce": asked["third_bounce"]}
-        found = {}
-        for name, (choice, first, last) in asked.items():
-            first, last = max(first, settings.min_depth), min(last, settings.max_depth)
-            unbounded = choice == "auto" and wall_lights_itself(contents.sensor)
-            if choice != "paths" and first <= last and not unbounded:
-                found[name] = (choice, first, last)
-        if not found:
-            return None
+        ranges = {
+            name: (choice, range(max(first, settings.min_depth), min(last, settings.max_depth) + 1))
+            for name, (choice, first, last) in asked.items()
+            if choice != "paths"
+        }
+        ranges = {name: found for name, found in ranges.items() if found[1]}
+        from_paths = Division(range(0), settings.max_depth)
+        if not ranges:
+            return from_paths
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
             reason = why_not(scene, contents.sensor, contents)
         else:
             reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
-        for name, (choice, _, _) in found.items():
+        for name, (choice, _) in ranges.items():
             if reason and choice != "auto":
                 raise SceneError(f"transient_nlos_path: {name} is {choice!r}, but {reason}. Set it to 'auto'.")
-        return None if reason else (min(r[1] for r in found.values()), max(r[2] for r in found.values()))
+        if reason:
+            return replace(from_paths, why_not=reason)
+        wall = (table or self.scan_table(scene, contents.sensor)).wall
+        shared = [found for choice, found in ranges.values() if wall is not None or choice != "auto"]
+        if not shared:
+            return replace(from_paths, why_not=NOT_FLAT)
+        bounces = range(shared[0].start, shared[-1].stop)
+        division = Division.of(bounces, settings.min_depth, settings.max_depth, wall is None)
+        return division if wall is not None else replace(division, why_not=NOT_FLAT)
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
+        table = self.scan_table(scene, contents.sensor)
         if settings is None:
             settings = self.settings()
-            beside = self.beside_paths(scene, contents, wanted)
-            most = settings.max_depth
-            if beside is not None and wanted is None and beside[1] == most:
-                # Paths that have nothing to find beyond end before.
-                most = max(beside[0] - 1, 1)
-            settings = replace(settings, left_out=beside, max_depth=most)
-        return super().world(scene, contents, wanted, window, settings)
+            division = self.division(scene, contents, wanted, table)
+            # Paths that have nothing to find beyond end before.
+            most = settings.max_depth if wanted is not None else max(division.longest, 1)
+            settings = replace(settings, division=division, max_depth=most)
+        return World(scene, contents, settings, self.strategies(contents, table), wanted, window)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
-        if world.left_out is None:
-            super().add_light(world, sensor, film, job)
-            return
-        first, last = world.left_out
-        parts = []
-        if first == BOUNCES:
-            parts.append(lambda run: self._shared(world, sensor, film, run.seed, run.samples).add(run.progress))
-        if last >= FIRST:
-            bounces = max(first, FIRST), last
-            of_scan = Local(
-                light=self._light(world, sensor), elements=self._elements(world, sensor), capture=self.capture
-            )
-            parts.append(lambda run: add_late_light(of_scan, world.scene, sensor, film, bounces, run))
-        if self.walks(world):
+        division, parts = world.division, []
+        if division.third_bounce:
+            parts.append(lambda run: self._shared(world, film, run.seed, run.samples).add(run.progress))
+        if division.chained:
+            table = self._table(world)
+            of_scan = Local(light=self._light(table), elements=self._elements(world), capture=self.capture)
+            parts.append(lambda run: add_late_light(table, film, of_scan, division.chained, run))
+        if division.walks:
             parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
         for i, part in enumerate(parts):
             part(replace(job, progress=_share_of(job.progress, i, len(parts))))
 
-    def strategies(self, contents: Any) -> Any:
-        guides = self._guides(contents)
+    def strategies(self, contents: Any, table: ScanTable) -> Any:
+        guides = self._guides(contents, table)
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
         scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
-        return self._segment(contents)(), scattering, self._connections(contents)
+        return self._segment(contents)(), scattering, self._connections(table)
 
     def _segment(self, contents: Any) -> type:
         if contents.media is not None:
@@ -268,28 +282,18 @@ class TransientNLOSPath(base.TransientIntegrator):
             return Vacuum
         return FoundVacuum if self.hidden_sampling else MaterialVacuum
 
-    def _connections(self, contents: Any) -> list[Any]:
+    def _connections(self, table: ScanTable) -> list[Any]:
         if not self.laser_sampling:
             return [EmitterFound(), EmitterSampled()]
-        sensor, capture = contents.sensor, self.capture
-        fov = None if self.equal_grids or capture is not CaptureType.EXHAUSTIVE else self.laser_fov
+        return [LaserSpot(table, self.capture is CaptureType.CONFOCAL, self.legs)]
 
-        def read_spots(scene: Any) -> LaserSpots:
-            aims = aims_of(scene, sensor, capture, fov)
-            check_count(aims, sensor, capture)
-            return LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
-
-        return [LaserSpot(read_spots, capture is CaptureType.CONFOCAL, self.legs)]
-
-    def _guides(self, contents: Any) -> list[HiddenGeometry]:
+    def _guides(self, contents: Any, table: ScanTable) -> list[HiddenGeometry]:
         if not self.hidden_sampling:
             return []
-
-        def read_elements(scene: Any) -> HiddenElements:
-            return elements_of(scene, contents.sensor, self.samples_wall)
-
+        wall = contents.sensor.get_shape()
+        without = None if self.samples_wall or wall is None else [wall]
         shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
-        return [HiddenGeometry(read_elements, *shares)]
+        return [HiddenGeometry(elements_of(table, without), *shares)]
 
     # ----------------------------------------------------------------------------------- primary rays
 
@@ -318,13 +322,6 @@ class TransientNLOSPath(base.TransientIntegrator):
 
     # ----------------------------------------------------------------------------------- derivatives
 
-    def walks(self, world: Any) -> bool:
-        if world.left_out is None:
-            return True
-        (first, last), settings = world.left_out, self.settings()
-        shortest = settings.min_depth < BOUNCES and wall_lights_itself(world.contents.sensor)
-        return settings.max_depth > last or settings.min_depth <= BOUNCES < first or shortest
-
     def silhouettes(self, scene: Any) -> str:
         sensors = scene.sensors()
         contents = self.contents(scene, sensors[0]) if sensors else None
@@ -336,32 +333,31 @@ class TransientNLOSPath(base.TransientIntegrator):
     def beside(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> list[Any]:
         if not self.laser_sampling:
             return []
-        shared = [self._shared(world, sensor, film, seed, samples)] if self._shares(world) else []
-        ray = dr.detach(scan_rays(sensor))
-        scanned = _scanned(world.scene, sensor).compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        edges = mutual_occlusion(self, world, sensor, film, seed, samples, scanned)
+        shared = [self._shared(world, film, seed, samples)] if world.division.third_bounce else []
+        edges = mutual_occlusion(self, world, sensor, film, seed, samples, dr.detach(self._table(world).seen()))
         return shared if edges is None else [*shared, edges]
 
     @staticmethod
-    def _shares(world: Any) -> bool:
-        """Whether light of three bounces comes from shared samples."""
-        return world.left_out is not None and world.left_out[0] == BOUNCES
+    def _table(world: Any) -> ScanTable:
+        return next(c.table for c in world.connections if isinstance(c, LaserSpot))
 
-    def _light(self, world: Any, sensor: Any) -> Any:
-        spots = next(c.spots for c in world.connections if isinstance(c, LaserSpot))
+    def _light(self, table: ScanTable) -> Any:
         with dr.resume_grad():
-            return scan_light(world.scene, sensor, spots, self.capture, self.legs)
+            return scan_light(table, self.capture, self.legs)
 
-    def _elements(self, world: Any, sensor: Any) -> HiddenElements:
-        includes_wall = self.samples_wall or wall_lights_itself(sensor)
+    def _elements(self, world: Any) -> HiddenElements:
+        """Hidden points as shared samples draw them: on the wall, too, where it lights itself."""
+        table = self._table(world)
         guides = [guide for guide in world.scattering.guides if isinstance(guide, HiddenGeometry)]
-        if guides and includes_wall == self.samples_wall:
+        wall = [] if self.samples_wall or table.wall is None else table.wall
+        of_guide = [] if self.samples_wall or table.sensor.get_shape() is None else [table.sensor.get_shape()]
+        if guides and {shape.ptr for shape in wall} == {shape.ptr for shape in of_guide}:
             # The paths' own table; a copy, of which elements may be put in another order.
             return copy(guides[0].elements)
-        return elements_of(world.scene, sensor, includes_wall)
+        return elements_of(table, wall)
 
-    def _shared(self, world: Any, sensor: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
-        light, elements = self._light(world, sensor), self._elements(world, sensor)
+    def _shared(self, world: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
+        light, elements = self._light(self._table(world)), self._elements(world)
         return SharedThirdBounce(world, film, light, elements, self.capture, (seed, samples))
 
 

@@ -16,7 +16,8 @@ from torchtransient.plugins.transport.instances import AttachedSurfaces
 @dataclass(frozen=True)
 class PathSettings:
     """The parameters of an integrator that a walk asks for, see :class:`.TransientIntegrator`. ``min_depth``: events
-    of smaller depths do not count. ``left_out``: nor do those of these depths (first, last).
+    of smaller depths do not count. ``division``: who finds light of which depths
+    (:class:`~..around_corner.division.Division`), None where paths find all.
     """
 
     max_depth: int
@@ -25,7 +26,7 @@ class PathSettings:
     discard_direct_light: bool
     camera_unwarp: bool
     min_depth: int = 0
-    left_out: tuple[int, int] | None = None
+    division: Any = None
 
 
 class World:
@@ -40,7 +41,7 @@ class World:
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
         self.scene, self.contents, self.wanted = scene, contents, wanted
         self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
-        self.left_out = settings.left_out
+        self.division = settings.division
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
@@ -94,6 +95,11 @@ class World:
         return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property
+    def walks(self) -> bool:
+        """Whether there is light that paths have to find."""
+        return self.division is None or self.division.walks
+
+    @property
     def index_changes(self) -> bool:
         """Whether paths can run in media of different indices of refraction, or through delta lobes."""
         return self.contents.delta or self.contents.refraction is not None
@@ -101,10 +107,10 @@ class World:
     def deep_enough(self, active: Any, depth: Any) -> Any:
         """Which events of depth ``depth`` (UInt32) count."""
         active = active if self.min_depth == 0 else active & (depth >= self.min_depth)
-        if self.left_out is None:
+        if self.division is None or not self.division.shared:
             return active
-        first, last = self.left_out
-        return active & ((depth < first) | (depth > last))
+        shared = self.division.shared
+        return active & ((depth < shared.start) | (depth >= shared.stop))
 
     def in_time(self, active: Any, τ: Any, p: Any) -> Any:
         """Which paths of length ``τ`` up to the point ``p`` can still have an event that the film counts."""

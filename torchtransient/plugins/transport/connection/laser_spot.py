@@ -26,7 +26,7 @@ from torchtransient.plugins.transport.strategy import Connection, Event, EventTe
 class LaserSpot(Connection):
     """Light that was scattered once by a laser spot.
 
-    ``read_spots(scene)``: the :class:`~torchtransient.plugins.around_corner.scan_table.LaserSpots` of the job.
+    ``table``: the :class:`~torchtransient.plugins.around_corner.scan_table.ScanTable` of the job, with its spots.
     ``confocal``: each path ends at the spot that it started from. ``legs``: the way from the laser to the spot counts.
     An event's depth is its number of bounces: the laser's own way is no segment of the path.
     """
@@ -34,12 +34,9 @@ class LaserSpot(Connection):
     name = "laser_spot"
     finds_light = False
 
-    def __init__(self, read_spots, confocal, legs):
-        self.read_spots, self.confocal, self.legs = read_spots, confocal, legs
-        self.spots, self.index = None, None
-
-    def prepare(self, world):
-        self.spots = self.read_spots(world.scene)
+    def __init__(self, table, confocal, legs):
+        self.table, self.spots, self.confocal, self.legs = table, table.spots, confocal, legs
+        self.index = None
 
     def tables(self):
         return [array for array in self.spots.arrays() if dr.grad_enabled(array)]

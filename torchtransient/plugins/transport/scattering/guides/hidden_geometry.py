@@ -11,7 +11,7 @@ from torchtransient.plugins.transport.strategy import Guide
 class HiddenGeometry(Guide):
     """Draws points on hidden surfaces, more of them where the relay wall sees most of the light.
 
-    ``read_elements(scene)``: the :class:`~torchtransient.plugins.sampling.hidden_elements.HiddenElements` of the job.
+    ``elements``: the :class:`~torchtransient.plugins.sampling.hidden_elements.HiddenElements` of the job.
     ``at_wall``: its share of the samples that leave the first vertex; ``beyond``: of the others. Hidden surfaces light
     each other best as their BSDFs say, so ``beyond`` is small, and less than one since a body close to another one
     would have no bounded variance.
@@ -19,13 +19,8 @@ class HiddenGeometry(Guide):
 
     name = "hidden_geometry"
 
-    def __init__(self, read_elements, at_wall, beyond):
-        self.read_elements, self.at_wall, self.share = read_elements, at_wall, beyond
-        self.elements = None
-
-    def prepare(self, world):
-        with dr.suspend_grad():
-            self.elements = self.read_elements(world.scene)
+    def __init__(self, elements, at_wall, beyond):
+        self.elements, self.at_wall, self.share = elements, at_wall, beyond
 
     def share_at(self, depth):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
