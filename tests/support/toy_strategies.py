@@ -99,8 +99,8 @@ class AreaOfShape(Guide):
         self.shape = next(shape for shape in world.scene.shapes() if shape.id() == self.shape_id)
         self.per_area = 1 / self.shape.surface_area()
 
-    def draw(self, world, vertex, u):
-        return self.shape.sample_position(0.0, u).p, mi.ShapePtr(self.shape), None
+    def draw(self, world, vertex, x, y):
+        return self.shape.sample_position(0.0, mi.Point2f(mi.Float(x), y)).p, mi.ShapePtr(self.shape), None
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))

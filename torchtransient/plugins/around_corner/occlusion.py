@@ -121,13 +121,15 @@ class MutualOcclusion:
         leg = rays.leg if rays.leg is not None else world.scene.ray_intersect_preliminary(ray, coherent=True)
         seen = leg.compute_surface_interaction(rays.ray, mi.RayFlags.All)
         found = seen.is_valid()
-        lit = self.spots.spot(ray.wavelengths, found)
-        found &= lit.is_valid()
-        place = Local(seen=dr.detach(seen), lit=dr.detach(lit), seen_at=seen.p, lit_at=lit.p, ray=ray, found=found)
+        spot = self.spots.general_spot(ray.wavelengths, found)
+        found &= spot.valid
+        place = Local(
+            seen=dr.detach(seen), lit=dr.detach(spot.si), spot=spot, seen_at=seen.p, lit_at=spot.p, ray=ray, found=found
+        )  # fmt: skip
         place.before = self.integrator.first_opl(self.film, rays)
         if not world.camera_unwarp:
             place.before += mi.Float64(dr.norm(place.seen.p - ray.o) * dr.detach(rays.η))
-        place.before += mi.Float64(dr.detach(self.spots.leg(found)))
+        place.before += mi.Float64(dr.detach(spot.leg))
         place.η = dr.detach(rays.η)
         edge = self._edge_point(pixel, job)
         views = [self._term(place, edge, from_spot=False)]
@@ -195,7 +197,7 @@ class MutualOcclusion:
         active &= (r_seen > 0) & (r_spot > 0) & (cos_seen > EDGE_ON) & (cos_spot > EDGE_ON)
         at_wall = self._scattered(seen, place.ray.d, d_seen, active)
         hidden = self._scattered(si, d_seen, d_spot, active)
-        light = self.spots.light(lit, d_spot, active)
+        light = dr.detach(place.spot.light(d_spot, active))
         value = product(at_wall, product(hidden, light))
         # The cosine towards the spot is in the BSDF's value.
         measure = dr.rcp(dr.square(r_spot)) if not from_spot else cos_seen / (cos_spot * dr.square(r_seen))

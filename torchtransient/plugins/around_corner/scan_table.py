@@ -11,9 +11,12 @@ import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
+from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.sampling.area_elements import has_shading_normals
 
 # Wall points along each side of a scan that stand for all of it in densities.
 ACROSS = 5
@@ -41,6 +44,15 @@ class ScanTable:
             check_count(aims, sensor, capture)
             self.spots = LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
         self.wall = self._wall()
+
+    def lambertian_spots(self, legs: bool) -> WallPoints | None:
+        """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with
+        normals that are interpolated, or in light with wavelengths or a polarization.
+        """
+        if self.wall is None or mi.is_spectral or mi.is_polarized:
+            return None
+        diffuse = all(is_lambertian(shape.bsdf()) and not has_shading_normals(shape) for shape in self.wall)
+        return self.spots.points(legs) if diffuse else None
 
     def seen(self) -> Any:
         """What the rays meet (SurfaceInteraction3f), attached where sensor or shape are."""
@@ -128,6 +140,22 @@ class LaserSpots:
         frame = self.si.sh_frame
         fields = [getattr(self.si, name) for name in _FIELDS if name != "sh_frame"]
         return [*fields, frame.s, frame.t, frame.n, self.length, self.ray.d]
+
+    def lit(self) -> Any:
+        """SurfaceInteraction3f of the spots, as they are lit."""
+        si = dr.copy(self.si)
+        si.wi = si.to_local(-self.ray.d)
+        return si
+
+    def points(self, legs: bool, *, energy: bool = True) -> WallPoints:
+        """The spots on a diffuse wall without wavelengths: what they scatter of the light that falls on them, or with
+        ``energy=False`` of a beam of one joule. ``legs``: the way from the laser counts.
+        """
+        si, factor = self.lit(), mi.UnpolarizedSpectrum(1)
+        if energy:
+            cos = dr.abs_dot(si.n, self.ray.d)
+            factor = self.energy([], dr.arange(mi.UInt32, dr.width(si.p)), cos, si.is_valid()) * cos
+        return points_of(si, factor * dr.inv_pi, self.length if legs else mi.Float(0))
 
     def energy(self, wavelengths: Any, index: Any, cos: Any, active: Any) -> Any:
         """What falls on a spot, per colour, and per cosine ``cos`` of the beam there (UnpolarizedSpectrum).

@@ -19,7 +19,7 @@ from torchtransient.plugins.around_corner.scan_table import ACROSS, ScanTable
 from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
-from torchtransient.plugins.around_corner.wall_points import WallPoints
+from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
@@ -77,20 +77,14 @@ class ScanLight:
 def scan_light(table: ScanTable, capture: CaptureType, legs: bool) -> ScanLight:
     """Of the scene as it is now."""
     origin, spots, seen = mi.Point3f(table.sensor.origin), table.spots, table.seen()
-    looked_at = _points(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
-    si = dr.copy(spots.si)
-    si.wi = si.to_local(-spots.ray.d)
-    cos = dr.abs_dot(si.n, spots.ray.d)
-    index = dr.arange(mi.UInt32, dr.width(si.p))
-    factor, energy = mi.UnpolarizedSpectrum(1), mi.UnpolarizedSpectrum(1)
-    if hasattr(spots.emitter, "energy_at"):
-        energy = spots.emitter.energy_at([], True)
-        same_legs = not legs or bool(dr.all(spots.origin == origin))
-        if capture is CaptureType.EXHAUSTIVE and same_legs and _same(si, seen):
-            return ScanLight(looked_at, looked_at, energy)
-    else:
-        factor = spots.energy([], index, cos, si.is_valid()) * cos
-    return ScanLight(looked_at, _points(si, factor * dr.inv_pi, spots.length if legs else mi.Float(0)), energy)
+    looked_at = points_of(seen, dr.inv_pi, dr.norm(seen.p - origin) if legs else mi.Float(0))
+    if not hasattr(spots.emitter, "energy_at"):
+        return ScanLight(looked_at, spots.points(legs), mi.UnpolarizedSpectrum(1))
+    energy = spots.emitter.energy_at([], True)
+    same_legs = not legs or bool(dr.all(spots.origin == origin))
+    if capture is CaptureType.EXHAUSTIVE and same_legs and _same(spots.lit(), seen):
+        return ScanLight(looked_at, looked_at, energy)
+    return ScanLight(looked_at, spots.points(legs, energy=False), energy)
 
 
 def _same(spots: Any, points: Any) -> bool:
@@ -99,16 +93,6 @@ def _same(spots: Any, points: Any) -> bool:
         return False
     near = dr.norm(spots.p - points.p) <= 1e-6 * (1 + dr.norm(points.p))
     return bool(dr.all(near & (spots.wi.z * points.wi.z > 0) & spots.is_valid() & points.is_valid()))
-
-
-def _points(si: Any, factor: Any, length: Any) -> WallPoints:
-    """Points of a wall as they are seen (or lit) along ``si.wi``, with their albedo times ``factor``."""
-    bsdf, valid = si.bsdf(), si.is_valid()
-    side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
-    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, valid))
-    value = dr.select(valid & (side != 0), albedo * factor, 0)
-    n = dr.select(valid, dr.select(side < 0, -si.n, si.n), mi.Normal3f(0, 0, 1))
-    return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
 def moves(world: Any, shapes: list[Any]) -> bool:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import ShapeError
+from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 
 
 class WallPoints:
@@ -39,6 +40,18 @@ class WallPoints:
             _one_or_each(self.value, index, active),
             _one_or_each(self.leg, index, active),
         )
+
+
+def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
+    """What interactions with a diffuse wall make of light that comes along ``si.wi``, or goes that way: their albedo
+    times ``factor``, and the legs ``length``.
+    """
+    bsdf, valid = si.bsdf(), si.is_valid()
+    side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
+    albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, valid))
+    value = dr.select(valid & (side != 0), albedo * factor, 0)
+    n = dr.select(valid, dr.select(side < 0, -si.n, si.n), mi.Normal3f(0, 0, 1))
+    return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 
 def _one_or_each(array: Any, index: Any, active: Any) -> Any:

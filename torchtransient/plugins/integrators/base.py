@@ -164,7 +164,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         width, lasers = int(film.crop_size()[0]), laser_count(film)
         lanes = width * job.rows * job.spp * lasers
         sampler.seed(job.seed, lanes)
-        index, laser = dr.arange(mi.UInt32, lanes) // dr.opaque(mi.UInt32, job.spp), None
+        spp, lane = dr.opaque(mi.UInt32, job.spp), dr.arange(mi.UInt32, lanes)
+        index, laser = lane // spp, None
+        stratum = lane - index * spp
         if film.exhaustive_scan:
             laser, index = index % lasers, index // lasers
         row = index // width
@@ -189,7 +191,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         scale = dr.opaque(mi.Float, 1 / job.total)
         if weight is not None:
             scale *= weight
-        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser)
+        return PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp))
 
     def offset_in_pixel(self, film, sensor, sampler):
         """(offset of a sample from its pixel's centre, weight or None for one)."""

@@ -131,10 +131,10 @@ class HiddenElements:
         element, a = self.select_element(mi.Float64(u.x), active, tile)
         return self.point(element, a, u.y, active)
 
-    def draw_with_surface(self, u: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        """A point as in :meth:`draw`, and the shape and primitive that it lies on."""
-        element, a = self.select_element(mi.Float64(u.x), active)
-        point, _ = self.point(element, a, u.y, active)
+    def draw_with_surface(self, x: Any, y: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        """A point for two numbers in [0, 1) (``Float64``, ``Float``), and the shape and primitive that it lies on."""
+        element, a = self.select_element(x, active)
+        point, _ = self.point(element, a, y, active)
         return point, *self.surface(element, active)
 
     def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:

@@ -40,13 +40,14 @@ class PrimaryRays:
     """The rays of one pass: seeded ``sampler``, ``ray`` and ``weight`` (attached to the sensor), ``scale`` (of a sample
     in its pixel), ``row`` and ``column`` of the pixel, the :class:`View` of every sensor (``seen``),
     and the index of refraction ``η`` where the rays start (attached to the glass that they start in); ``laser``:
-    number of the laser position in an exhaustive scan, else None; ``leg``: how the first segment ends where that is
-    known. A plain object, which Dr.Jit loops leave alone.
+    number of the laser position in an exhaustive scan, else None; ``strata``: (number of the sample in its pixel, how
+    many there are); ``leg``: how the first segment ends where that is known. A plain object, which Dr.Jit loops leave alone.
     """
 
-    def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None):
+    def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None):
         self.sampler, self.ray, self.weight, self.scale = sampler, ray, weight, scale
         self.row, self.column, self.seen, self.η, self.laser, self.leg = row, column, seen, η, laser, None
+        self.strata = strata
 
     def length(self):
         """Optical length from the sensor's origin to where the rays start, attached."""

@@ -199,6 +199,8 @@ class Connection(Strategy):
     light_of_scene_alone = False
     # Whether it may have an event at the last vertex of a path, from where nothing is connected any more.
     finds_light = True
+    # Whether it has no event at the first vertex, of any path of the job.
+    dark_at_first = False
 
     def events(self, wanted: Any) -> int:
         """Events that it has at a vertex at most; in a derivative (``wanted`` is not None) the number of terms."""
@@ -263,8 +265,8 @@ class Guide(Strategy):
         """
         return self.share
 
-    def draw(self, world: Any, vertex: Vertex, u: Any) -> Any:
-        """(a Point3f on a surface for two uniform numbers ``u`` (Point2f), the ShapePtr of that surface, the number of
+    def draw(self, world: Any, vertex: Vertex, x: Any, y: Any) -> Any:
+        """(a Point3f on a surface for two uniform numbers (Float64, Float), the ShapePtr of that surface, the number of
         its triangle or None where that does not matter).
         """
         raise NotImplementedError

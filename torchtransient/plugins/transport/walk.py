@@ -48,8 +48,11 @@ def start(world, ray, first_opl, η) -> Path:
     )
 
 
-def look_around(world, path, kept, sampler, sink):
-    """What a path finds at its next vertex: changes ``kept``; returns (vertex, next step, samples by strategy)."""
+def look_around(world, path, kept, sampler, sink, *, dark=False):
+    """What a path finds at its next vertex: changes ``kept``; returns (vertex, next step, samples by strategy).
+    ``dark``: no connection finds light there.
+    """
+    connections = [] if dark else world.connections
     # ------------------------------------------------------------------------- vertex
     vertex = world.segment.arrive(world, path)
     vertex.τ, vertex.η = path.τ + vertex.opl, path.η
@@ -59,10 +62,10 @@ def look_around(world, path, kept, sampler, sink):
     vertex.scattered_τ = vertex.delay.after(vertex.τ)
 
     # ------------------------------------------------------------------------- events
-    proposals = [c.propose(world, path, vertex, sampler) for c in world.connections]
+    proposals = [c.propose(world, path, vertex, sampler) for c in connections]
     answers, step = world.scattering.scatter(world, path, vertex, proposals, sampler)
     samples = {}
-    for c, proposal, answer in zip(world.connections, proposals, answers, strict=True):
+    for c, proposal, answer in zip(connections, proposals, answers, strict=True):
         event = c.connect(world, path, vertex, proposal, answer, sink.zeros)
         event.value = dr.select(event.active, event.value, 0)
         sink.event(kept, event)
@@ -70,12 +73,12 @@ def look_around(world, path, kept, sampler, sink):
     return vertex, step, samples
 
 
-def bounce(world, path, kept, sampler, sink):
-    """One turn of the loop: changes ``path`` (at its end) and ``kept``.
+def bounce(world, path, kept, sampler, sink, *, dark=False):
+    """One turn of the loop: changes ``path`` (at its end) and ``kept``. ``dark``: as in :func:`look_around`.
 
     Plain Python, so that lists cost nothing where they are empty and Dr.Jit's rewriting of syntax sees none of it.
     """
-    vertex, step, samples = look_around(world, path, kept, sampler, sink)
+    vertex, step, samples = look_around(world, path, kept, sampler, sink, dark=dark)
     # ------------------------------------------------------------- to the next vertex
     onward = vertex.goes_on
     if not world.finds_light:  # nothing would be looked for at the last vertex
@@ -129,9 +132,12 @@ def walk(world, sampler, ray, first_opl, sink, η=1, leg=None):
     kept = sink.begin(world)
     # Of the last vertex nothing is asked but its connections where no light is found: it needs no turn of the loop.
     turns = world.max_depth if world.finds_light or sink.keeps_vertices else max(world.max_depth - 2, 0)
+    if dr.hint(world.dark_at_first and not sink.keeps_vertices and turns > 0, mode="scalar"):
+        bounce(world, path, kept, sampler, sink, dark=True)
+        turns = turns if turns > 1 else 0
     while dr.hint(path.active & (path.depth < turns), max_iterations=turns, label="path"):
         bounce(world, path, kept, sampler, sink)
-    if dr.hint(turns < world.max_depth, mode="scalar"):
+    if dr.hint(not (world.finds_light or sink.keeps_vertices), mode="scalar"):
         look_around(world, path, kept, sampler, sink)
     sink.end(kept)
     return path.depth, kept

@@ -50,6 +50,8 @@ class World:
         self.surfaces = AttachedSurfaces.of(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
         self.finds_light = any(connection.finds_light for connection in self.connections)
+        # Media have connections draw numbers, which derivatives have to draw as well.
+        self.dark_at_first = contents.media is None and all(c.dark_at_first for c in self.connections)
         # Where paths end before they would be thinned out, no number is drawn for it.
         self.plays_roulette = self.finds_light or self.max_depth > self.rr_depth + 2
         self._check_names()

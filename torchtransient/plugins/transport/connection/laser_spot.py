@@ -19,6 +19,7 @@ from torchtransient.plugins.polarized import (
     rotation_from_light,
     rotation_to_sensor,
 )
+from torchtransient.plugins.sampling.packed import packed_columns
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
@@ -36,36 +37,41 @@ class LaserSpot(Connection):
 
     def __init__(self, table, confocal, legs):
         self.table, self.spots, self.confocal, self.legs = table, table.spots, confocal, legs
-        self.index = None
+        self.points, self.packed, self.index = None, None, None
+        # No point of a flat wall sees another.
+        self.dark_at_first = table.wall is not None
+
+    def prepare(self, world):
+        if not world.scattering.turns_freely:
+            return
+        # Where everything is diffuse, a few numbers say all of a spot.
+        self.points = self.table.lambertian_spots(self.legs)
+        if self.points is not None:
+            with dr.suspend_grad():
+                self.packed = PackedSpots(self.points, self.spots.si.is_valid())
 
     def tables(self):
-        return [array for array in self.spots.arrays() if dr.grad_enabled(array)]
+        arrays = self.spots.arrays()
+        if self.points is not None:
+            arrays += [self.points.p, self.points.n, self.points.value, self.points.leg]
+        return [array for array in arrays if dr.grad_enabled(array)]
 
     def start(self, world, rays):
         self.index = rays.spot
 
     # ------------------------------------------------------------------------------------------------ the spot
 
-    def spot(self, wavelengths, active):
-        """SurfaceInteraction3f of the path's own spot."""
-        spot = dr.gather(mi.SurfaceInteraction3f, self.spots.si, self.index, active)
-        spot.wavelengths = wavelengths
-        return spot
+    def spot(self, wavelengths, active, *, attached=False):
+        """The path's own spot: :class:`DiffuseSpot`, or :class:`GeneralSpot` with its derivatives."""
+        if self.points is None:
+            return self.general_spot(wavelengths, active)
+        if not attached:
+            return self.packed.take(self.index, active)
+        return DiffuseSpot(*self.points.take(self.index, active))
 
-    def light(self, spot, d, active):
-        """What the spot sends against the ray of direction ``d`` that finds it, times the squared distance: a spectrum,
-        or a Stokes vector in the frame of that ray.
-        """
-        beam = dr.gather(mi.Vector3f, self.spots.ray.d, self.index, active)
-        spot = dr.copy(spot)
-        spot.wi = spot.to_local(-d)
-        wo = spot.to_local(-beam)
-        # An area is seen by its own normal, however it is shaded.
-        cos_out, cos_in = dr.abs_dot(spot.n, d), dr.abs_dot(spot.n, beam)
-        value = spot.bsdf().eval(mi.BSDFContext(), spot, wo, active)
-        value = attenuated(value, self.spots.energy(spot.wavelengths, self.index, cos_in, active))
-        light = rotate_stokes(first_column(value), rotation_to_sensor(spot, d))
-        return light * cos_out
+    def general_spot(self, wavelengths, active):
+        """The same whatever the wall is: with an interaction, from which rays can start."""
+        return GeneralSpot(self.spots, self.index, wavelengths, self.legs, active)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -74,7 +80,7 @@ class LaserSpot(Connection):
         spot = self.spot(vertex.at.wavelengths, active)
         to = spot.p - vertex.at.p
         dist = dr.norm(to)
-        active &= spot.is_valid() & (dist > 0)
+        active &= spot.valid & (dist > 0)
         d = to / dr.select(active, dist, 1)
         ds = Local(p=spot.p, n=spot.n, d=d, dist=dist, delta=mi.Bool(True), emitter=None)
         active &= dr.dot(d, vertex.at.n) != 0
@@ -83,11 +89,11 @@ class LaserSpot(Connection):
 
     def connect(self, world, path, vertex, proposal, answer, zeros):
         ds, active = proposal.ds, proposal.active
-        light = self.light(proposal.spot, ds.d, active) * dr.select(active, dr.rcp(dr.square(ds.dist)), 0)
+        light = proposal.spot.light(ds.d, active) * dr.select(active, dr.rcp(dr.square(ds.dist)), 0)
         value = product(vertex.β, product(answer.matrix, light))
         if not zeros:
             active = active & (dr.max(dr.abs(intensity(value))) > 0)
-        opl = vertex.scattered_τ + mi.Float64(ds.dist * (vertex.η * answer.eta)) + mi.Float64(self.leg(active))
+        opl = vertex.scattered_τ + mi.Float64(ds.dist * (vertex.η * answer.eta)) + mi.Float64(proposal.spot.leg)
         active = world.counted(active, opl)
         test = active
         if self.confocal and world.contents.media is None:
@@ -95,10 +101,6 @@ class LaserSpot(Connection):
         seen, T = world.segment.transmittance(world, vertex, ds, proposal.u, sampler=proposal.sampler, active=test)
         active = (active & ~test) | seen
         return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
-
-    def leg(self, active):
-        """Length from the laser to the spot, where it counts."""
-        return dr.gather(mi.Float, self.spots.length, self.index, active) if self.legs else mi.Float(0)
 
     # ------------------------------------------------------------------------------------------------- record
 
@@ -113,17 +115,17 @@ class LaserSpot(Connection):
     def attached(self, world, vertex, step, wanted):
         si, r = vertex.scattered_si, vertex.v.of(self.name)
         lit = r["lit"]
-        spot = self.spot(si.wavelengths, lit)
+        spot = self.spot(si.wavelengths, lit, attached=True)
         to = dr.select(lit, spot.p - si.p, mi.Vector3f(0, 0, 1))
         length = dr.norm(to)
         d = to / length
         towards = world.scattering.evaluate(world, vertex, d, lit)
         matrix = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, d, dr.detach(d)))
-        light = self.light(spot, d, lit) * dr.rcp(dr.square(length)) * r.get("T", 1)
+        light = spot.light(d, lit) * dr.rcp(dr.square(length)) * r.get("T", 1)
         end = Local(p=spot.p, d=dr.detach(d), far=mi.Bool(False), ahead=False)
         light *= world.segment.attached_transmittance(world, vertex, end, lit)
         value = dr.select(lit, product(matrix, light), 0)
-        leg = self.leg(lit)
+        leg = mi.Float(spot.leg)
         opl = (
             vertex.scattered_opl + mi.Float64(dr.detach(length * towards.eta) * vertex.v.η) + mi.Float64(dr.detach(leg))
         )
@@ -131,3 +133,68 @@ class LaserSpot(Connection):
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length + leg)
         return [EventTerm(value=product(vertex.carry.β, value), slope=slope, opl=opl, active=lit)]
+
+
+class GeneralSpot:
+    """A laser's spot on any surface: ``p``, ``n``, ``valid``, ``leg`` (the way to it, where that counts), and the
+    interaction ``si``.
+    """
+
+    def __init__(self, spots, index, wavelengths, legs, active):
+        self.spots, self.index = spots, index
+        self.si = dr.gather(mi.SurfaceInteraction3f, spots.si, index, active)
+        self.si.wavelengths = wavelengths
+        self.p, self.n, self.valid = self.si.p, self.si.n, self.si.is_valid()
+        self.leg = dr.gather(mi.Float, spots.length, index, active) if legs else mi.Float(0)
+
+
+    def light(self, d, active):
+        """What the spot sends against the ray of direction ``d`` that finds it, times the squared distance: a spectrum,
+        or a Stokes vector in the frame of that ray.
+        """
+        beam = dr.gather(mi.Vector3f, self.spots.ray.d, self.index, active)
+        spot = dr.copy(self.si)
+        spot.wi = spot.to_local(-d)
+        wo = spot.to_local(-beam)
+        # An area is seen by its own normal, however it is shaded.
+        cos_out, cos_in = dr.abs_dot(spot.n, d), dr.abs_dot(spot.n, beam)
+        value = spot.bsdf().eval(mi.BSDFContext(), spot, wo, active)
+        value = attenuated(value, self.spots.energy(spot.wavelengths, self.index, cos_in, active))
+        light = rotate_stokes(first_column(value), rotation_to_sensor(spot, d))
+        return light * cos_out
+
+
+class DiffuseSpot:
+    """The same on a flat diffuse wall: ``n`` points to the side that is lit, and is zero where the beam meets nothing,
+    ``value`` is what leaves along it.
+    """
+
+    def __init__(self, p, n, value, leg):
+        self.p, self.n, self.value, self.leg = p, mi.Normal3f(n), value, leg
+        self.valid = dr.any(dr.detach(self.n) != 0)
+
+    def light(self, d, active):
+        """As :meth:`GeneralSpot.light`."""
+        cos = -dr.dot(self.n, d)
+        return dr.select(active & (cos > 0), mi.Spectrum(self.value) * cos, 0)
+
+
+class PackedSpots:
+    """The fields of diffuse spots, which a lane reads four numbers at a time. A plain object, which Dr.Jit loops leave
+    alone.
+    """
+
+    def __init__(self, points, valid):
+        p, n, value, leg = points.take(dr.arange(mi.UInt32, points.width))
+        n = dr.select(valid, n, 0)
+        columns = [*p, *n, mi.Float(leg), *value]
+        columns += [mi.Float(0)] * (-len(columns) % 4)
+        self.channels, self.count = dr.size_v(value), len(columns) // 4
+        self.flat = packed_columns([columns[i : i + 4] for i in range(0, len(columns), 4)], points.width)
+
+    def take(self, index, active):
+        """The :class:`DiffuseSpot` of each lane."""
+        rows = [dr.gather(mi.Vector4f, self.flat, index * self.count + i, active) for i in range(self.count)]
+        x = [row[i] for row in rows for i in range(4)]
+        value = mi.UnpolarizedSpectrum(x[7 : 7 + self.channels])
+        return DiffuseSpot(mi.Point3f(x[:3]), mi.Normal3f(x[3:6]), value, x[6])

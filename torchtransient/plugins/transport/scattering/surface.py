@@ -50,6 +50,7 @@ class Surface(Scattering):
             guide.prepare(world)
 
     def start(self, world, rays):
+        self.strata = rays.strata
         for guide in self.guides:
             guide.start(world, rays)
 
@@ -133,15 +134,22 @@ class Surface(Scattering):
 
     def _follow_guides(self, world, path, vertex, step, sampler):
         """Let guides draw some of the next vertices: ``step.guided``, at ``step.point``. Of the scattering's own sample
-        and those of the guides one is used: they share the numbers of the direction.
+        and those of the guides one is used.
+
+        At the first vertex the samples of a pixel share out among them who draws, and what: they vary less, and lanes
+        beside each other look at places beside each other, where their rays find the same boxes and triangles.
         """
-        u, below, own = sampler.next_1d(), 0.0, self.own_share(path.depth)
+        u, (number, count) = mi.Float64(sampler.next_1d()), self.strata
+        u = dr.select(path.depth == 0, (mi.Float64(number) + u) / mi.Float64(count), u)
+        below, own = 0.0, self.own_share(path.depth)
         step.guided, step.point = u < 1 - own, mi.Point3f(vertex.at.p)
         step.shape, step.primitive = dr.zeros(mi.ShapePtr), mi.UInt32(_ANY)
         for guide in self.guides:
-            point, shape, primitive = guide.draw(world, vertex, step.u_dir)
             share = guide.share_at(path.depth)
             chosen = (u >= below) & (u < below + share)
+            # What is left of the number that has chosen is uniform again.
+            x = dr.clip((u - below) / mi.Float64(share), 0, 1 - dr.epsilon(mi.Float64))
+            point, shape, primitive = guide.draw(world, vertex, x, step.u_dir.y)
             step.point, step.shape = dr.select(chosen, point, step.point), dr.select(chosen, shape, step.shape)
             step.primitive = dr.select(chosen, _ANY if primitive is None else primitive, step.primitive)
             below += share
@@ -171,8 +179,10 @@ class Surface(Scattering):
         pi, reached = world.segment.surface_of(leg)
         reached = smooth & reached & pi.is_valid()
         found = world.segment.found(leg, ray, mi.RayFlags.Minimal, reached)
-        value, pdf = self.value_towards(world, path, vertex, step.out, smooth)
-        guided = self.guided_density(world, path.depth, ray.o, found, pi.shape, reached, pi.prim_index)
+        # From the vertex itself to what was found, not from beside it, where the ray starts.
+        p, to = vertex.at.p, dr.select(reached, found.p - vertex.at.p, ray.d)
+        value, pdf = self.value_towards(world, path, vertex, to * dr.rsqrt(dr.squared_norm(to)), smooth)
+        guided = self.guided_density(world, path.depth, p, found, pi.shape, reached, pi.prim_index)
         pdf = self.own_share(path.depth) * pdf + dr.select(reached, guided, 0)
         # A guided sample stands for the point that was drawn, and for no other that its ray runs into before: nor for
         # one just above it, where a surface lies below another one.

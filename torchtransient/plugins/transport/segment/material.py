@@ -108,7 +108,8 @@ class FoundVacuum(MaterialVacuum):
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
 
     def depart(self, world, ray, vertex, β, sampler, active):
-        pi = super().depart(world, ray, vertex, β, sampler, active)
+        # Most lanes follow guides, which send those beside each other to places beside each other.
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
 
     def surface_of(self, leg):

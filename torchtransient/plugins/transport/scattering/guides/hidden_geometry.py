@@ -25,8 +25,8 @@ class HiddenGeometry(Guide):
     def share_at(self, depth):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
 
-    def draw(self, world, vertex, u):
-        return self.elements.draw_with_surface(u, vertex.goes_on)
+    def draw(self, world, vertex, x, y):
+        return self.elements.draw_with_surface(x, y, vertex.goes_on)
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
