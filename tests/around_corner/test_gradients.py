@@ -145,10 +145,10 @@ def test_general_paths(case, kind):
     points = 2 if kind == "exhaustive" else 3
     scene = scan_scene(plate(), kind, film(points, kind=kind, **SMOOTH), third_bounce="paths")
     capture = Capture(scene, key, change())
-    seeds, spp = 8, 2**13
+    seeds, spp = 16, 2**12
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
-    differences = np.array([capture.difference(2 * h, 10 + seed, spp) for seed in range(seeds)])
+    differences = np.array([capture.difference(h, 20 + seed, spp) for seed in range(seeds)])
     error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / seeds)
     assert abs(reverse.mean() - differences.mean()) < 4 * error
     assert error < 0.1 * abs(reverse.mean())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.stats import t as student
 
 from support.third_bounce_runs import captured
 from torchtransient.interfaces import CaptureType
@@ -59,15 +60,20 @@ def rendered(scene, spp, seeds, first=0):
     return np.array(runs)
 
 
-def agree(a, b, blocks=10, deviations=3.0):
-    """Whether the means of runs ``(seeds, ..., bins, channels)`` agree: totals, and each of some blocks of time, within
-    the standard errors of both (of 10 blocks one in 40 cases exceeds three: they have four).
+def agree(a, b, blocks=10, total=1e-3, block=1e-5):
+    """Whether the means of runs ``(seeds, ..., bins, channels)`` agree: totals, and each of some blocks of time, by
+    Welch's test. ``total``, ``block``: chances of a difference as large where there is none; of a hundred tests of ten
+    blocks one fails in a hundred. Returns (whether they do, the differences over their standard errors).
     """
     a, b = (x.sum(tuple(range(1, x.ndim - 2))).sum(-1) for x in (a, b))
     a, b = (np.concatenate([x.sum(1)[:, None], x.reshape(len(x), blocks, -1).sum(2)], 1) for x in (a, b))
-    error = np.hypot(a.std(0, ddof=1) / len(a) ** 0.5, b.std(0, ddof=1) / len(b) ** 0.5)
+    squares = [x.var(0, ddof=1) / len(x) for x in (a, b)]
+    error = np.sqrt(sum(squares))
     z = (a.mean(0) - b.mean(0)) / np.where(error > 0, error, 1)
-    return abs(z[0]) < deviations and np.abs(z[1:]).max() < deviations + 1, z
+    spread = sum(square**2 / (len(x) - 1) for square, x in zip(squares, (a, b), strict=True))
+    freedom = np.where(spread > 0, error**4 / np.where(spread > 0, spread, 1), 1)
+    chance = 2 * student.sf(np.abs(z), freedom)
+    return bool(chance[0] > total and chance[1:].min() > block), z
 
 
 def chains(scene, elements, film, sensors, lasers, kind, count, seed=0, bounces=(4, 5), **choices):
