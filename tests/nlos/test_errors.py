@@ -132,7 +132,16 @@ CASES = {
     "vertices that are no number: simulate": (lambda: simulate(broken_mesh()), SceneError, NAN),
     "vertices that are no number: renderer": (lambda: renderer(broken_mesh()), SceneError, NAN),
     "vertices that are no number: scene": (lambda: scene(hidden=broken_mesh()), SceneError, NAN),
-    "no area": (lambda: simulate(MESH), SceneError, "expected shapes with a surface"),
+    "no area": (lambda: simulate(MESH), SceneError, r"shapes with an area.*got 'hidden' \(0 m\^2\)"),
+    "no area: renderer": (lambda: renderer(MESH), SceneError, r"shapes with an area.*got 'hidden' \(0 m\^2\)"),
+    "no area: scene": (
+        lambda: scene(hidden={"dot": tt.scenes.triangle_mesh(*MESH)}), SceneError, r"got 'dot' \(0 m\^2\)",
+    ),
+    "lengths of stars": (lambda: simulate((1e30 * MESH[0], MESH[1])), UnitError, "hidden: expected vertices in finite"),
+    "areas beyond numbers": (
+        lambda: simulate({"far": {"type": "mesh_arrays", "vertices": 1e30 * np.eye(3), "faces": [[0, 1, 2]]}}),
+        SceneError, "shapes of finite area, got 'far'",
+    ),
     "hidden light: simulate": (lambda: simulate(shining()), SceneError, SHINES),
     "hidden light: renderer": (lambda: renderer(shining()), SceneError, SHINES),
     "hidden light: scene": (
@@ -143,7 +152,7 @@ CASES = {
     "no dictionary": (lambda: simulate({"a": 3}), SceneError, "expected 'a' as a dictionary with a type, got 3"),
     "a name of the capture": (lambda: simulate({"wall": Z["letter"]}), SceneError, "names wall belong to the capture"),
     "a mesh file that is not there": (lambda: simulate("no.obj"), SceneError, "no file 'no.obj'"),
-    "another file": (lambda: simulate("no.txt"), SceneError, r"expected a mesh file \(\.ply, \.obj, \.stl\)"),
+    "another file": (lambda: simulate("no.txt"), SceneError, r"expected a mesh file \(\.obj, \.ply, \.ser"),
     # light and work
     "one bounce": (lambda: simulate(bounces=(1,)), SceneError, BOUNCES.format(r"\(1,\)")),
     "a gap in bounces": (lambda: renderer(bounces=(3, 5)), SceneError, BOUNCES.format(r"\(3, 5\)")),
@@ -163,7 +172,7 @@ CASES = {
     "no samples: renderer": (lambda: renderer(spp=0), UnitError, "spp: expected a positive integer"),
     "no samples: scene": (lambda: tt.nlos.simulate(complete(), spp=0), UnitError, "spp: expected a positive integer"),
     "half a sample": (lambda: simulate(spp=1.5), UnitError, "spp: expected a positive integer"),
-    "a negative seed": (lambda: simulate(seed=-1), SceneError, "seed: expected a whole number of at least 0"),
+    "a negative seed": (lambda: simulate(seed=-1), SceneError, "seed: expected a whole number from 0 to 4294967295, got -1"),
     "no tiles": (lambda: simulate(tiles=0), SceneError, "tiles: expected a whole number of at least 1"),
     "memory: simulate": (
         lambda: simulate(of=scan("exhaustive", (100, 100)), time_axis=LARGE), StorageError, "36.38 TiB.*Use fewer bins",

@@ -15,7 +15,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
 from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, same, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import flag, positive, real_array, shown
 
 KINDS = ("single", "confocal", "exhaustive")
 # Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.
@@ -60,6 +61,7 @@ class Scan:
                 object.__setattr__(self, name, unit_normals(name, float64_points(name, getattr(self, name), device)))
         if self.wall is not None and not isinstance(self.wall, Mapping):
             raise SceneError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
+        flag("Scan: first_and_last_leg", self.first_and_last_leg)
         check_shapes(self)
         check_sides(self)
 
@@ -242,9 +244,7 @@ class Scan:
         that are none, and as TimeAxis.
         """
         low, high = bounds_of(hidden_bounds, "Scan.default_axis")
-        width = float(bin_width_opl)
-        if not (math.isfinite(width) and width > 0):
-            raise UnitError(f"Scan.default_axis: expected bin_width_opl > 0 metres, got {bin_width_opl!r}.")
+        width = positive("Scan.default_axis: bin_width_opl", bin_width_opl)
         first, last = math.floor(shortest(self, low, high) / width), math.ceil(longest(self, low, high) / width)
         return TimeAxis(first * width, width, max(1, last - first))
 
@@ -310,18 +310,19 @@ class Scan:
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """`laser` as an index into the spots of a scan. Raises ShapeError where there is none."""
     index = laser if isinstance(laser, tuple) else (laser,)
-    inside = len(index) == len(scan.laser_shape) and all(
-        -n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)
-    )
-    if not inside:
-        raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {laser!r}.")
+    whole = all(isinstance(i, int | np.integer) and not isinstance(i, bool) for i in index)
+    inside = len(index) == len(scan.laser_shape) and whole
+    if not inside or not all(-n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)):
+        raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {shown(laser)}.")
     return tuple(int(i) for i in index)
 
 
 def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:
     if laser is None:
         return surface.at(0.5, 0.5)
-    plain = laser.detach().cpu().numpy() if isinstance(laser, Tensor) else np.asarray(laser, dtype=np.float64)
+    plain = real_array(laser)
+    if plain is None or plain.shape not in ((2,), (3,)):
+        raise ShapeError(f"Scan.grid laser: expected (u, v) on the wall or a point (3,), got {shown(laser)}.")
     if plain.shape == (2,):
         return surface.at(plain[0], plain[1])
     point = triple("Scan.grid laser", laser)

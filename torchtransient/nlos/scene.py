@@ -11,7 +11,10 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
+from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, UnitError
+from torchtransient.nlos import defaults
+from torchtransient.nlos.mesh_file import mesh_file
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.scene_handle import load
 from torchtransient.render.variant import active_variant
@@ -20,7 +23,6 @@ from torchtransient.render.variant import active_variant
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
 ALL_BOUNCES = "all"
-_MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
 # Plugins of emitters, Mitsuba's and ours.
 _LIGHTS = (
     "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
@@ -28,7 +30,9 @@ _LIGHTS = (
 )  # fmt: skip
 
 
-def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0) -> dict[str, Any]:
+def capture_scene(
+    hidden: Any, scan: Scan, bounces: Sequence[int] | str = defaults.BOUNCES, energy: Any = defaults.ENERGY
+) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
     ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
@@ -47,7 +51,7 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
         )
     _check_energy(energy)
     first, last = _range(bounces)
-    shapes = hidden_shapes(hidden)
+    shapes = shapes_of(hidden)
     taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
     if taken:
         raise SceneError(
@@ -89,23 +93,10 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
     }
 
 
-def hidden_shapes(hidden: Any) -> dict[str, Any]:
-    """Hidden things as a dictionary of Mitsuba shapes (and what they refer to) by name."""
+def shapes_of(hidden: Any) -> dict[str, Any]:
+    """Hidden things, as they are given, as a dictionary of Mitsuba shapes (and what they refer to) by name."""
     if isinstance(hidden, (str, Path)):
-        plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
-        if Path(hidden).suffix.lower() == ".xml":
-            raise SceneError(
-                f"hidden: {str(hidden)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it "
-                "as it is: tt.nlos.simulate(path)."
-            )
-        if plugin is None:
-            raise SceneError(
-                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got "
-                f"{str(hidden)!r}."
-            )
-        if not Path(hidden).is_file():
-            raise SceneError(f"hidden: no file {str(hidden)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
-        return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
+        return {"hidden": mesh_file(Path(hidden), "hidden")}
     if isinstance(hidden, Mapping):
         if hidden.get("type") == "scene" or "type" not in hidden:
             shapes = {name: node for name, node in hidden.items() if name != "type"}
@@ -173,7 +164,8 @@ def _check_energy(energy: Any) -> None:
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
-    return {"type": "mesh_arrays", "vertices": _numbers(vertices), "faces": _numbers(faces)}
+    points, triangles = checked_mesh("hidden", vertices, faces)
+    return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
 def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
@@ -199,7 +191,7 @@ def _numbers(values: Any) -> np.ndarray:
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
     """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
-    scene = load({"type": "scene", **hidden_shapes(hidden)}, variant=variant)
+    scene = load({"type": "scene", **shapes_of(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()
         return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)

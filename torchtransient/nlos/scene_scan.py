@@ -238,15 +238,43 @@ def _check_hidden(scene: Any, wall: Ends) -> None:
             "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
             "the hidden things as shapes."
         )
-    for shape in hidden:
-        box = shape.bbox()
-        corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
-        if bool((((corners[:, None] - wall.points) * wall.normals).sum(-1) > 0).any()):
-            return
+    _check_areas(hidden)
+    if reaches_before(hidden, wall.points, wall.normals):
+        return
     raise SceneError(
         "hidden: expected something before the wall, on the side that its normals point to, got nothing there: what is "
         "behind it sends it no light. Move the hidden things or turn the wall (flip_normals)."
     )
+
+
+def reaches_before(shapes: list[Any], points: NDArray[np.float64], normals: NDArray[np.float64]) -> bool:
+    """Whether the box of a shape reaches before the wall at one of its ``points``, with ``normals`` there (N, 3)."""
+    for shape in shapes:
+        box = shape.bbox()
+        corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
+        # Mostly the first point tells.
+        for chosen in (slice(0, 1), slice(1, None)):
+            if bool((((corners[:, None] - points[chosen]) * normals[chosen]).sum(-1) > 0).any()):
+                return True
+    return False
+
+
+def _check_areas(shapes: list[Any]) -> None:
+    """Raise SceneError where no shape has an area that light could fall on, or one has none that is a number."""
+    areas = {}
+    for shape in shapes:
+        try:
+            areas[shape.id() or shape.class_name()] = float(np.array(shape.surface_area()).reshape(-1)[0])
+        except RuntimeError:
+            return  # of shapes that do not know theirs, such as copies of groups
+    told = ", ".join(f"{name!r} ({area:.3g} m^2)" for name, area in areas.items())
+    if not all(np.isfinite(area) for area in areas.values()):
+        raise SceneError(f"hidden: expected shapes of finite area, got {told}. Give lengths in metres.")
+    if not any(area > 0 for area in areas.values()):
+        raise SceneError(
+            f"hidden: expected shapes with an area that light falls on, got {told}. Give triangles whose corners are "
+            "not all in a row, and scales other than 0."
+        )
 
 
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:
