@@ -1,6 +1,6 @@
-"""Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms. What is none is a typed error that names it.
+"""Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms.
 
-A number is what Python, numpy or torch have for one; truth values and texts are none, although Python takes them.
+What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and texts are none, although Python takes them.
 """
 
 from __future__ import annotations

@@ -149,7 +149,11 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"hidden": {"a": {"scene": "cornell_box"}}}, SceneError, "nlos_z, nlos_letter"),
         ({"hidden": {"a": {"scene": "nlos_letter", "leter": "K"}}}, SceneError, "Did you mean 'letter'"),
         ({"hidden": {"a": {"scene": "nlos_letter", "letter": "A"}}}, SceneError, "hidden: a: letter: expected one of"),
-        ({"hidden": {"a": {"scene": "nlos_letter", "size": "big"}}}, UnitError, "hidden: a: size: expected a finite number"),
+        (
+            {"hidden": {"a": {"scene": "nlos_letter", "size": "big"}}},
+            UnitError,
+            "a: size: expected a finite",
+        ),
         ({"hidden": {"a": {"scene": "nlos_letter", "size": -1}}}, UnitError, "hidden: a: size"),
         ({"hidden": {"a": {"file": "none.obj"}}}, SceneError, "no file 'none.obj'"),
         ({"hidden": {"a": {"shape": "torus"}}}, SceneError, "rectangle, disk, cube, sphere"),

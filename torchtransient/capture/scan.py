@@ -51,8 +51,7 @@ class Scan:
     wall: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {self.kind!r}.")
+        _check_kind(self.kind)
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
         for name in ("sensor_points", "laser_points", "sensor_origin", "laser_origin"):
             object.__setattr__(self, name, float64_points(name, getattr(self, name), device))
@@ -92,6 +91,7 @@ class Scan:
         Raises SceneError where a spot misses the wall, for a laser or a laser grid that the kind has no use for, and
         for an exhaustive scan of one pair, which is a single one; otherwise as the class and :meth:`Wall.grid`.
         """
+        _check_kind(kind)
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
         points, normals = surface.grid((nx, ny), extent, cell_centers=cell_centers)
@@ -144,6 +144,7 @@ class Scan:
         `normals`: those of the sensor points where no wall is given, and of the spots of a confocal scan. Errors as the
         class.
         """
+        _check_kind(kind)
         sensor = float64_points("sensor_points", sensor_points)
         if kind == "confocal":
             _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
@@ -305,6 +306,11 @@ class Scan:
         lasers = {"single": ", 1 spot", "confocal": "", "exhaustive": f", {spots} spots"}[self.kind]
         legs = ", with first and last leg" if self.first_and_last_leg else ""
         return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
+
+
+def _check_kind(kind: Any) -> None:
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
 
 
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:

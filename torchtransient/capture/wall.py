@@ -112,7 +112,7 @@ class Wall:
         if isinstance(description, Wall):
             return description
         if isinstance(description, Mapping):
-            kind = description.get("type")
+            kind = str(description.get("type"))
             matrix = transform("Wall: to_world", description.get("to_world", np.eye(4)))
             if kind == "rectangle":
                 return cls._rectangle(description, matrix)

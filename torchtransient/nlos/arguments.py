@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+import torch
+from torch import nn
+
+from torchtransient.capture import Scan
 from torchtransient.errors import SceneError, UnitError
+from torchtransient.quantities import shown
 from torchtransient.render.arguments import samples
 from torchtransient.render.seeds import SEED_RANGE
+from torchtransient.sensing import Device
 
 # What samplers count with has 32 bits.
 MOST_SAMPLES = 2**32 - 1
@@ -17,7 +24,7 @@ def checked_count(who: str, name: str, value: Any) -> int:
     """A whole number of at least 1. Raises SceneError."""
     number = _whole(value)
     if number is None or number < 1:
-        raise SceneError(f"{who}: {name}: expected a whole number of at least 1, got {value!r}.")
+        raise SceneError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
     return number
 
 
@@ -33,7 +40,7 @@ def checked_seed(who: str, value: Any) -> int:
     number = _whole(value)
     if number is None or not 0 <= number < SEED_RANGE:
         raise SceneError(
-            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {value!r}. Others would be taken "
+            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
             "modulo 2^32, and be the same as one of these."
         )
     return number
@@ -56,9 +63,32 @@ def check_seeds(who: str, value: Any) -> None:
             raise
 
 
+def check_is_scan(who: str, value: Any) -> None:
+    """Raise SceneError for what is no scan."""
+    if not isinstance(value, Scan):
+        raise SceneError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
+
+
+def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
+    """Raise SceneError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
+    if not isinstance(sensor, nn.Module | Device | None):
+        raise SceneError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
+    if not isinstance(generator, torch.Generator | None):
+        raise SceneError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
+
+
+def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
+    """Parameters by key, of a mapping or a list of keys. Raises SceneError for what is neither."""
+    listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
+    keys = list(given) if listed else [given]
+    if not listed or not all(isinstance(key, str) for key in keys):
+        raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
+    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
+
+
 def _whole(value: Any) -> int | None:
     """A whole number of any library; None for what is none. True is not one."""
     try:
-        return None if isinstance(value, bool) else operator.index(value)
+        return None if "bool" in str(getattr(value, "dtype", type(value))) else operator.index(value)
     except TypeError:
         return None

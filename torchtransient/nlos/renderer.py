@@ -12,7 +12,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.nlos import defaults
-from torchtransient.nlos.arguments import check_seeds, checked_samples
+from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
 from torchtransient.nlos.scan_watch import ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen
@@ -65,15 +65,13 @@ class CaptureRenderer(nn.Module):
         **settings: Any,
     ):
         super().__init__()
-        if not isinstance(scan, Scan):
-            raise SceneError(f"CaptureRenderer: expected scan as a tt.nlos.Scan, got {type(scan).__name__}.")
-        if isinstance(parameters, str):
-            raise SceneError(f"CaptureRenderer: parameters: expected a list of keys, write [{parameters!r}].")
+        check_is_scan("CaptureRenderer", scan)
+        check_sensor("CaptureRenderer", sensor)
+        wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
         checked_samples("CaptureRenderer", settings.get("spp"))
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
-        wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
         _check_once(wanted, followed)
         self._own, self._sources = tuple(wanted), _Sources(followed.values())
         self.renderer = TransientRenderer(scene, {**wanted, **dict.fromkeys(followed)}, **settings)
@@ -83,8 +81,9 @@ class CaptureRenderer(nn.Module):
             raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
         self.sensor = None if sensor is None else as_module(sensor, self.renderer.axis)
         check_scan(self.renderer.scene, scan, self.renderer._options)
-        if needing_slope(self.renderer._infos, self.renderer._keys):
-            self.renderer._watch.installed = ScanWatch()
+        moving = needing_slope(self.renderer._infos, self.renderer._keys)
+        if moving:
+            self.renderer._watch.installed = ScanWatch(_lasting_normals(scan, moving))
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
@@ -106,9 +105,12 @@ class CaptureRenderer(nn.Module):
         SceneError; ``generator``: for the noise of ``sensor``.
         """
         check_seeds("CaptureRenderer", seed)
+        check_sensor("CaptureRenderer", self.sensor, generator)
         checked_samples("CaptureRenderer", spp)
         self._sources.check()
-        given = _attached(self.scan) | dict(values or {})
+        given = _attached(self.scan)
+        if values is not None:
+            given |= keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
         return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
 
@@ -157,6 +159,13 @@ def _leaves(tensor: torch.Tensor) -> list[torch.Tensor]:
             found.append(node.variable)
         ahead += [before for before, _ in node.next_functions]
     return found
+
+
+def _lasting_normals(scan: Scan, moving: Iterable[str]) -> Any:
+    """Normals of the wall at the scan points (N, 3) as numpy array, None where they may change or are not known."""
+    changing = any(key == POINTS or key.split(".")[:2] != [WALL, SENSOR] for key in moving if key.startswith(WALL))
+    known = scan.sensor_normals
+    return None if changing or known is None else known.detach().cpu().reshape(-1, 3).numpy().copy()
 
 
 def _check_once(parameters: Mapping[str, Any], followed: Mapping[str, torch.Tensor]) -> None:

@@ -4,62 +4,83 @@ origin, or behind the wall.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchtransient.nlos.scene_scan import SAME_POINT, reaches_before
 
 
+@dataclass(frozen=True, eq=False)
 class ScanWatch:
     """Says what is wrong with a scene of a capture as it is, in one pass of rays to scan points and laser spots.
 
-    It is asked in every render, so it does not look up which shapes are met: every end in the wrong place counts.
+    ``normals``: those of the wall at the scan points (N, 3), None where they may change. It is asked in every render,
+    so it does not look up which shapes are met: every end in the wrong place counts.
     """
+
+    normals: NDArray[np.float64] | None
 
     def __call__(self, scene: Any, number: int) -> dict[str, str]:
         """Findings about sensor ``number`` of a scene that holds the values of a call, by what they are about."""
         import drjit as dr
         import mitsuba as mi
 
+        from torchtransient.interfaces import CaptureType
         from torchtransient.plugins.around_corner.scan_table import aims_of, origin_of, scanned_points
 
-        sensor, integrator = scene.sensors()[number], scene.integrator()
+        sensor, capture = scene.sensors()[number], scene.integrator().capture
         with dr.suspend_grad():
             points, origin = dr.detach(scanned_points(scene, sensor)), dr.detach(mi.Point3f(sensor.origin))
             laser = dr.detach(origin_of(scene, sensor))
-            spots = laser + dr.detach(aims_of(scene, sensor, integrator.capture, None))
-            seen, normals = _end(scene, origin, points)
-            lit, _ = _end(scene, laser, spots)
-            dr.eval(points, spots, seen, lit, normals)
-        places, marks = np.array(points).T, np.array(spots).T
+            rays = {"sensor": _rays(origin, points - origin)}
+            if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
+                rays["laser"] = _rays(laser, dr.detach(aims_of(scene, sensor, capture, None)))
+            off = {who: _end_elsewhere(scene, ray) for who, ray in rays.items()}
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"])
+            dr.eval(points, normals, off)
         found = {}
-        for who, ends, wanted, start in (("sensor", seen, places, origin), ("laser", lit, marks, laser)):
-            legs = np.linalg.norm(wanted - np.array(start).reshape(3), axis=1)
-            size = max(float(np.linalg.norm(np.ptp(places, axis=0))), float(legs.max()))
-            off = int((~(np.abs(np.array(ends) - legs) <= SAME_POINT * size)).sum())
-            if off:
+        for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
+            if wrong.any():
                 found[f"{who} of a scan"] = (
-                    f"{off} of {len(legs)} rays of the {who} do not end at their points of the wall, for values of a "
-                    f"call: something stands between the wall and {who}_origin, or points and wall have parted. What "
-                    "the rays meet is what is rendered there."
+                    f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
+                    f"values of a call: something stands between the wall and {who}_origin, or points and wall have parted. "
+                    "What the rays meet is what is rendered there."
                 )
         wall = sensor.get_shape()
         hidden = [shape for shape in scene.shapes() if shape.ptr != wall.ptr]
-        if not reaches_before(hidden, places, np.array(normals).T):
+        if not reaches_before(hidden, np.array(points).T, np.array(normals).T if normals is not None else self.normals):
             found["hidden things of a scan"] = (
-                "nothing hidden is before the wall, for values of a call: what is behind it sends it no light, and "
-                "has no gradient that would bring it back."
+                "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and has "
+                "no gradient that would bring it back."
             )
         return found
 
 
-def _end(scene: Any, origin: Any, points: Any) -> tuple[Any, Any]:
-    """How far rays from an origin to points go (Float), and normals there on the side that they come from."""
+def _rays(origin: Any, way: Any) -> Any:
+    """Rays (Ray3f) that end where ``way`` does."""
     import drjit as dr
     import mitsuba as mi
 
-    ray = mi.Ray3f(origin, dr.normalize(points - origin))
-    pi = scene.ray_intersect_preliminary(ray, coherent=True)
-    si = pi.compute_surface_interaction(ray, +mi.RayFlags.Minimal)
-    return pi.t, dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+    length = dr.norm(way)
+    return mi.Ray3f(origin, way / length, length, 0.0, [])
+
+
+def _end_elsewhere(scene: Any, ray: Any) -> Any:
+    """Which rays meet something before their end, or nothing there (Bool); NaN is elsewhere, too."""
+    import drjit as dr
+    import mitsuba as mi
+
+    met = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, ray.d), coherent=True)
+    return ~(dr.abs(met.t - ray.maxt) <= SAME_POINT * ray.maxt)
+
+
+def _normals(scene: Any, ray: Any) -> Any:
+    """Normals where rays end, on the side that they come from."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(mi.Ray3f(ray.o, ray.d), +mi.RayFlags.Minimal, coherent=True)
+    return dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,9 @@ from torchtransient.capture import Scan
 from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.nlos import defaults
+from torchtransient.nlos.arguments import check_is_scan
 from torchtransient.nlos.mesh_file import mesh_file
+from torchtransient.quantities import shown
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.scene_handle import load
 from torchtransient.render.variant import active_variant
@@ -23,6 +24,8 @@ from torchtransient.render.variant import active_variant
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
 ALL_BOUNCES = "all"
+# What single precision holds.
+MOST_ENERGY = 1e30
 # Plugins of emitters, Mitsuba's and ours.
 _LIGHTS = (
     "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
@@ -44,6 +47,7 @@ def capture_scene(
     Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
     without a wall; UnitError for an energy below zero.
     """
+    check_is_scan("capture", scan)
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
@@ -158,9 +162,9 @@ def _check_energy(energy: Any) -> None:
     if isinstance(energy, Mapping):
         return
     if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
-        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {energy!r}.")
-    if not (math.isfinite(energy) and energy >= 0):
-        raise UnitError(f"energy: expected joules of at least 0, got {energy!r}.")
+        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
+    if not 0 <= energy < MOST_ENERGY:
+        raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {MOST_ENERGY:g} at most).")
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:

@@ -22,9 +22,10 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.data.array_file import path_of
 from torchtransient.errors import SceneError
 from torchtransient.nlos import defaults
-from torchtransient.nlos.arguments import checked_count, checked_samples, checked_seed
+from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
@@ -84,7 +85,8 @@ def simulate(
     capture does not fit into memory or the disk is full, and for a part file that belongs to another simulation, is
     damaged, or is worked on by another process.
     """
-    seed, path = checked_seed("simulate", seed), None if part is None else Path(part)
+    seed, path = checked_seed("simulate", seed), _part_path(part)
+    check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     if sensor is not None and work.axes()[0] is None:
         raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
@@ -122,7 +124,7 @@ def forecast(
     if unknown:
         raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
     of_light = given.pop("bounces"), given.pop("energy")
-    path = None if part is None else Path(part)
+    path = _part_path(part)
     work = _work(hidden, scan, *given.values(), of_light, variant, _parts(scan, path, tiles))
     with active_variant(work.variant.name):
         return forecast_of(work, timed=True)
@@ -140,8 +142,7 @@ def _work(
     spp = checked_samples("simulate", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    if not isinstance(scan, Scan):
-        raise SceneError(f"simulate: expected scan as a tt.nlos.Scan, got {type(scan).__name__}.")
+    check_is_scan("simulate", scan)
     if isinstance(hidden, Scene):
         raise SceneError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
@@ -193,6 +194,10 @@ def _is_complete(scene: Mapping[str, Any]) -> bool:
     """Whether a dictionary has an integrator: hidden things have none."""
     kinds = [str(node.get("type", "")) for node in scene.values() if isinstance(node, Mapping)]
     return any("path" in kind for kind in kinds) or "integrator" in scene
+
+
+def _part_path(part: Any) -> Path | None:
+    return None if part is None else path_of(part, "simulate: part")
 
 
 def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:

@@ -31,6 +31,8 @@ class LaserBeam(mi.Emitter):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
+        if "energy" in props and isinstance(props["energy"], (bool, str)):
+            raise UnitError(f"laser_beam: energy: expected joules or a spectrum, got {props['energy']!r}.")
         self.energy = props.get_emissive_texture("energy", 1.0)
         _check_light(self.energy)
         # That of the base class cannot be set from Python.

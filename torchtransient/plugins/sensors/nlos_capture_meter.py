@@ -12,6 +12,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
 from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
+from torchtransient.quantities import real_array, shown
 
 
 class NLOSCaptureMeter(mi.Sensor):
@@ -167,11 +168,12 @@ def _is_rectangle(shape: Any) -> bool:
 
 
 def _place_of(props: Any, name: str, default: Any = None) -> Any:
-    """A point of a sensor's properties. Raises SceneError unless it is finite."""
-    place = mi.ScalarPoint3f(props.get(name, default))
-    if not np.isfinite(np.array(place)).all():
-        raise SceneError(f"nlos_capture_meter: expected {name} of finite numbers, got {place}.")
-    return place
+    """A point of a sensor's properties. Raises SceneError unless it is one, and finite."""
+    given = props.get(name, default)
+    numbers = real_array(given)
+    if numbers is None or numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise SceneError(f"nlos_capture_meter: expected {name} as a point of three finite numbers, got {shown(given)}.")
+    return mi.ScalarPoint3f(numbers)
 
 
 def _points_of(props: Any, name: str) -> Any:
