@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 import warnings
 
 import numpy as np
@@ -67,7 +68,7 @@ def test_points_that_an_optimizer_changes(as_leaf):
     with torch.no_grad():
         leaf[:2, :, 0] += 0.2
     after = layer(seed=0).transient
-    expected = renderer(scan(GRID + torch.tensor([0.2, 0.0, 0.0])))(seed=0).transient
+    expected = renderer(scan((GRID + torch.tensor([0.2, 0.0, 0.0])).requires_grad_()))(seed=0).transient.detach()
     torch.testing.assert_close(after.detach(), expected, rtol=0, atol=1e-5 * float(expected.max()))
     assert float((after - before).abs().max()) > 1e-3 * float(before.max())
 
@@ -84,7 +85,9 @@ def test_points_that_were_computed_do_not_follow(computed):
     assert float(leaf.grad.abs().sum()) > 0
     with torch.no_grad():
         leaf += 0.0
-    with pytest.raises(SceneError, match=r"points of its scan were computed of have changed.*make scan and renderer anew"):
+    with pytest.raises(
+        SceneError, match=r"computed of have changed.*make scan and renderer anew"
+    ):
         layer(seed=0)
 
 
@@ -156,8 +159,7 @@ def test_values_that_hide_the_scan_are_said_once(z, batch):
             layer({VERTICES: given}, seed=0)
     found = [warning for warning in caught if "window" not in str(warning.message)]
     assert len(found) == 1 and issubclass(found[0].category, PhysicsWarning)
-    with pytest.warns(PhysicsWarning, match=SAID[z]):
-        renderer(parameters=[VERTICES])({VERTICES: given}, seed=0)
+    assert re.search(SAID[z], str(found[0].message))
 
 
 @pytest.mark.parametrize("z", SAID)
@@ -172,8 +174,9 @@ def test_values_that_hide_the_scan_as_errors(z):
 
 
 @pytest.mark.parametrize(
-    ("key", "who"), [(POINTS, "sensor"), (SPOTS, "laser"), (ORIGIN, "sensor"), (LASER_ORIGIN, "laser"), ("wall.to_world", "sensor")]
-)  # fmt: skip
+    ("key", "who"),
+    [(POINTS, "sensor"), (SPOTS, "laser"), (ORIGIN, "sensor"), (LASER_ORIGIN, "laser"), ("wall.to_world", "sensor")],
+)
 def test_points_and_wall_that_part(key, who):
     layer = renderer(scan(kind="single", laser_points=GRID[0, 1]), [key], physics="error")
     layer(seed=0)
@@ -181,8 +184,7 @@ def test_points_and_wall_that_part(key, who):
     if key == "wall.to_world":
         value[2, 3] -= 0.1
     elif key in (ORIGIN, LASER_ORIGIN):
-        value[2] = 4.0  # beyond the letter
-        value[:2] = 0.0
+        value[:] = torch.tensor([0.0, -0.4, 4.0])  # beyond the foot of the letter
     else:
         value.reshape(-1, 3)[0, 2] += 0.1
     with pytest.raises(PhysicsError, match=f"rays of the {who} do not end at their points"):

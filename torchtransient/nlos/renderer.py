@@ -73,7 +73,7 @@ class CaptureRenderer(nn.Module):
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
         _check_once(wanted, followed)
-        self._own, self._sources = tuple(wanted), _Sources(followed.values())
+        self._own, self._sources = tuple(wanted), _Sources(_points_of(scan)[key] for key in followed)
         self.renderer = TransientRenderer(scene, {**wanted, **dict.fromkeys(followed)}, **settings)
         for key in followed:
             self.renderer.values[key].requires_grad_(requires_grad=False)
@@ -180,11 +180,13 @@ def _check_once(parameters: Mapping[str, Any], followed: Mapping[str, torch.Tens
 
 def _attached(scan: Scan) -> dict[str, torch.Tensor]:
     """The points of a scan that require gradients as they are now, by their keys in the scene."""
+    points = {key: value for key, value in _points_of(scan).items() if value.requires_grad}
+    return {key: value if value.ndim == 1 else value.reshape(-1, 3) for key, value in points.items()}
+
+
+def _points_of(scan: Scan) -> dict[str, torch.Tensor]:
     points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin, LASER_ORIGIN: scan.laser_origin}
-    if scan.kind != "confocal":
-        points[SPOTS] = scan.laser_points
-    listed = {key: value if value.ndim == 1 else value.reshape(-1, 3) for key, value in points.items()}
-    return {key: value for key, value in listed.items() if value.requires_grad}
+    return points if scan.kind == "confocal" else {**points, SPOTS: scan.laser_points}
 
 
 def as_capture(
