@@ -1,6 +1,7 @@
 """Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms.
 
-What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and texts are none, although Python takes them.
+What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and
+texts are none, although Python takes them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def share(name: str, value: Any) -> float:
 
 def shares(name: str, values: Any) -> float | tuple[float, float, float]:
     """One share, or three of a linear sRGB colour: a sequence or an array of three. Raises UnitError."""
-    if not isinstance(values, (list, tuple)) and getattr(values, "ndim", 0) != 1:
+    if not isinstance(values, (list, tuple)) and getattr(values, "ndim", None) != 1:
         return share(name, values)
     plain = list(values)
     if len(plain) != 3:
@@ -64,7 +65,7 @@ def count(name: str, value: Any, least: int = 1) -> int:
 
 def flag(name: str, value: Any) -> bool:
     """``value`` as a truth value. Raises SceneError for others: a text that says False would count as true."""
-    if not _is_truth(value) or getattr(value, "ndim", 0):
+    if not _is_truth(value) or getattr(value, "ndim", None):
         raise SceneError(f"{name}: expected True or False, got {shown(value)}.")
     return bool(value)
 
@@ -108,7 +109,7 @@ def shown(value: Any) -> str:
 
 def _number(value: Any) -> float:
     """NaN for what is no real number."""
-    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", 0):
+    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):
         return math.nan
     try:
         return float(value)

@@ -15,8 +15,8 @@ from torchtransient.errors import TorchTransientError
 VARIANT = "llvm_ad_mono"
 WRONG = (
     None, "x", b"x", True, [], [1], (1, 2, 3, 4), {}, {"a": 1}, math.nan, math.inf, -1, 0, 1.5, 2**33, 10**400,
-    -(10**400), 1j, np.zeros((2, 2)), np.full(3, math.nan), torch.tensor([1.0, 2.0]), [[1, 2], [3]], [None] * 3, ["a", "b", "c"],
-    object(), lambda: 0,
+    -(10**400), 1j, np.zeros((2, 2)), np.full(3, math.nan), torch.tensor([1.0, 2.0]), [[1, 2], [3]], [None] * 3,
+    ["a", "b", "c"], object(), lambda: 0,
 )  # fmt: skip
 VERTICES, FACES = np.array([[0, 0, 1.0], [1, 0, 1], [0, 1, 1]]), [[0, 2, 1]]
 WALL = tt.nlos.Wall.plane()

@@ -37,7 +37,7 @@ ROUTES = {
     "in a folder by a parameter": (SHAPE.format(name="$place/a.obj"), {"place": "deep"}, "deep/a.obj"),
     "in an included file": ('<include filename="more.xml"/>', {}, "default.obj"),
     "in a form of its own": (
-        SHAPE.replace('name="filename" value="{name}"', "value = '{name}'   name='filename'").format(name="default.obj"),
+        SHAPE.replace('name="filename" value="{name}"', "value = '{name}' name='filename'").format(name="default.obj"),
         {}, "default.obj",
     ),
 }  # fmt: skip

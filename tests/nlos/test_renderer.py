@@ -85,9 +85,7 @@ def test_points_that_were_computed_do_not_follow(computed):
     assert float(leaf.grad.abs().sum()) > 0
     with torch.no_grad():
         leaf += 0.0
-    with pytest.raises(
-        SceneError, match=r"computed of have changed.*make scan and renderer anew"
-    ):
+    with pytest.raises(SceneError, match=r"computed of have changed.*make scan and renderer anew"):
         layer(seed=0)
 
 

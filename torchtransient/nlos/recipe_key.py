@@ -11,35 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtransient.errors import SceneError
-from torchtransient.render.scene_handle import Scene
-from torchtransient.render.variant import active_variant
-
 
 def recipe_key(*parts: Any) -> str:
     """Of descriptions, scans, arrays and plain data; files that descriptions name count with what is in them."""
     return hashlib.sha256(_text(parts).encode()).hexdigest()
-
-
-def files_of(scene: Scene) -> dict[str, str]:
-    """What is in the files that a scene names anywhere, by the name that it has there: included files, defaults and
-    values of ``$parameters`` count. Raises SceneError for a description that Mitsuba cannot read.
-    """
-    import mitsuba as mi
-
-    description, found = scene._description, {}
-    with active_variant(scene.variant), description.resolved_files():
-        try:
-            nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes
-        except RuntimeError as error:
-            raise SceneError(f"{description.name}: {error}") from error
-        for node in nodes:
-            for name in list(node.props):
-                value = node.props[name] if node.props.type(name) == mi.Properties.Type.String else ""
-                contents = _contents(Path(str(mi.file_resolver().resolve(value)))) if value else ""
-                if contents:
-                    found[value] = contents
-    return found
 
 
 def _text(value: Any) -> str:
@@ -49,7 +24,7 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple | list):
         return "[" + ", ".join(map(_text, value)) + "]"
     if isinstance(value, str | Path):
-        return f"{str(value)!r}{_contents(Path(value))}"
+        return f"{str(value)!r}{contents_of(Path(value))}"
     if is_dataclass(value) and not isinstance(value, type):
         return type(value).__name__ + _text({field.name: getattr(value, field.name) for field in fields(value)})
     if isinstance(value, torch.Tensor):
@@ -67,8 +42,8 @@ def _text(value: Any) -> str:
     return repr(value)
 
 
-def _contents(path: Path) -> str:
-    """What is in a file, "" for texts that name none."""
+def contents_of(path: Path) -> str:
+    """A text that stands for what is in a file, "" for texts that name none."""
     try:
         if not path.is_file():
             return ""

@@ -46,15 +46,16 @@ class ScanWatch:
             if wrong.any():
                 found[f"{who} of a scan"] = (
                     f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
-                    f"values of a call: something stands between the wall and {who}_origin, or points and wall have parted. "
-                    "What the rays meet is what is rendered there."
+                    f"values of a call: something stands between the wall and {who}_origin, or points and wall have "
+                    "parted. What the rays meet is what is rendered there."
                 )
         wall = sensor.get_shape()
         hidden = [shape for shape in scene.shapes() if shape.ptr != wall.ptr]
-        if not reaches_before(hidden, np.array(points).T, np.array(normals).T if normals is not None else self.normals):
+        upright = self.normals if self.normals is not None else np.array(normals).T
+        if not reaches_before(hidden, np.array(points).T, upright):
             found["hidden things of a scan"] = (
-                "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and has "
-                "no gradient that would bring it back."
+                "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and "
+                "has no gradient that would bring it back."
             )
         return found
 

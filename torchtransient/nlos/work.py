@@ -12,9 +12,10 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.nlos.recipe_key import files_of, recipe_key
+from torchtransient.nlos.recipe_key import recipe_key
 from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
+from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.nlos.variant_choice import VariantChoice
 from torchtransient.render.renderer import TransientRenderer
