@@ -131,6 +131,16 @@ def test_a_vmap_of_seeds():
     torch.testing.assert_close(found, torch.stack([total(values[0], s) for s in (3, 4)]), rtol=1e-5, atol=0)
 
 
+def test_which_draws_are_those_of_simulate():
+    """A layer's in the same variant are those of a simulation in one part; parts are other draws."""
+    settings = {"time_axis": AXIS, "spp": 16, "seed": 3, "progress": False}
+    whole = tt.nlos.simulate(tt.scenes.nlos_z(), scan(), **settings).transient
+    parts = tt.nlos.simulate(tt.scenes.nlos_z(), scan(), tiles=2, **settings).transient
+    layer = renderer(parameters=["letter.bsdf.reflectance.value"])(seed=3).transient.detach()
+    torch.testing.assert_close(layer, whole, rtol=0, atol=1e-6 * float(whole.max()))
+    assert float((parts - whole).abs().max()) > 0.01 * float(whole.max())
+
+
 # ------------------------------------------------------------------------------------------------ values out of sight
 
 BEHIND, BETWEEN = -2.0, -0.9

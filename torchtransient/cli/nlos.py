@@ -33,7 +33,7 @@ INTERRUPTED = 130
 @click.option("--restart", is_flag=True, help="Delete a part file that is there, and start anew.")
 @click.option("--describe", is_flag=True, help="Say memory, time and what is chosen, and stop.")
 @click.option("--spp", type=click.IntRange(1, 2**32 - 1), help="Samples per sensor point.  [default: the file's]")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Same seed and parts, same capture.  [default: the file's]")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Same seed, same capture.  [default: the file's]")
 @click.option("--variant", help="Mitsuba variant.  [default: the file's, or the cheapest that shows all colours]")
 @click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of an XML file.")
 @click.option("--transients", type=click.Path(path_type=Path), help="Draw histograms over the wall (.png).")

@@ -71,8 +71,9 @@ def simulate(
     ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
     ``generator`` (devices draw their counts); its answer has the same bins.
     ``seed``: a whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to
-    in the order they come. Parts have seeds derived from it, so that another number of them is another draw; so is what
-    a :class:`CaptureRenderer` with parameters, or in another variant, makes of the same seed.
+    in the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
+    :class:`CaptureRenderer` draws what one part does in the same variant (and spreads it by a tent in time where a
+    parameter can change lengths).
 
     ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
     that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
