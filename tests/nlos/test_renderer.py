@@ -64,6 +64,7 @@ def test_points_that_an_optimizer_changes(as_leaf):
     layer = renderer(scan(given))
     before = layer(seed=0).transient
     before.sum().backward()
+    before = before.detach()
     assert leaf.grad is not None and float(leaf.grad.abs().sum()) > 0
     with torch.no_grad():
         leaf[:2, :, 0] += 0.2

@@ -15,7 +15,7 @@ from torchtransient.nlos import defaults
 from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
 from torchtransient.nlos.scan_watch import ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
-from torchtransient.nlos.scene_scan import check_scan_is_seen
+from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
@@ -83,7 +83,7 @@ class CaptureRenderer(nn.Module):
         check_scan(self.renderer.scene, scan, self.renderer._options)
         moving = needing_slope(self.renderer._infos, self.renderer._keys)
         if moving:
-            self.renderer._watch.installed = ScanWatch(_lasting_normals(scan, moving))
+            self.renderer._watch.installed = ScanWatch(tolerance_of(scan), _lasting_normals(scan, moving))
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:

@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.nlos.scene_scan import SAME_POINT, reaches_before
+from torchtransient.nlos.scene_scan import reaches_before
 
 
 @dataclass(frozen=True, eq=False)
 class ScanWatch:
     """Says what is wrong with a scene of a capture as it is, in one pass of rays to scan points and laser spots.
 
-    ``normals``: those of the wall at the scan points (N, 3), None where they may change. It is asked in every render,
-    so it does not look up which shapes are met: every end in the wrong place counts.
+    ``tolerance``: in metres, how far from its point a ray may end. ``normals``: those of the wall at the scan points
+    (N, 3), None where they may change. It is asked in every render, so it does not look up which shapes are met: every
+    end in the wrong place counts.
     """
 
+    tolerance: float
     normals: NDArray[np.float64] | None
 
     def __call__(self, scene: Any, number: int) -> dict[str, str]:
@@ -38,8 +40,9 @@ class ScanWatch:
             rays = {"sensor": _rays(origin, points - origin)}
             if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
                 rays["laser"] = _rays(laser, dr.detach(aims_of(scene, sensor, capture, None)))
-            off = {who: _end_elsewhere(scene, ray) for who, ray in rays.items()}
-            normals = None if self.normals is not None else _normals(scene, rays["sensor"])
+            tolerance = dr.opaque(mi.Float, self.tolerance)
+            off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])
             dr.eval(points, normals, off)
         found = {}
         for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
@@ -60,22 +63,21 @@ class ScanWatch:
         return found
 
 
-def _rays(origin: Any, way: Any) -> Any:
-    """Rays (Ray3f) that end where ``way`` does."""
+def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
+    """Rays (Ray3f) along ways, and their lengths."""
     import drjit as dr
     import mitsuba as mi
 
     length = dr.norm(way)
-    return mi.Ray3f(origin, way / length, length, 0.0, [])
+    return mi.Ray3f(origin, way / length), length
 
 
-def _end_elsewhere(scene: Any, ray: Any) -> Any:
-    """Which rays meet something before their end, or nothing there (Bool); NaN is elsewhere, too."""
+def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
+    """Which rays meet something before their length, or nothing there (Bool); NaN is elsewhere, too."""
     import drjit as dr
-    import mitsuba as mi
 
-    met = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, ray.d), coherent=True)
-    return ~(dr.abs(met.t - ray.maxt) <= SAME_POINT * ray.maxt)
+    met = scene.ray_intersect_preliminary(ray, coherent=True)
+    return ~(dr.abs(met.t - length) <= tolerance)
 
 
 def _normals(scene: Any, ray: Any) -> Any:
@@ -83,5 +85,5 @@ def _normals(scene: Any, ray: Any) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    si = scene.ray_intersect(mi.Ray3f(ray.o, ray.d), +mi.RayFlags.Minimal, coherent=True)
+    si = scene.ray_intersect(ray, +mi.RayFlags.Minimal, coherent=True)
     return dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)

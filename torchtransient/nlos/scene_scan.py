@@ -99,6 +99,12 @@ def check_scan_is_seen(scene: Any, scan: Scan) -> None:
     _check_same(_laser_ends(scene, sensor, scene.integrator())[1], spots, points, "laser")
 
 
+def tolerance_of(scan: Scan) -> float:
+    """How far from a point of a scan, in metres, a ray may end that looks at it."""
+    points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
+    return SAME_POINT * max(_extent(points), float(scan.sensor_legs.detach().max()))
+
+
 # ---------------------------------------------------------------------------------------------------------------- rays
 
 
@@ -247,6 +253,10 @@ def _check_hidden(scene: Any, wall: Ends) -> None:
     )
 
 
+def _extent(points: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
 def reaches_before(shapes: list[Any], points: NDArray[np.float64], normals: NDArray[np.float64]) -> bool:
     """Whether the box of a shape reaches before the wall at one of its ``points``, with ``normals`` there (N, 3)."""
     for shape in shapes:
@@ -280,7 +290,7 @@ def _check_areas(shapes: list[Any]) -> None:
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:
     """Raise SceneError unless rays end at ``points``; ``scanned``: those that say how large the scan is."""
     legs = np.linalg.norm(points - ends.origins, axis=-1)
-    size = max(float(np.linalg.norm(scanned.max(0) - scanned.min(0))), float(legs.max()))
+    size = max(_extent(scanned), float(legs.max()))
     off = np.linalg.norm(ends.points - points, axis=-1)
     wrong = np.flatnonzero((off > SAME_POINT * size) | np.array([not name for name in ends.shapes]))
     if not len(wrong):
