@@ -135,6 +135,10 @@ class _Sources:
     def __init__(self, tensors: Iterable[torch.Tensor]):
         self._versions = [(leaf, leaf._version) for tensor in tensors for leaf in _leaves(tensor)]
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Points of a copy are leaves.
+        return {"_versions": []}
+
     def check(self) -> None:
         """Raise SceneError where one was changed since."""
         if any(leaf._version != version for leaf, version in self._versions):
