@@ -68,9 +68,9 @@ def test_points_that_an_optimizer_changes(as_leaf):
     assert leaf.grad is not None and float(leaf.grad.abs().sum()) > 0
     with torch.no_grad():
         leaf[:2, :, 0] += 0.2
-    after = layer(seed=0).transient
+    after = layer(seed=0).transient.detach()
     expected = renderer(scan((GRID + torch.tensor([0.2, 0.0, 0.0])).requires_grad_()))(seed=0).transient.detach()
-    torch.testing.assert_close(after.detach(), expected, rtol=0, atol=1e-5 * float(expected.max()))
+    torch.testing.assert_close(after, expected, rtol=0, atol=1e-5 * float(expected.max()))
     assert float((after - before).abs().max()) > 1e-3 * float(before.max())
 
 
