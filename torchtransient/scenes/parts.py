@@ -65,6 +65,6 @@ def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
 
 def diffuse(reflectance: float | Sequence[float]) -> SceneDict:
     """A Lambertian BSDF; one albedo for all wavelengths or three, linear sRGB. Raises UnitError outside of [0, 1]."""
-    albedo = shares("reflectance", reflectance)
+    albedo = shares("albedo or reflectance", reflectance)
     value = {"type": "rgb", "value": list(albedo)} if isinstance(albedo, tuple) else albedo
     return {"type": "diffuse", "reflectance": value}
