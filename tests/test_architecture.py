@@ -20,7 +20,7 @@ TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
-    "gates": 0, "stokes": 0, "tensor_record": 0,
+    "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
@@ -142,7 +142,7 @@ def is_below(other, room):
     # likelihoods are those of the sensors; captures are records with axes; simulated ones have files.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("nlos", "data"),
+        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "data"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 

@@ -169,7 +169,7 @@ class FrequencyAxis:
 def _finite(value: float, name: str, owner: str = "TimeAxis") -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         raise UnitError(f"{owner}: expected {name} to be one number, got {value!r}.") from None
     if not math.isfinite(number):
         raise UnitError(f"{owner}: expected {name} to be finite, got {number!r}.")

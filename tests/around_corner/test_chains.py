@@ -64,9 +64,11 @@ def test_each_number_of_bounces(bounces):
 def test_a_curved_wall(tmp_path):
     """Heads lie on the wall, too; light of two and three bounces goes on coming from paths."""
     wall = curved_wall(tmp_path)
+    x, y = np.meshgrid((np.arange(3) + 0.5) / 3, (np.arange(2) + 0.5) / 2)
+    points = np.array(mi.load_dict(wall).sample_position(0, mi.Point2f(x.ravel(), y.ravel())).p).T
     for given in ({"min_bounces": 4, "max_depth": 5}, {"max_depth": 5}):
         shapes = [mesh("a", plate(0.8, 0.8, (0, 0, 1.0)))]
-        given |= {"wall": wall, "film": {"start_opl": 0.0}}
+        given |= {"wall": wall, "points": points, "film": {"start_opl": 0.0}}
         some = scan_scene(shapes, **given, late_light="chains")
         other = scan_scene(shapes, **given)
         equal, z = agree(rendered(some, 4 * CHAINS, 12), rendered(other, 4 * PATHS, 8, first=50))

@@ -166,8 +166,8 @@ TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Wall.plane(0.0, 1.0), UnitError, "width > 0"),
-        (lambda: Wall.plane(1.0, float("nan")), UnitError, "height > 0"),
+        (lambda: Wall.plane(0.0, 1.0), UnitError, "width: expected a finite number greater than zero"),
+        (lambda: Wall.plane(1.0, float("nan")), UnitError, "height: expected a finite number greater than zero"),
         (lambda: Wall.plane(normal=(0, 0, 0)), SceneError, "normal with a direction"),
         (lambda: Wall.plane(normal=(0, 1, 0)), SceneError, "parallel"),
         (lambda: Wall.plane(center=(0, 1)), ShapeError, "three numbers"),

@@ -40,11 +40,12 @@ def simulate(hidden=None, of=None, **settings):
 
 def renderer(hidden=None, of=None, **settings):
     settings = {"time_axis": AXIS, "spp": 4} | settings
-    return tt.nlos.CaptureRenderer(Z if hidden is None else hidden, of or scan(), **settings)(seed=0)
+    seed = settings.pop("seed", 0)
+    return tt.nlos.CaptureRenderer(Z if hidden is None else hidden, of or scan(), **settings)(seed=seed)
 
 
-def scene(*given, **changed):
-    return tt.nlos.simulate(complete(*given, **changed), spp=4, progress=False)
+def scene(*given, seed=0, **changed):
+    return tt.nlos.simulate(complete(*given, **changed), spp=4, progress=False, seed=seed)
 
 
 def plate(z, **settings):
@@ -78,6 +79,7 @@ NAN = r"expected finite numbers, got NaN or infinity in 'letter.vertices' \(1 of
 BEHIND = r"expected something before the wall.*got nothing there.*turn the wall"
 NOTHING = "expected at least one shape beside the wall, got none"
 BOUNCES = r"whole numbers of at least 2 without gaps.*got {}.*light around one corner has 3"
+SEED = "seed: expected a whole number from 0 to 4294967295, got {}"
 BACK = r"rays end on the back of 'wall'.*Move sensor_origin or laser_origin"
 LARGE = tt.TimeAxis(0.0, 1e-3, 100_000)
 MESH = (np.ones((3, 3)), np.array([[0, 1, 2]]))
@@ -132,7 +134,16 @@ CASES = {
     "vertices that are no number: simulate": (lambda: simulate(broken_mesh()), SceneError, NAN),
     "vertices that are no number: renderer": (lambda: renderer(broken_mesh()), SceneError, NAN),
     "vertices that are no number: scene": (lambda: scene(hidden=broken_mesh()), SceneError, NAN),
-    "no area": (lambda: simulate(MESH), SceneError, "expected shapes with a surface"),
+    "no area": (lambda: simulate(MESH), SceneError, r"shapes with an area.*got 'hidden' \(0 m\^2\)"),
+    "no area: renderer": (lambda: renderer(MESH), SceneError, r"shapes with an area.*got 'hidden' \(0 m\^2\)"),
+    "no area: scene": (
+        lambda: scene(hidden={"dot": tt.scenes.triangle_mesh(*MESH)}), SceneError, r"got 'dot' \(0 m\^2\)",
+    ),
+    "lengths of stars": (lambda: simulate((1e30 * MESH[0], MESH[1])), UnitError, "hidden: expected vertices in finite"),
+    "areas beyond numbers": (
+        lambda: simulate({"far": {"type": "mesh_arrays", "vertices": 1e30 * np.eye(3), "faces": [[0, 1, 2]]}}),
+        SceneError, "shapes of finite area, got 'far'",
+    ),
     "hidden light: simulate": (lambda: simulate(shining()), SceneError, SHINES),
     "hidden light: renderer": (lambda: renderer(shining()), SceneError, SHINES),
     "hidden light: scene": (
@@ -143,7 +154,7 @@ CASES = {
     "no dictionary": (lambda: simulate({"a": 3}), SceneError, "expected 'a' as a dictionary with a type, got 3"),
     "a name of the capture": (lambda: simulate({"wall": Z["letter"]}), SceneError, "names wall belong to the capture"),
     "a mesh file that is not there": (lambda: simulate("no.obj"), SceneError, "no file 'no.obj'"),
-    "another file": (lambda: simulate("no.txt"), SceneError, r"expected a mesh file \(\.ply, \.obj, \.stl\)"),
+    "another file": (lambda: simulate("no.txt"), SceneError, r"expected a mesh file \(\.obj, \.ply, \.ser"),
     # light and work
     "one bounce": (lambda: simulate(bounces=(1,)), SceneError, BOUNCES.format(r"\(1,\)")),
     "a gap in bounces": (lambda: renderer(bounces=(3, 5)), SceneError, BOUNCES.format(r"\(3, 5\)")),
@@ -163,7 +174,17 @@ CASES = {
     "no samples: renderer": (lambda: renderer(spp=0), UnitError, "spp: expected a positive integer"),
     "no samples: scene": (lambda: tt.nlos.simulate(complete(), spp=0), UnitError, "spp: expected a positive integer"),
     "half a sample": (lambda: simulate(spp=1.5), UnitError, "spp: expected a positive integer"),
-    "a negative seed": (lambda: simulate(seed=-1), SceneError, "seed: expected a whole number of at least 0"),
+    "a negative seed: simulate": (lambda: simulate(seed=-1), SceneError, SEED.format(-1)),
+    "a negative seed: renderer": (lambda: renderer(seed=-1), SceneError, SEED.format(-1)),
+    "a negative seed: scene": (lambda: scene(seed=-1), SceneError, SEED.format(-1)),
+    "a negative seed: forecast": (
+        lambda: tt.nlos.forecast(Z, scan(), time_axis=AXIS, seed=-1), SceneError, SEED.format(-1),
+    ),
+    "a seed of 33 bits: simulate": (lambda: simulate(seed=2**32), SceneError, SEED.format(2**32)),
+    "a seed of 33 bits: renderer": (lambda: renderer(seed=[0, 2**32]), SceneError, SEED.format(2**32)),
+    "a seed of 33 bits: tiles": (lambda: simulate(seed=2**32, tiles=2), SceneError, SEED.format(2**32)),
+    "samples of 33 bits: simulate": (lambda: simulate(spp=2**32), UnitError, "spp: expected at most 4294967295"),
+    "samples of 33 bits: renderer": (lambda: renderer(spp=2**32), UnitError, "spp: expected at most 4294967295"),
     "no tiles": (lambda: simulate(tiles=0), SceneError, "tiles: expected a whole number of at least 1"),
     "memory: simulate": (
         lambda: simulate(of=scan("exhaustive", (100, 100)), time_axis=LARGE), StorageError, "36.38 TiB.*Use fewer bins",

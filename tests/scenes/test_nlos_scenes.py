@@ -223,7 +223,7 @@ def test_bounds_are_those_of_mitsuba():
         (lambda: scenes.nlos_room(depth=1.0), UnitError, "depth beyond the 2.4 m"),
         (lambda: scenes.relay_wall(-1.0), UnitError, "width"),
         (lambda: scenes.triangle_mesh(np.zeros((3, 2)), [[0, 1, 2]]), ShapeError, r"\(V, 3\)"),
-        (lambda: scenes.triangle_mesh(np.zeros((3, 3)), [[0, 1, 3]]), ShapeError, "vertices 0 to 2"),
+        (lambda: scenes.triangle_mesh(np.zeros((3, 3)), [[0, 1, 3]]), ShapeError, "whole numbers from 0 to 2"),
         (lambda: scenes.bounds({}), SceneError, "without any"),
         (lambda: scenes.bounds({"a": {"type": "obj"}}), SceneError, "'obj' at a"),
         (lambda: meshes.sheet(outline("T")[::-1]), SceneError, "against the clock"),

@@ -24,8 +24,12 @@ def wall_rectangle(albedo=0.9):
     }
 
 
-def scan_scene(shapes, kind="confocal", size=(3, 2), film=None, wall=None, spot=(-0.2, 0.1, 0.0), **integrator):
-    """A loaded scene: built ``shapes`` before a wall of one metre and a half (or ``wall``, a dictionary)."""
+def scan_scene(
+    shapes, kind="confocal", size=(3, 2), film=None, wall=None, spot=(-0.2, 0.1, 0.0), points=None, **integrator
+):
+    """A loaded scene: built ``shapes`` before a wall of one metre and a half (or ``wall``, a dictionary); ``points``
+    (N, 3): the scanned ones, where the wall does not say which.
+    """
     film = {
         "type": "transient_hdr_film", "temporal_bins": 60, "bin_width_opl": 0.1, "start_opl": 1.0,
         "width": size[0], "height": size[1], "rfilter": {"type": "box"}, **(film or {}),
@@ -35,6 +39,8 @@ def scan_scene(shapes, kind="confocal", size=(3, 2), film=None, wall=None, spot=
     if kind == "exhaustive":
         film |= {"exhaustive_scan": True, "laser_scan_width": size[0], "laser_scan_height": size[1]}
     sensor = {"type": "nlos_capture_meter", "sensor_origin": ORIGIN, "film": film}
+    if points is not None:
+        sensor["points"] = mi.TensorXf(np.asarray(points, dtype=np.float32))
     look = mi.ScalarTransform4f().look_at(ORIGIN, list(spot), [0, 1, 0])
     return mi.load_dict(
         {

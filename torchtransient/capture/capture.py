@@ -14,6 +14,7 @@ from torch import Tensor
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.quantities import finite, flag, shown
 from torchtransient.tensor_record import TensorRecord
 
 _CHANNEL_AND_TIME = 2
@@ -53,6 +54,7 @@ class Capture(TensorRecord):
     polarized: bool = False
 
     def __post_init__(self) -> None:
+        self._check_settings()
         # Trees of tensors (``torch.utils._pytree``) take records apart and put anything into their places.
         if isinstance(self.transient, Tensor):
             self._check("transient", self.transient, None if self.axis is None else self.axis.num_bins, "axis")
@@ -65,6 +67,19 @@ class Capture(TensorRecord):
             json.dumps(self.metadata, default=_refuse_plain)
         except (TypeError, ValueError) as error:
             raise StorageError(f"Capture: expected metadata of plain data that JSON can hold: {error}.") from None
+
+    def _check_settings(self) -> None:
+        if not isinstance(self.scan, Scan):
+            raise ShapeError(f"Capture: expected scan as a Scan, got {shown(self.scan)}.")
+        for name, kind in (("axis", TimeAxis), ("frequencies", FrequencyAxis)):
+            given = getattr(self, name)
+            if given is not None and not isinstance(given, kind):
+                raise ShapeError(f"Capture: expected {name} as a {kind.__name__} or None, got {shown(given)}.")
+        if not isinstance(self.channels, tuple) or not all(isinstance(name, str) for name in self.channels):
+            raise ShapeError(f"Capture: expected channels as a tuple of names, got {shown(self.channels)}.")
+        if not isinstance(self.metadata, Mapping):
+            raise StorageError(f"Capture: expected metadata as names and values, got {shown(self.metadata)}.")
+        flag("Capture: polarized", self.polarized)
 
     def _check(self, name: str, tensor: Tensor, count: int | None, axis: str) -> None:
         if count is None:
@@ -116,7 +131,8 @@ class Capture(TensorRecord):
         """
         cube, axis = self._cube("crop"), self.axis
         assert axis is not None
-        if not (math.isfinite(start_opl) and math.isfinite(end_opl) and start_opl < end_opl):
+        start_opl, end_opl = finite("Capture.crop: start_opl", start_opl), finite("Capture.crop: end_opl", end_opl)
+        if not start_opl < end_opl:
             raise UnitError(f"Capture.crop: expected a start before an end in metres, got {start_opl!r}, {end_opl!r}.")
         # An edge that was computed in another way belongs to the bin that it is meant for.
         first = max(0, math.floor((start_opl - axis.start_opl) / axis.bin_width_opl + 1e-6))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import real_array, shown
 
 if TYPE_CHECKING:
     from torchtransient.capture.scan import Scan
@@ -16,9 +17,10 @@ if TYPE_CHECKING:
 
 def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     """The corners (3,) of a box of lowest and highest coordinates, float64. Raises ShapeError and UnitError."""
-    box = torch.as_tensor(bounds, dtype=torch.float64).detach().cpu()
-    if box.shape != (2, 3):
-        raise ShapeError(f"{who}: expected bounds (2, 3), the lowest and the highest corner, got {tuple(box.shape)}.")
+    plain = real_array(bounds)
+    if plain is None or plain.shape != (2, 3):
+        raise ShapeError(f"{who}: expected bounds (2, 3), the lowest and the highest corner, got {shown(bounds)}.")
+    box = torch.from_numpy(plain)
     if not bool(torch.isfinite(box).all()) or not bool((box[0] <= box[1]).all()):
         raise UnitError(f"{who}: expected finite bounds, the lowest corner first, got {box.tolist()}.")
     return box[0], box[1]

@@ -15,7 +15,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
 from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, same, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import flag, positive, real_array, shown
 
 KINDS = ("single", "confocal", "exhaustive")
 # Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.
@@ -50,8 +51,7 @@ class Scan:
     wall: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {self.kind!r}.")
+        _check_kind(self.kind)
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
         for name in ("sensor_points", "laser_points", "sensor_origin", "laser_origin"):
             object.__setattr__(self, name, float64_points(name, getattr(self, name), device))
@@ -60,6 +60,7 @@ class Scan:
                 object.__setattr__(self, name, unit_normals(name, float64_points(name, getattr(self, name), device)))
         if self.wall is not None and not isinstance(self.wall, Mapping):
             raise SceneError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
+        flag("Scan: first_and_last_leg", self.first_and_last_leg)
         check_shapes(self)
         check_sides(self)
 
@@ -90,6 +91,7 @@ class Scan:
         Raises SceneError where a spot misses the wall, for a laser or a laser grid that the kind has no use for, and
         for an exhaustive scan of one pair, which is a single one; otherwise as the class and :meth:`Wall.grid`.
         """
+        _check_kind(kind)
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
         points, normals = surface.grid((nx, ny), extent, cell_centers=cell_centers)
@@ -142,6 +144,7 @@ class Scan:
         `normals`: those of the sensor points where no wall is given, and of the spots of a confocal scan. Errors as the
         class.
         """
+        _check_kind(kind)
         sensor = float64_points("sensor_points", sensor_points)
         if kind == "confocal":
             _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
@@ -242,9 +245,7 @@ class Scan:
         that are none, and as TimeAxis.
         """
         low, high = bounds_of(hidden_bounds, "Scan.default_axis")
-        width = float(bin_width_opl)
-        if not (math.isfinite(width) and width > 0):
-            raise UnitError(f"Scan.default_axis: expected bin_width_opl > 0 metres, got {bin_width_opl!r}.")
+        width = positive("Scan.default_axis: bin_width_opl", bin_width_opl)
         first, last = math.floor(shortest(self, low, high) / width), math.ceil(longest(self, low, high) / width)
         return TimeAxis(first * width, width, max(1, last - first))
 
@@ -307,21 +308,27 @@ class Scan:
         return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
 
 
+def _check_kind(kind: Any) -> None:
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise SceneError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
+
+
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """`laser` as an index into the spots of a scan. Raises ShapeError where there is none."""
     index = laser if isinstance(laser, tuple) else (laser,)
-    inside = len(index) == len(scan.laser_shape) and all(
-        -n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)
-    )
-    if not inside:
-        raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {laser!r}.")
+    whole = all(isinstance(i, int | np.integer) and not isinstance(i, bool) for i in index)
+    inside = len(index) == len(scan.laser_shape) and whole
+    if not inside or not all(-n <= i < n for i, n in zip(index, scan.laser_shape, strict=True)):
+        raise ShapeError(f"laser: expected an index into spots {scan.laser_shape}, got {shown(laser)}.")
     return tuple(int(i) for i in index)
 
 
 def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:
     if laser is None:
         return surface.at(0.5, 0.5)
-    plain = laser.detach().cpu().numpy() if isinstance(laser, Tensor) else np.asarray(laser, dtype=np.float64)
+    plain = real_array(laser)
+    if plain is None or plain.shape not in ((2,), (3,)):
+        raise ShapeError(f"Scan.grid laser: expected (u, v) on the wall or a point (3,), got {shown(laser)}.")
     if plain.shape == (2,):
         return surface.at(plain[0], plain[1])
     point = triple("Scan.grid laser", laser)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.quantities import real_array, shown
 
 if TYPE_CHECKING:
     from torchtransient.capture.scan import Scan
@@ -17,11 +18,17 @@ if TYPE_CHECKING:
 
 def float64_points(name: str, values: Any, device: torch.device | None = None) -> Tensor:
     """Points (..., 3) as float64, with the gradients they carry. Raises ShapeError and UnitError."""
-    try:
-        tensor = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {values!r}.") from None
-    if tensor.is_complex() or tensor.ndim == 0 or tensor.shape[-1] != 3 or tensor.numel() == 0:
+    plain = values if isinstance(values, Tensor) else real_array(values)
+    if plain is None:
+        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
+    tensor = plain if isinstance(plain, Tensor) else torch.from_numpy(plain)
+    if (
+        tensor.is_complex()
+        or tensor.dtype == torch.bool
+        or tensor.ndim == 0
+        or tensor.shape[-1] != 3
+        or tensor.numel() == 0
+    ):
         raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
     tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
     if not bool(torch.isfinite(tensor.detach()).all()):

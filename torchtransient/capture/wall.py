@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 
 from torchtransient.capture.triangles import first_hits, triangle_normals
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.quantities import flag, positive, real_array, shares, shown, transform
 
 Array = NDArray[np.float64]
 
 # A point counts as lying on the wall up to this part of the wall's diagonal: coordinates of files have five digits.
 ON_WALL = 1e-4
+# Squares of areas are numbers of single precision in kernels.
+_FAR = 1e9
+# Indices of points have 32 bits in kernels.
+_MOST_POINTS = 2**32 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +58,7 @@ class Wall:
         `albedo`: one number or a linear sRGB triple. Raises UnitError for sizes that are not positive or albedos
         outside of [0, 1], SceneError for a normal without a direction or along `up`.
         """
-        for name, size in (("width", width), ("height", height)):
-            if not (np.isfinite(size) and size > 0):
-                raise UnitError(f"Wall.plane: expected {name} > 0 metres, got {size!r}.")
+        width, height = positive("Wall.plane: width", width), positive("Wall.plane: height", height)
         n, u, v = _frame(triple("Wall.plane normal", normal), triple("Wall.plane up", up), "Wall.plane")
         to_world = np.eye(4)
         to_world[:3, 0], to_world[:3, 1], to_world[:3, 2] = u * width / 2, v * height / 2, n
@@ -77,7 +80,7 @@ class Wall:
         u and v span the smallest rectangle across the mean normal that holds the mesh. Raises ShapeError for other
         shapes or indices, UnitError for numbers that are not finite, SceneError for a mesh without a mean normal.
         """
-        points, triangles = mesh_arrays("Wall.mesh", vertices, faces)
+        points, triangles = checked_mesh("Wall.mesh", vertices, faces)
         corners = points[triangles]
         areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
         mean = areas.sum(0)
@@ -109,12 +112,12 @@ class Wall:
         if isinstance(description, Wall):
             return description
         if isinstance(description, Mapping):
-            kind = description.get("type")
-            matrix = _to_world(description)
+            kind = str(description.get("type"))
+            matrix = transform("Wall: to_world", description.get("to_world", np.eye(4)))
             if kind == "rectangle":
                 return cls._rectangle(description, matrix)
             if kind == "mesh_arrays":
-                points, triangles = mesh_arrays("Wall", description.get("vertices"), description.get("faces"))
+                points, triangles = checked_mesh("Wall", description.get("vertices"), description.get("faces"))
                 if description.get("flip_normals"):
                     triangles = triangles[:, ::-1]
                 placed = cls.mesh(points @ matrix[:3, :3].T + matrix[:3, 3], triangles)
@@ -167,7 +170,14 @@ class Wall:
         """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. Raises SceneError for coordinates
         outside of [0, 1] and where a curved wall has a hole.
         """
-        u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+        places = [real_array(u), real_array(v)]
+        if places[0] is None or places[1] is None:
+            raise ShapeError(f"Wall.at: expected coordinates (u, v) as numbers, got {shown(u)} and {shown(v)}.")
+        try:
+            u, v = np.broadcast_arrays(places[0], places[1])
+        except ValueError:
+            shapes = f"{places[0].shape} and {places[1].shape}"
+            raise ShapeError(f"Wall.at: expected coordinates (u, v) that broadcast, got shapes {shapes}.") from None
         if not (np.all((u >= 0) & (u <= 1)) and np.all((v >= 0) & (v <= 1))):
             raise SceneError("Wall.at: expected coordinates (u, v) between 0 and 1, got some outside of the wall.")
         flat = self.center + (2 * u[..., None] - 1) * self.half_u + (2 * v[..., None] - 1) * self.half_v
@@ -194,6 +204,7 @@ class Wall:
         without an area or outside of the wall, and as :meth:`at`.
         """
         nx, ny = grid_size(size, "Wall.grid")
+        flag("cell_centers", cell_centers)
         u0, v0, u1, v1 = _extent(extent)
         u, v = _places(nx, u0, u1, cell_centers), _places(ny, v0, v1, cell_centers)
         return self.at(u[None, :], v[:, None])
@@ -251,10 +262,9 @@ class Wall:
 
 def triple(what: str, values: Any) -> Array:
     """Three finite numbers as float64 (3,). Raises ShapeError and UnitError."""
-    try:
-        array = np.asarray(_detached(values), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ShapeError(f"{what}: expected three numbers [x, y, z], got {values!r}.") from None
+    array = real_array(values)
+    if array is None:
+        raise ShapeError(f"{what}: expected three numbers [x, y, z], got {shown(values)}.")
     if array.shape != (3,):
         raise ShapeError(f"{what}: expected three numbers [x, y, z], got shape {array.shape}.")
     if not np.isfinite(array).all():
@@ -262,27 +272,30 @@ def triple(what: str, values: Any) -> Array:
     return array
 
 
-def mesh_arrays(who: str, vertices: Any, faces: Any) -> tuple[Array, NDArray[np.int64]]:
-    """A triangle mesh as float64 (V, 3) and int64 (F, 3). Raises ShapeError and UnitError."""
-    try:
-        points = np.array(_detached(vertices), dtype=np.float64)
-        given = np.array(_detached(faces))
-    except (TypeError, ValueError) as error:
-        raise ShapeError(f"{who}: expected vertices (V, 3) and faces (F, 3), got something else: {error}.") from None
+def checked_mesh(who: str, vertices: Any, faces: Any) -> tuple[Array, NDArray[np.int64]]:
+    """A triangle mesh as float64 (V, 3), metres, and int64 (F, 3). Raises ShapeError and UnitError."""
+    points, given = real_array(vertices), real_array(faces)
+    if points is None or given is None:
+        raise ShapeError(
+            f"{who}: expected vertices (V, 3) and faces (F, 3) as rows of three numbers, got {shown(vertices)} and "
+            f"{shown(faces)}."
+        )
     if points.ndim != 2 or points.shape[1] != 3 or given.ndim != 2 or given.shape[1] != 3 or not len(given):
         raise ShapeError(
             f"{who}: expected vertices (V, 3) and faces (F, 3), got shapes {points.shape} and {given.shape}."
         )
-    if not np.isfinite(points).all():
-        raise UnitError(f"{who}: expected finite vertices in metres, got {int((~np.isfinite(points)).sum())} others.")
-    whole = given.dtype.kind in "iu" or (given.dtype.kind == "f" and bool((given == np.round(given)).all()))
-    triangles = given.astype(np.int64)
-    if not whole or triangles.min() < 0 or triangles.max() >= len(points):
+    if not (np.abs(points) < _FAR).all():
+        raise UnitError(
+            f"{who}: expected vertices in finite metres, less than {_FAR:g} from the origin, got "
+            f"{int((~(np.abs(points) < _FAR)).sum())} other numbers."
+        )
+    whole = bool((given == np.round(given)).all())
+    if not whole or given.min() < 0 or given.max() >= len(points):
         raise ShapeError(
             f"{who}: expected faces of whole numbers from 0 to {len(points) - 1}, one less than the vertices, got "
-            f"{given.dtype} from {given.min()} to {given.max()}."
+            f"numbers from {given.min():g} to {given.max():g}."
         )
-    return points, triangles
+    return points.copy(), given.astype(np.int64)
 
 
 def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
@@ -290,7 +303,9 @@ def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
     whole = [isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in pair]
     if len(pair) != 2 or not all(whole):
-        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {size!r}.")
+        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {shown(size)}.")
+    if pair[0] * pair[1] > _MOST_POINTS:
+        raise ShapeError(f"{who}: expected at most {_MOST_POINTS} points in all, got {shown(size)}.")
     return int(pair[0]), int(pair[1])
 
 
@@ -310,29 +325,18 @@ def _frame(normal: Array, up: Array, who: str) -> tuple[Array, Array, Array]:
     return n, u, np.cross(n, u)
 
 
-def _to_world(description: Mapping[str, Any]) -> Array:
-    given = description.get("to_world", np.eye(4))
-    matrix = np.asarray(getattr(given, "matrix", given), dtype=np.float64)
-    matrix = matrix[..., 0] if matrix.ndim == 3 else matrix
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ShapeError(f"Wall: expected to_world as a (4, 4) array of finite numbers, got shape {matrix.shape}.")
-    return matrix
-
-
 def _diffuse(albedo: float | Sequence[float]) -> dict[str, Any]:
-    values = np.asarray(albedo, dtype=np.float64)
-    if values.shape not in ((), (3,)) or not bool(((values >= 0) & (values <= 1)).all()):
-        raise UnitError(f"Wall: expected an albedo or three between 0 and 1, got {albedo!r}.")
-    plain: Any = float(values) if values.ndim == 0 else {"type": "rgb", "value": values.tolist()}
+    values = shares("Wall: albedo", albedo)
+    plain: Any = {"type": "rgb", "value": list(values)} if isinstance(values, tuple) else values
     return {"type": "diffuse", "reflectance": plain}
 
 
 def _extent(extent: Sequence[float] | None) -> tuple[float, float, float, float]:
     if extent is None:
         return 0.0, 0.0, 1.0, 1.0
-    given = np.asarray(extent, dtype=np.float64)
-    if given.shape != (4,):
-        raise ShapeError(f"extent: expected four coordinates of the wall (u0, v0, u1, v1), got {extent!r}.")
+    given = real_array(extent)
+    if given is None or given.shape != (4,):
+        raise ShapeError(f"extent: expected four coordinates of the wall (u0, v0, u1, v1), got {shown(extent)}.")
     u0, v0, u1, v1 = given.tolist()
     if not (0 <= u0 < u1 <= 1 and 0 <= v0 < v1 <= 1):
         raise SceneError(f"extent: expected 0 <= u0 < u1 <= 1 and 0 <= v0 < v1 <= 1, got {extent!r}.")

@@ -32,8 +32,8 @@ INTERRUPTED = 130
 @click.option("--whole", is_flag=True, help="No part file: faster for small captures, and lost by a kill.")
 @click.option("--restart", is_flag=True, help="Delete a part file that is there, and start anew.")
 @click.option("--describe", is_flag=True, help="Say memory, time and what is chosen, and stop.")
-@click.option("--spp", type=click.IntRange(min=1), help="Samples per sensor point.  [default: the file's]")
-@click.option("--seed", type=click.IntRange(min=0), help="Same seed and parts, same capture.  [default: the file's]")
+@click.option("--spp", type=click.IntRange(1, 2**32 - 1), help="Samples per sensor point.  [default: the file's]")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Same seed, same capture.  [default: the file's]")
 @click.option("--variant", help="Mitsuba variant.  [default: the file's, or the cheapest that shows all colours]")
 @click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of an XML file.")
 @click.option("--transients", type=click.Path(path_type=Path), help="Draw histograms over the wall (.png).")
@@ -54,6 +54,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.data.capture_file import check_capture_target
+    from torchtransient.nlos.arguments import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     target = check_capture_target(options["output"] or _beside(scene))
@@ -67,7 +68,7 @@ def command(scene: Path, **options: Any) -> None:
         return
     if options["restart"] and part is not None:
         _delete(part)
-    generator = torch.Generator().manual_seed(setup.get("seed") or 0)
+    generator = torch.Generator().manual_seed(checked_seed(scene.name, setup.get("seed") or 0))
     try:
         capture = tt.nlos.simulate(
             **setup, part=part, **parts, progress=not options["quiet"], generator=generator, keep_part=True

@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.errors import StorageError
+from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
@@ -27,12 +28,20 @@ _PART_BYTES = 2**26
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
 
 
+def path_of(path: Any, what: str) -> Path:
+    """`path` as a Path. Raises StorageError for what is no name of a file."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}.") from None
+
+
 def check_target(path: str | Path, what: str) -> Path:
     """Return `path`, or raise StorageError when a file could not be written there. For before long computations.
 
     `what`: what the file is, for messages.
     """
-    target = Path(path)
+    target = path_of(path, what)
     if target.suffix.lower() not in ENDINGS:
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{target}'.")
     check_folder(target, what)
@@ -43,7 +52,7 @@ def check_target(path: str | Path, what: str) -> Path:
 
 def check_folder(path: str | Path, what: str) -> None:
     """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
-    target = Path(path)
+    target = path_of(path, what)
     folder = target.parent
     if not folder.is_dir():
         raise StorageError(f"{what}: the folder '{folder}' does not exist. Create it first.")
@@ -71,7 +80,7 @@ def read_arrays(path: str | Path, form: str, what: str) -> dict[str, Any]:
 
     Raises StorageError for a file that is missing, of another format, or damaged.
     """
-    source = Path(path)
+    source = path_of(path, what)
     if source.suffix.lower() not in ENDINGS:
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
     if not source.is_file():

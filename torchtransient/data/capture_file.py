@@ -50,6 +50,8 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
     target = check_capture_target(path)
     if not isinstance(capture, Capture):
         raise StorageError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
+    if not isinstance(metadata, Mapping | None):
+        raise StorageError(f"capture file: expected metadata as names and values, got {type(metadata).__name__}.")
     try:
         note = json.dumps({**(metadata or {}), **capture.metadata})
     except (TypeError, ValueError) as error:

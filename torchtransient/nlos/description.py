@@ -1,11 +1,11 @@
 """A capture around a corner as a YAML file: what is hidden, the wall, the scan, the bins and how much work to spend.
 
     hidden:
-      letter: {scene: nlos_letter, letter: K, depth: 1.0}      # things by name: `hidden_shapes`
+      letter: {scene: nlos_letter, letter: K, depth: 1.0}      # things by name: `described_shapes`
       ball: {shape: sphere, scale: 0.2, translate: [0.4, 0, 0.8], albedo: 0.7}
     wall: {width: 2.0, height: 2.0, albedo: 0.5}               # metres; or file: wall.npz with vertices and faces
     scan: {kind: confocal, size: [32, 32]}                     # as Scan.grid
-    time_axis: {bin_width_opl: 0.01}                           # start_opl and num_bins are found where they are missing
+    time_axis: {bin_width_opl: 0.01}                           # metres; what is missing is found, 16 ps wide
     spp: 4096                                                  # samples a sensor point
     bounces: [3]                                               # which numbers of bounces count, or `all`
     sensor: device.yaml                                        # a device of tt.sensing, or its entries
@@ -26,7 +26,9 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import KINDS
 from torchtransient.errors import SceneError, TorchTransientError
-from torchtransient.nlos.hidden_shapes import albedo_of, hidden_shapes, mesh_of_npz
+from torchtransient.nlos import defaults
+from torchtransient.nlos.described_shapes import albedo_of, described_shapes
+from torchtransient.nlos.mesh_file import mesh_of_npz
 from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
@@ -34,7 +36,6 @@ from torchtransient.sensing import Device
 ENTRIES = (
     "name", "hidden", "wall", "scan", "time_axis", "frequencies", "spp", "bounces", "sensor", "seed", "variant",
 )  # fmt: skip
-DEFAULT_SPP, DEFAULT_BIN_WIDTH_OPL = 4096, 0.01
 _PLANE = ("width", "height", "center", "normal", "up", "albedo")
 _SCAN = (
     "kind", "size", "laser", "sensor_origin", "laser_origin", "laser_grid", "cell_centers", "extent",
@@ -56,10 +57,10 @@ class CaptureDescription:
     scan: Scan
     axis: TimeAxis | None
     frequencies: FrequencyAxis | None = None
-    spp: int = DEFAULT_SPP
-    bounces: tuple[int, ...] | None = (3,)
+    spp: int = defaults.SPP
+    bounces: tuple[int, ...] | None = defaults.BOUNCES
     sensor: Device | None = None
-    seed: int = 0
+    seed: int = defaults.SEED
     variant: str | None = None
     entries: Mapping[str, Any] = field(default_factory=dict)
 
@@ -72,7 +73,7 @@ def read_description(source: str | Path) -> CaptureDescription:
     """
     data, folder = read_yaml(source, "capture description")
     section = Section(data, "capture description", ENTRIES)
-    hidden = hidden_shapes(section.get("hidden"), folder)
+    hidden = described_shapes(section.get("hidden"), folder)
     scan = _scan(Section(section.get("scan"), "scan", _SCAN), _wall(section.get("wall", {}), folder))
     frequencies = _frequencies(section)
     if frequencies is not None and "time_axis" in section:
@@ -83,10 +84,10 @@ def read_description(source: str | Path) -> CaptureDescription:
         scan=scan,
         axis=None if frequencies is not None else _axis(section.get("time_axis", {}), scan, hidden),
         frequencies=frequencies,
-        spp=section.whole("spp", DEFAULT_SPP),
+        spp=section.whole("spp", defaults.SPP),
         bounces=_bounces(section),
         sensor=_sensor(section.get("sensor", None), folder),
-        seed=section.whole("seed", 0, least=0),
+        seed=section.whole("seed", defaults.SEED, least=0),
         variant=section.text("variant", None),
         entries=data,
     )
@@ -144,7 +145,7 @@ def _axis(data: Any, scan: Scan, hidden: Mapping[str, Any]) -> TimeAxis:
         if not whole:
             raise SceneError("time_axis: expected start_s, bin_width_s and num_bins, or lengths (start_opl, ...).")
         return TimeAxis.from_seconds(section.number(start), section.number(width), section.whole("num_bins"))
-    size = section.number(width, DEFAULT_BIN_WIDTH_OPL)
+    size = section.number(width, defaults.BIN_WIDTH_OPL)
     if whole:
         return TimeAxis(section.number(start), size, section.whole("num_bins"))
     if start in section or "num_bins" in section:
@@ -168,7 +169,7 @@ def _frequencies(section: Section) -> FrequencyAxis | None:
 
 
 def _bounces(section: Section) -> tuple[int, ...] | None:
-    given = section.get("bounces", 3)
+    given = section.get("bounces", list(defaults.BOUNCES))
     if given == "all":
         return None
     wanted = given if isinstance(given, list) else [given]

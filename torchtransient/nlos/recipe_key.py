@@ -24,7 +24,7 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple | list):
         return "[" + ", ".join(map(_text, value)) + "]"
     if isinstance(value, str | Path):
-        return f"{str(value)!r}{_contents(Path(value))}"
+        return f"{str(value)!r}{contents_of(Path(value))}"
     if is_dataclass(value) and not isinstance(value, type):
         return type(value).__name__ + _text({field.name: getattr(value, field.name) for field in fields(value)})
     if isinstance(value, torch.Tensor):
@@ -42,8 +42,8 @@ def _text(value: Any) -> str:
     return repr(value)
 
 
-def _contents(path: Path) -> str:
-    """What is in a file, "" for texts that name none."""
+def contents_of(path: Path) -> str:
+    """A text that stands for what is in a file, "" for texts that name none."""
     try:
         if not path.is_file():
             return ""

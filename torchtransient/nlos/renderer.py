@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,11 +11,15 @@ from torch import nn
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
+from torchtransient.nlos import defaults
+from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
+from torchtransient.nlos.scan_watch import ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
-from torchtransient.nlos.scene_scan import check_scan_is_seen
+from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.opaque import opaque
 from torchtransient.render.output import RenderOutput
+from torchtransient.render.parameters import needing_slope
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
@@ -37,7 +41,15 @@ class CaptureRenderer(nn.Module):
     of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a
     device, whose expected answer is taken (``device.sensor(axis, grad=...)`` makes modules with noise).
 
-    Where points of the scan require gradients they get them. :meth:`forward` returns a :class:`Capture`.
+    Where points of the scan require gradients they get them: the tensors of the scan themselves, as they are when it is
+    called, so that an optimizer may change them. Points that were computed of other tensors (or given in another
+    precision than the scan's float64) are what they were when the scan was made: once those tensors have changed, a
+    call raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
+    :class:`Capture`.
+
+    Values that put something hidden between the wall and an origin, all of it behind the wall, or points off the wall
+    are rendered as they are, and said as a ``PhysicsWarning``, once a scene (the constructor raises SceneError for
+    such a set-up; ``physics="error"`` does for values too, ``"ignore"`` does not look).
     """
 
     def __init__(
@@ -46,26 +58,32 @@ class CaptureRenderer(nn.Module):
         scan: Scan,
         parameters: Sequence[str] | Mapping[str, Any] = (),
         *,
-        bounces: Sequence[int] | str = (3,),
-        energy: Any = 1.0,
+        bounces: Sequence[int] | str = defaults.BOUNCES,
+        energy: Any = defaults.ENERGY,
         sensor: nn.Module | Device | None = None,
         variant: str | None = None,
         **settings: Any,
     ):
         super().__init__()
+        check_is_scan("CaptureRenderer", scan)
+        check_sensor("CaptureRenderer", sensor)
+        wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
+        checked_samples("CaptureRenderer", settings.get("spp"))
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
         self.scan, self.bounces = scan, bounces
-        self._followed = _attached(scan)
-        own = {key: None for key in self._followed if key not in parameters}
-        wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
-        self._own = tuple(wanted)
-        self.renderer = TransientRenderer(scene, {**wanted, **own}, **settings)
-        for key in own:
+        followed = _attached(scan)
+        _check_once(wanted, followed)
+        self._own, self._sources = tuple(wanted), _Sources(_points_of(scan)[key] for key in followed)
+        self.renderer = TransientRenderer(scene, {**wanted, **dict.fromkeys(followed)}, **settings)
+        for key in followed:
             self.renderer.values[key].requires_grad_(requires_grad=False)
         if sensor is not None and self.renderer.axis is None:
             raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
         self.sensor = None if sensor is None else as_module(sensor, self.renderer.axis)
         check_scan(self.renderer.scene, scan, self.renderer._options)
+        moving = needing_slope(self.renderer._infos, self.renderer._keys)
+        if moving:
+            self.renderer._watch.installed = ScanWatch(tolerance_of(scan), _lasting_normals(scan, moving))
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
@@ -83,9 +101,16 @@ class CaptureRenderer(nn.Module):
         generator: torch.Generator | None = None,
     ) -> Capture:
         """Render a :class:`Capture`. ``values``, ``seed``, ``spp``, ``progress`` and errors as in
-        :meth:`TransientRenderer.forward`; ``generator``: for the noise of ``sensor``.
+        :meth:`TransientRenderer.forward`, but that seeds outside of 0 to 2^32 - 1, which modulo 2^32 are others, raise
+        SceneError; ``generator``: for the noise of ``sensor``.
         """
-        given = self._followed | dict(values or {})
+        check_seeds("CaptureRenderer", seed)
+        check_sensor("CaptureRenderer", self.sensor, generator)
+        checked_samples("CaptureRenderer", spp)
+        self._sources.check()
+        given = _attached(self.scan)
+        if values is not None:
+            given |= keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
         return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
 
@@ -104,13 +129,68 @@ def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) ->
         check_scan_is_seen(built.scene, scan)
 
 
+class _Sources:
+    """The leaves that tensors were computed of, and how often they had been changed by then."""
+
+    def __init__(self, tensors: Iterable[torch.Tensor]):
+        self._versions = [(leaf, leaf._version) for tensor in tensors for leaf in _leaves(tensor)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Points of a copy are leaves.
+        return {"_versions": []}
+
+    def check(self) -> None:
+        """Raise SceneError where one was changed since."""
+        if any(leaf._version != version for leaf, version in self._versions):
+            raise SceneError(
+                "CaptureRenderer: tensors that points of its scan were computed of have changed, and the points have "
+                "not. Give Scan the leaves themselves (float64), or the points of each step to the call: "
+                f"renderer({{'{POINTS}': points}}, ...); or make scan and renderer anew in each step."
+            )
+
+
+def _leaves(tensor: torch.Tensor) -> list[torch.Tensor]:
+    """The leaves that a tensor was computed of; none for a leaf and its views, which see what becomes of it."""
+    if tensor.is_leaf or (tensor._is_view() and tensor._base is not None and tensor._base.is_leaf):
+        return []
+    found, seen, ahead = [], set(), [tensor.grad_fn]
+    while ahead:
+        node = ahead.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if hasattr(node, "variable"):
+            found.append(node.variable)
+        ahead += [before for before, _ in node.next_functions]
+    return found
+
+
+def _lasting_normals(scan: Scan, moving: Iterable[str]) -> Any:
+    """Normals of the wall at the scan points (N, 3) as numpy array, None where they may change or are not known."""
+    changing = any(key == POINTS or key.split(".")[:2] != [WALL, SENSOR] for key in moving if key.startswith(WALL))
+    known = scan.sensor_normals
+    return None if changing or known is None else known.detach().cpu().reshape(-1, 3).numpy().copy()
+
+
+def _check_once(parameters: Mapping[str, Any], followed: Mapping[str, torch.Tensor]) -> None:
+    """Raise SceneError where two tensors would be one value."""
+    twice = [key for key in parameters if key in followed]
+    if twice:
+        raise SceneError(
+            f"CaptureRenderer: {', '.join(twice)}: expected one tensor, got one of the scan, which requires gradients, "
+            "and one of parameters=. Leave the key out of parameters, or take scan.detach()."
+        )
+
+
 def _attached(scan: Scan) -> dict[str, torch.Tensor]:
-    """The points of a scan that require gradients, by their keys in the scene."""
+    """The points of a scan that require gradients as they are now, by their keys in the scene."""
+    points = {key: value for key, value in _points_of(scan).items() if value.requires_grad}
+    return {key: value if value.ndim == 1 else value.reshape(-1, 3) for key, value in points.items()}
+
+
+def _points_of(scan: Scan) -> dict[str, torch.Tensor]:
     points = {POINTS: scan.sensor_points, ORIGIN: scan.sensor_origin, LASER_ORIGIN: scan.laser_origin}
-    if scan.kind != "confocal":
-        points[SPOTS] = scan.laser_points
-    listed = {key: value if value.ndim == 1 else value.reshape(-1, 3) for key, value in points.items()}
-    return {key: value for key, value in listed.items() if value.requires_grad}
+    return points if scan.kind == "confocal" else {**points, SPOTS: scan.laser_points}
 
 
 def as_capture(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,12 @@ import numpy as np
 import torch
 
 from torchtransient.capture import Scan
+from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, UnitError
+from torchtransient.nlos import defaults
+from torchtransient.nlos.arguments import check_is_scan
+from torchtransient.nlos.mesh_file import mesh_file
+from torchtransient.quantities import shown
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.scene_handle import load
 from torchtransient.render.variant import active_variant
@@ -20,7 +24,8 @@ from torchtransient.render.variant import active_variant
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
 ALL_BOUNCES = "all"
-_MESH_FILES = {".ply": "ply", ".obj": "obj", ".stl": "stl"}
+# What single precision holds.
+MOST_ENERGY = 1e30
 # Plugins of emitters, Mitsuba's and ours.
 _LIGHTS = (
     "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
@@ -28,7 +33,9 @@ _LIGHTS = (
 )  # fmt: skip
 
 
-def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), energy: Any = 1.0) -> dict[str, Any]:
+def capture_scene(
+    hidden: Any, scan: Scan, bounces: Sequence[int] | str = defaults.BOUNCES, energy: Any = defaults.ENERGY
+) -> dict[str, Any]:
     """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
 
     ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
@@ -40,6 +47,7 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
     Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
     without a wall; UnitError for an energy below zero.
     """
+    check_is_scan("capture", scan)
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
@@ -47,7 +55,7 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
         )
     _check_energy(energy)
     first, last = _range(bounces)
-    shapes = hidden_shapes(hidden)
+    shapes = shapes_of(hidden)
     taken = sorted({WALL, LASER, _INTEGRATOR} & set(shapes))
     if taken:
         raise SceneError(
@@ -89,23 +97,10 @@ def capture_scene(hidden: Any, scan: Scan, bounces: Sequence[int] | str = (3,), 
     }
 
 
-def hidden_shapes(hidden: Any) -> dict[str, Any]:
-    """Hidden things as a dictionary of Mitsuba shapes (and what they refer to) by name."""
+def shapes_of(hidden: Any) -> dict[str, Any]:
+    """Hidden things, as they are given, as a dictionary of Mitsuba shapes (and what they refer to) by name."""
     if isinstance(hidden, (str, Path)):
-        plugin = _MESH_FILES.get(Path(hidden).suffix.lower())
-        if Path(hidden).suffix.lower() == ".xml":
-            raise SceneError(
-                f"hidden: {str(hidden)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it "
-                "as it is: tt.nlos.simulate(path)."
-            )
-        if plugin is None:
-            raise SceneError(
-                f"hidden: expected a mesh file ({', '.join(_MESH_FILES)}), a shape dictionary or a mesh, got "
-                f"{str(hidden)!r}."
-            )
-        if not Path(hidden).is_file():
-            raise SceneError(f"hidden: no file {str(hidden)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
-        return {"hidden": {"type": plugin, "filename": str(hidden), "face_normals": True}}
+        return {"hidden": mesh_file(Path(hidden), "hidden")}
     if isinstance(hidden, Mapping):
         if hidden.get("type") == "scene" or "type" not in hidden:
             shapes = {name: node for name, node in hidden.items() if name != "type"}
@@ -167,13 +162,14 @@ def _check_energy(energy: Any) -> None:
     if isinstance(energy, Mapping):
         return
     if isinstance(energy, bool) or not isinstance(energy, (int, float, np.number)):
-        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {energy!r}.")
-    if not (math.isfinite(energy) and energy >= 0):
-        raise UnitError(f"energy: expected joules of at least 0, got {energy!r}.")
+        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
+    if not 0 <= energy < MOST_ENERGY:
+        raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {MOST_ENERGY:g} at most).")
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
-    return {"type": "mesh_arrays", "vertices": _numbers(vertices), "faces": _numbers(faces)}
+    points, triangles = checked_mesh("hidden", vertices, faces)
+    return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
 def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
@@ -199,7 +195,7 @@ def _numbers(values: Any) -> np.ndarray:
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
     """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
-    scene = load({"type": "scene", **hidden_shapes(hidden)}, variant=variant)
+    scene = load({"type": "scene", **shapes_of(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()
         return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)

@@ -99,6 +99,12 @@ def check_scan_is_seen(scene: Any, scan: Scan) -> None:
     _check_same(_laser_ends(scene, sensor, scene.integrator())[1], spots, points, "laser")
 
 
+def tolerance_of(scan: Scan) -> float:
+    """How far from a point of a scan, in metres, a ray may end that looks at it."""
+    points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
+    return SAME_POINT * max(_extent(points), float(scan.sensor_legs.detach().max()))
+
+
 # ---------------------------------------------------------------------------------------------------------------- rays
 
 
@@ -238,21 +244,53 @@ def _check_hidden(scene: Any, wall: Ends) -> None:
             "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
             "the hidden things as shapes."
         )
-    for shape in hidden:
-        box = shape.bbox()
-        corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
-        if bool((((corners[:, None] - wall.points) * wall.normals).sum(-1) > 0).any()):
-            return
+    _check_areas(hidden)
+    if reaches_before(hidden, wall.points, wall.normals):
+        return
     raise SceneError(
         "hidden: expected something before the wall, on the side that its normals point to, got nothing there: what is "
         "behind it sends it no light. Move the hidden things or turn the wall (flip_normals)."
     )
 
 
+def _extent(points: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def reaches_before(shapes: list[Any], points: NDArray[np.float64], normals: NDArray[np.float64]) -> bool:
+    """Whether the box of a shape reaches before the wall at one of its ``points``, with ``normals`` there (N, 3)."""
+    for shape in shapes:
+        box = shape.bbox()
+        corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
+        # Mostly the first point tells.
+        for chosen in (slice(0, 1), slice(1, None)):
+            if bool((((corners[:, None] - points[chosen]) * normals[chosen]).sum(-1) > 0).any()):
+                return True
+    return False
+
+
+def _check_areas(shapes: list[Any]) -> None:
+    """Raise SceneError where no shape has an area that light could fall on, or one has none that is a number."""
+    areas = {}
+    for shape in shapes:
+        try:
+            areas[shape.id() or shape.class_name()] = float(np.array(shape.surface_area()).reshape(-1)[0])
+        except RuntimeError:
+            return  # of shapes that do not know theirs, such as copies of groups
+    told = ", ".join(f"{name!r} ({area:.3g} m^2)" for name, area in areas.items())
+    if not all(np.isfinite(area) for area in areas.values()):
+        raise SceneError(f"hidden: expected shapes of finite area, got {told}. Give lengths in metres.")
+    if not any(area > 0 for area in areas.values()):
+        raise SceneError(
+            f"hidden: expected shapes with an area that light falls on, got {told}. Give triangles whose corners are "
+            "not all in a row, and scales other than 0."
+        )
+
+
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:
     """Raise SceneError unless rays end at ``points``; ``scanned``: those that say how large the scan is."""
     legs = np.linalg.norm(points - ends.origins, axis=-1)
-    size = max(float(np.linalg.norm(scanned.max(0) - scanned.min(0))), float(legs.max()))
+    size = max(_extent(scanned), float(legs.max()))
     off = np.linalg.norm(ends.points - points, axis=-1)
     wrong = np.flatnonzero((off > SAME_POINT * size) | np.array([not name for name in ends.shapes]))
     if not len(wrong):

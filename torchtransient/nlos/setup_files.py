@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from torchtransient.data.array_file import path_of
 from torchtransient.errors import SceneError
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
@@ -31,7 +32,7 @@ def read_setup(path: str | Path, **xml_parameters: str) -> dict[str, Any]:
 
     Raises StorageError for files that cannot be read, SceneError for what they say.
     """
-    source = Path(path)
+    source = path_of(path, "read_setup")
     if source.suffix.lower() == ".xml":
         return {"hidden": load(source, **xml_parameters)}
     if xml_parameters:

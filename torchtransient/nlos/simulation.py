@@ -22,26 +22,20 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.data.array_file import path_of
 from torchtransient.errors import SceneError
+from torchtransient.nlos import defaults
+from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
 from torchtransient.nlos.renderer import as_module, in_film_shape, in_scan_shape, measured
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
-from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, checked_count, seed_of
-from torchtransient.render.arguments import samples
+from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
 from torchtransient.sensing import Device
-from torchtransient.units import seconds_to_opl
-
-# Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
-# all laser spots anew: 16 of them take three times as long as one, 4 a quarter more (256 x 256 pairs).
-PARTS, EXHAUSTIVE_PARTS = 16, 4
-BIN_WIDTH_S = 16e-12
-DEFAULT_SPP = 4096
-THIRD = (3,)
 
 
 def simulate(
@@ -54,7 +48,7 @@ def simulate(
     bounces: Sequence[int] | str | None = None,
     energy: Any = None,
     sensor: torch.nn.Module | Device | None = None,
-    seed: int = 0,
+    seed: int = defaults.SEED,
     variant: str | None = None,
     part: str | Path | None = None,
     tiles: int | None = None,
@@ -76,7 +70,10 @@ def simulate(
     ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
     ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
     ``generator`` (devices draw their counts); its answer has the same bins.
-    ``seed``: same seed and parts, same capture, to the rounding of sums that threads add to in the order they come.
+    ``seed``: a whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to
+    in the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
+    :class:`CaptureRenderer` draws what one part does in the same variant (and spreads it by a tent in time where a
+    parameter can change lengths).
 
     ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
     that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
@@ -89,9 +86,9 @@ def simulate(
     capture does not fit into memory or the disk is full, and for a part file that belongs to another simulation, is
     damaged, or is worked on by another process.
     """
-    path = None if part is None else Path(part)
+    seed, path = checked_seed("simulate", seed), _part_path(part)
+    check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
-    checked_count("seed", seed, 0)
     if sensor is not None and work.axes()[0] is None:
         raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
@@ -122,12 +119,13 @@ def forecast(
     """What :func:`simulate` would take with the same arguments: memory, time, variant, how light is found. Errors as
     there.
     """
+    checked_seed("forecast", settings.get("seed", defaults.SEED))
     given = {name: settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")}
     unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
     if unknown:
         raise SceneError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
     of_light = given.pop("bounces"), given.pop("energy")
-    path = None if part is None else Path(part)
+    path = _part_path(part)
     work = _work(hidden, scan, *given.values(), of_light, variant, _parts(scan, path, tiles))
     with active_variant(work.variant.name):
         return forecast_of(work, timed=True)
@@ -142,24 +140,26 @@ def _work(
 ) -> Work:  # fmt: skip
     if time_axis is not None and frequencies is not None:
         raise SceneError("simulate: expected time_axis or frequencies, got both. Leave out one of them.")
-    samples("spp", spp)
+    spp = checked_samples("simulate", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    if not isinstance(scan, Scan):
-        raise SceneError(f"simulate: expected scan as a tt.nlos.Scan, got {type(scan).__name__}.")
+    check_is_scan("simulate", scan)
     if isinstance(hidden, Scene):
         raise SceneError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
             "simulate the scene as it is, or give shapes by name."
         )
     bounces, energy = of_light
-    settings = {"bounces": THIRD if bounces is None else bounces, "energy": 1.0 if energy is None else energy}
+    settings = {
+        "bounces": defaults.BOUNCES if bounces is None else bounces,
+        "energy": defaults.ENERGY if energy is None else energy,
+    }
     chosen = choose_variant(load(capture_scene(hidden, scan.detach(), **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
-        time_axis = scan.detach().default_axis(bounds, seconds_to_opl(BIN_WIDTH_S))
-    film = Film(time_axis, frequencies, DEFAULT_SPP if spp is None else spp)
+        time_axis = scan.detach().default_axis(bounds, defaults.BIN_WIDTH_OPL)
+    film = Film(time_axis, frequencies, defaults.SPP if spp is None else spp)
     return HiddenWork(hidden, scan, settings, film, chosen, parts)
 
 
@@ -197,11 +197,15 @@ def _is_complete(scene: Mapping[str, Any]) -> bool:
     return any("path" in kind for kind in kinds) or "integrator" in scene
 
 
+def _part_path(part: Any) -> Path | None:
+    return None if part is None else path_of(part, "simulate: part")
+
+
 def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
     if tiles is None:
-        many = EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else PARTS
+        many = defaults.EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else defaults.PARTS
         return 1 if part is None else many
-    return checked_count("tiles", tiles)
+    return checked_count("simulate", "tiles", tiles)
 
 
 # ------------------------------------------------------------------------------------------------------------- renders

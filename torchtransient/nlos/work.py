@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError
 from torchtransient.nlos.recipe_key import recipe_key
 from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
+from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.nlos.variant_choice import VariantChoice
 from torchtransient.render.renderer import TransientRenderer
@@ -122,10 +120,8 @@ class SceneWork:
 
     def key(self, seed: int) -> str:
         """What a part file of this work is known by."""
-        description = self._renderer.scene._description
-        named = re.findall(r'"filename"\s+value\s*=\s*"([^"]+)"', getattr(description, "text", ""))
-        files = [Path(getattr(description, "path", ".")).parent / name for name in named]
-        return recipe_key(description, files, self.film, self.variant.name, seed, self.count)
+        scene = self._renderer.scene
+        return recipe_key(scene._description, files_of(scene), self.film, self.variant.name, seed, self.count)
 
     def weight(self, number: int) -> float:
         """What a pass counts in the mean of all samples."""
@@ -151,13 +147,6 @@ Work = HiddenWork | SceneWork
 def seed_of(seed: int, number: int) -> int:
     """The seed of a part: independent of those of others."""
     return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:4], "little")
-
-
-def checked_count(name: str, value: Any, least: int = 1) -> int:
-    """A whole number. Raises SceneError."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise SceneError(f"simulate: {name}: expected a whole number of at least {least}, got {value!r}.")
-    return value
 
 
 def _listed(scan: Scan, first: int, last: int) -> Scan:

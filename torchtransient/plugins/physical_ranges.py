@@ -67,7 +67,7 @@ _OF_BSDFS = {
     "k": OPTICAL,
 }  # fmt: skip
 _OF_MEDIA = {"albedo": SHARE, "sigma_t": EXTINCTION}
-_OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance"), LIGHT)
+_OF_EMITTERS = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"), LIGHT)
 _OF_SENSORS = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
 _NAMES = frozenset((*_OF_BSDFS, *_OF_MEDIA, *_OF_EMITTERS, *_OF_SENSORS, "g"))
 

@@ -194,6 +194,7 @@ def _render_items(
     for n, item in enumerate(job.items):
         if n == 0 or item.entry != job.items[n - 1].entry:
             session.install(item, values, [False] * len(values))
+            job.watch.placed(session.scene, item.sensor)
         film = session.film(item)
         with dr.suspend_grad():
             session.integrator.render(

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +35,8 @@ class PhysicsWatch:
 
     ``told``: what was said before, of the same scene: ``tt.render`` in a loop makes a renderer each time.
     ``window_name``: what tells its window from others, empty where none is looked at. ``ranges``: those that the
-    renderer's keys have; ``transforms``: which are transforms.
+    renderer's keys have; ``transforms``: which are transforms. ``installed``: looks at a built scene that holds the
+    values of a call, for the sensor of a number, and returns what it finds by what it is about; None looks at nothing.
     """
 
     def __init__(self, mode: str, told: set[str]):
@@ -44,6 +46,7 @@ class PhysicsWatch:
         self.window_name = ""
         self.ranges: dict[str, PhysicalRange] = {}
         self.transforms: frozenset[str] = frozenset()
+        self.installed: Callable[[Any, int], Mapping[str, str]] | None = None
         self._told = told
 
     @property
@@ -77,6 +80,12 @@ class PhysicsWatch:
             matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
             if any(is_singular(matrix) for matrix in matrices):
                 self._tell(key, singular_message(key))
+
+    def placed(self, scene: Any, sensor: int) -> None:
+        """A built scene that holds the values of a call, before it is rendered."""
+        if self.looks and self.installed is not None:
+            for about, message in self.installed(scene, sensor).items():
+                self._tell(about, message)
 
     def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
         """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""

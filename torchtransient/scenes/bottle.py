@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError, UnitError
-from torchtransient.scenes.parts import SceneDict, diffuse, perspective, positive, transient_film
+from torchtransient.quantities import positive
+from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 # Radius and height of the bottle's outline from the middle of its base to the middle of its lid.

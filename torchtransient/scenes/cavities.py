@@ -5,14 +5,8 @@ The solutions are in `torchtransient.testing.closed_forms` under the same names.
 
 from __future__ import annotations
 
-from torchtransient.scenes.parts import (
-    SceneDict,
-    diffuse,
-    perspective,
-    positive,
-    transient_film,
-    transient_path,
-)
+from torchtransient.quantities import positive
+from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 

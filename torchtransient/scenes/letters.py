@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError
+from torchtransient.quantities import shown
 
 _S = 0.2  # width of a stroke
 _H = 0.5 * _S
@@ -42,6 +43,6 @@ def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
 
     Raises SceneError for a letter that is not there (those with holes are not).
     """
-    if letter not in OUTLINES:
-        raise SceneError(f"letter: expected one of {', '.join(OUTLINES)}, got {letter!r}")
+    if not isinstance(letter, str) or letter not in OUTLINES:
+        raise SceneError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
     return (np.array(OUTLINES[letter], dtype=np.float64) - 0.5) * size

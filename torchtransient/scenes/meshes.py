@@ -4,43 +4,40 @@ outside. `triangle_mesh` makes shapes of scene dictionaries of them; nothing is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchtransient.capture.wall import checked_mesh
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.scenes.parts import SceneDict, count, diffuse, positive
+from torchtransient.quantities import count, positive, transform
+from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import Matrix, Triple
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
 Mesh = tuple[Vertices, Faces]
+Albedo = float | Sequence[float]
 
 
-def triangle_mesh(
-    vertices: Any, faces: Any, reflectance: float | tuple[float, float, float] = 0.5, to_world: Matrix | None = None
-) -> SceneDict:
-    """A diffuse shape of a scene dictionary, `mesh_arrays`, made of `vertices` (V, 3) and `faces` (F, 3).
+def triangle_mesh(vertices: Any, faces: Any, reflectance: Albedo = 0.5, to_world: Matrix | None = None) -> SceneDict:
+    """A diffuse shape of a scene dictionary, `mesh_arrays`, made of `vertices` (V, 3), metres, and `faces` (F, 3).
 
-    Its key `<name>.vertex_positions` is a parameter of the scene, (V, 3) in world space. Raises ShapeError for other
-    shapes and for faces of vertices that are not there.
+    `reflectance`: one albedo, or three of linear sRGB. Its key `<name>.vertex_positions` is a parameter of the scene,
+    (V, 3) in world space. Raises ShapeError for other shapes and for faces of vertices that are not there, UnitError
+    for vertices that are not finite and albedos outside of [0, 1].
     """
-    points, triangles = np.array(vertices, dtype=np.float64), np.array(faces)
-    if points.ndim != 2 or points.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
-        raise ShapeError(
-            f"triangle_mesh: expected vertices (V, 3) and faces (F, 3), got {points.shape} and {triangles.shape}"
-        )
-    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(points):
-        raise ShapeError(f"triangle_mesh: expected faces of vertices 0 to {len(points) - 1}, got others or none")
+    points, triangles = checked_mesh("triangle_mesh", vertices, faces)
     shape: SceneDict = {
         "type": "mesh_arrays",
         "vertices": points,
-        "faces": triangles.astype(np.int64),
+        "faces": triangles,
         "bsdf": diffuse(reflectance),
     }
     if to_world is not None:
-        shape["to_world"] = to_world
+        shape["to_world"] = transform("triangle_mesh: to_world", to_world)
     return shape
 
 
@@ -77,7 +74,7 @@ def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
     vertices = np.array(corners, dtype=np.float64)
     edge = np.linalg.norm(vertices[0] - vertices[1])
     faces = _triangles_of_edges(vertices, edge)
-    for _ in range(level):
+    for _ in range(_times("level", level)):
         vertices, faces = subdivided((vertices, faces))
         vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
@@ -85,9 +82,9 @@ def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
 
 
 def subdivided(mesh: Mesh, times: int = 1) -> Mesh:
-    """Every triangle as four, with a vertex in the middle of every edge; neighbours keep sharing theirs."""
+    """Every triangle as four, `times` times, with a vertex in the middle of every edge, which neighbours share."""
     vertices, faces = mesh
-    for _ in range(times):
+    for _ in range(_times("subdivide", times)):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
         unique, place = np.unique(edges, axis=0, return_inverse=True)
         ab, bc, ca = len(vertices) + place.reshape(3, -1)
@@ -115,6 +112,17 @@ def solid(outline: Any, z: float, thickness: float) -> Mesh:
     here, there = np.arange(n), (np.arange(n) + 1) % n
     sides = [np.stack([here, there, there + n], axis=1), np.stack([here, there + n, here + n], axis=1)]
     return np.concatenate([front, back]), np.concatenate([faces, faces[:, ::-1] + n, *sides])
+
+
+# More halvings of all edges make meshes of many millions of triangles.
+_MOST_TIMES = 8
+
+
+def _times(name: str, value: int) -> int:
+    times = count(name, value, least=0)
+    if times > _MOST_TIMES:
+        raise SceneError(f"{name}: expected at most {_MOST_TIMES}, got {times}: each makes four triangles of one.")
+    return times
 
 
 def triangulated(outline: Vertices) -> Faces:

@@ -7,16 +7,17 @@ scan, x runs to the right and y up, which is how letters read.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import finite, positive, real_array, shown, transform
 from torchtransient.scenes.letters import outline
-from torchtransient.scenes.meshes import Mesh, ellipsoid, joined, plate, sheet, solid, subdivided, triangle_mesh
-from torchtransient.scenes.parts import SceneDict, diffuse, positive
+from torchtransient.scenes.meshes import Albedo, Mesh, ellipsoid, joined, plate, sheet, solid, subdivided, triangle_mesh
+from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import scale
-
-Albedo = float | tuple[float, float, float]
 
 
 def relay_wall(width: float = 2.0, height: float = 2.0, albedo: Albedo = 0.5) -> SceneDict:
@@ -47,7 +48,7 @@ def nlos_letter(
     """
     corners = outline(letter, positive("size", size))
     z = positive("depth", depth)
-    mesh = sheet(corners, z) if thickness == 0 else solid(corners, z, thickness)
+    mesh = sheet(corners, z) if finite("thickness", thickness) == 0 else solid(corners, z, thickness)
     return {"letter": triangle_mesh(*subdivided(mesh, subdivide), albedo)}
 
 
@@ -115,7 +116,7 @@ def nlos_mannequin(
     Raises SceneError when the outstretched arm would reach through the wall.
     """
     vertices, faces = mannequin(height, level)
-    vertices = vertices + np.array([x, 0.0, positive("depth", depth)])
+    vertices = vertices + np.array([finite("x", x), 0.0, positive("depth", depth)])
     if vertices[:, 2].min() <= 0:
         needed = depth - vertices[:, 2].min()
         raise SceneError(f"depth: expected more than {needed:.3g} m, the reach of the arm, got {depth!r}")
@@ -128,6 +129,8 @@ def bounds(shapes: SceneDict) -> NDArray[np.float64]:
     For shapes of this room: rectangles, disks, cubes, spheres and meshes as arrays. Raises SceneError for others, and
     for a dictionary without any.
     """
+    if not isinstance(shapes, dict):
+        raise SceneError(f"bounds: expected a dictionary of shapes, got {shown(shapes)}")
     boxes = [_bounds_of(name, shape) for name, shape in shapes.items() if isinstance(shape, dict)]
     if not boxes:
         raise SceneError("bounds: expected a dictionary of shapes, got one without any")
@@ -135,16 +138,16 @@ def bounds(shapes: SceneDict) -> NDArray[np.float64]:
 
 
 def _bounds_of(name: str, shape: SceneDict) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    kind, matrix = shape.get("type"), np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64)
+    kind, matrix = shape.get("type"), transform(f"{name}: to_world", shape.get("to_world", np.eye(4)))
     if kind == "sphere":
-        center = matrix[:3, :3] @ np.asarray(shape.get("center", [0.0, 0.0, 0.0])) + matrix[:3, 3]
-        reach = shape.get("radius", 1.0) * np.linalg.norm(matrix[:3, :3], axis=1)
+        center = matrix[:3, :3] @ _rows(name, "center", shape.get("center", [0.0, 0.0, 0.0])) + matrix[:3, 3]
+        reach = positive(f"{name}: radius", shape.get("radius", 1.0)) * np.linalg.norm(matrix[:3, :3], axis=1)
         return center - reach, center + reach
     if kind == "disk":
         reach = np.linalg.norm(matrix[:3, :2], axis=1)
         return matrix[:3, 3] - reach, matrix[:3, 3] + reach
     if kind == "mesh_arrays":
-        points = np.asarray(shape["vertices"], dtype=np.float64)
+        points = _rows(name, "vertices", shape.get("vertices"))
     elif kind in ("rectangle", "cube"):
         depths = (0.0,) if kind == "rectangle" else (-1.0, 1.0)
         points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in depths], dtype=np.float64)
@@ -152,3 +155,10 @@ def _bounds_of(name: str, shape: SceneDict) -> tuple[NDArray[np.float64], NDArra
         raise SceneError(f"bounds: expected rectangles, disks, cubes, spheres or mesh_arrays, got {kind!r} at {name}")
     placed = points @ matrix[:3, :3].T + matrix[:3, 3]
     return placed.min(0), placed.max(0)
+
+
+def _rows(name: str, entry: str, values: Any) -> NDArray[np.float64]:
+    rows = real_array(values)
+    if rows is None or not rows.size or rows.shape[-1] != 3:
+        raise ShapeError(f"bounds: expected {entry} of {name} as rows of three numbers, got {shown(values)}")
+    return rows

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchtransient.quantities import flag, positive
 from torchtransient.scenes.meshes import triangle_mesh
 from torchtransient.scenes.nlos import mannequin
-from torchtransient.scenes.parts import SceneDict, diffuse, positive
+from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import rotate, scale, translate
 
 # Albedos by what they are of.
@@ -33,7 +34,8 @@ def nlos_room(
     UnitError.
     """
     for name, size, least in (("width", width, 2.4), ("height", height, 2.2), ("depth", depth, 2.4)):
-        positive(f"{name} beyond the {least} m of the furniture", size - least + 1e-9)
+        positive(f"{name} beyond the {least} m of the furniture", positive(name, size) - least + 1e-9)
+    flag("person", person)
     x, y, z = width / 2, height / 2, depth
 
     def of(what: str) -> float:

@@ -1,37 +1,15 @@
-"""The pieces that every scene dictionary of this room is made of: film, sensor, integrator and checked numbers."""
+"""The pieces that every scene dictionary of this room is made of: film, sensor, integrator, surface."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import Any
 
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import SceneError
+from torchtransient.quantities import count, finite, positive, shares
 from torchtransient.scenes.transforms import Matrix
 
 SceneDict = dict[str, Any]
-
-
-def positive(name: str, value: float) -> float:
-    """`value` as a float; UnitError unless it is finite and greater than zero."""
-    number = float(value)
-    if not math.isfinite(number) or number <= 0:
-        raise UnitError(f"{name}: expected a finite number greater than zero, got {value!r}")
-    return number
-
-
-def albedo(name: str, value: float) -> float:
-    """`value` as a float; UnitError unless it lies in [0, 1]."""
-    number = float(value)
-    if not 0.0 <= number <= 1.0:
-        raise UnitError(f"{name}: expected an albedo between 0 and 1, got {value!r}")
-    return number
-
-
-def count(name: str, value: int) -> int:
-    """`value` as an int; SceneError unless it is a whole number of at least one."""
-    if isinstance(value, bool) or int(value) != value or value < 1:
-        raise SceneError(f"{name}: expected a whole number of at least 1, got {value!r}")
-    return int(value)
 
 
 def transient_film(
@@ -44,15 +22,13 @@ def transient_film(
     finite.
     """
     width, height = (resolution, resolution) if isinstance(resolution, int) else resolution
-    if not math.isfinite(start_opl):
-        raise UnitError(f"start_opl: expected a finite length in metres, got {start_opl!r}")
     return {
         "type": "transient_hdr_film",
         "width": count("resolution", width),
         "height": count("resolution", height),
         "rfilter": {"type": "box"},
         "temporal_bins": count("num_bins", num_bins),
-        "start_opl": float(start_opl),
+        "start_opl": finite("start_opl", start_opl),
         "bin_width_opl": positive("bin_width_opl", bin_width_opl),
     }
 
@@ -87,9 +63,8 @@ def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
     return integrator
 
 
-def diffuse(reflectance: float | tuple[float, float, float]) -> SceneDict:
-    """A Lambertian BSDF; one albedo for all wavelengths or a linear sRGB triple."""
-    if isinstance(reflectance, tuple):
-        value = [albedo("reflectance", channel) for channel in reflectance]
-        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
-    return {"type": "diffuse", "reflectance": albedo("reflectance", reflectance)}
+def diffuse(reflectance: float | Sequence[float]) -> SceneDict:
+    """A Lambertian BSDF; one albedo for all wavelengths or three, linear sRGB. Raises UnitError outside of [0, 1]."""
+    albedo = shares("albedo or reflectance", reflectance)
+    value = {"type": "rgb", "value": list(albedo)} if isinstance(albedo, tuple) else albedo
+    return {"type": "diffuse", "reflectance": value}

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import finite, real_array, shown
 
 Matrix = NDArray[np.float64]
 Triple = Sequence[float] | NDArray[np.float64]
 
 
 def _triple(name: str, values: Triple) -> NDArray[np.float64]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != (3,):
-        raise ShapeError(f"{name}: expected three numbers, got shape {array.shape}; pass [x, y, z]")
+    array = real_array(values)
+    if array is None or array.shape != (3,):
+        raise ShapeError(f"{name}: expected three numbers, got {shown(values)}; pass [x, y, z]")
     if not np.all(np.isfinite(array)):
         raise SceneError(f"{name}: expected finite numbers, got {array.tolist()}")
     return array
@@ -43,7 +44,8 @@ def scale(factor: float | Triple) -> Matrix:
 
     A zero factor has no inverse and raises SceneError: Mitsuba inverts every transform.
     """
-    factors = np.full(3, float(factor)) if np.ndim(factor) == 0 else _triple("scale", factor)  # type: ignore[arg-type]
+    alone = real_array(factor)
+    factors = np.full(3, alone) if alone is not None and alone.ndim == 0 else _triple("scale", factor)  # type: ignore[arg-type]
     if np.any(factors == 0) or not np.all(np.isfinite(factors)):
         raise SceneError(f"scale: expected finite factors other than zero, got {factors.tolist()}")
     return np.diag([*factors, 1.0])
@@ -60,7 +62,7 @@ def rotate(axis: Triple, angle_deg: float) -> Matrix:
         raise SceneError("rotate: expected an axis with a direction, got [0, 0, 0]")
     x, y, z = direction / length
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = np.deg2rad(angle_deg)
+    angle = np.deg2rad(finite("rotate: angle_deg", angle_deg))
     matrix = np.eye(4)
     matrix[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
     return matrix

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from torchtransient.errors import SceneError
-from torchtransient.scenes.parts import SceneDict, diffuse, perspective, positive, transient_film, transient_path
+from torchtransient.quantities import positive
+from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 

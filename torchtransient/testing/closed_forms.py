@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchtransient.errors import UnitError
+from torchtransient.quantities import positive, share
 from torchtransient.testing.flight_lengths import (
     Array,
     FlightLaw,
@@ -38,9 +39,9 @@ def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, in
     Derivation: radiance rho I cos / (pi d^2) of the plane, integrated against the meter's cosine.
     """
     edges = checked_edges(edges_opl)
-    h = _positive("height", height)
+    h = positive("height", height)
     r = np.maximum(edges / 2.0, h)
-    factor = 2.0 * intensity * _albedo(reflectance) * h**3 / 5.0
+    factor = 2.0 * intensity * share("reflectance", reflectance) * h**3 / 5.0
     return factor * -np.diff(r**-5)
 
 
@@ -54,7 +55,7 @@ def integrating_sphere_irradiance(
     metres; result in J/m^2. `max_flights` cuts the series after that many flights. Source: Fry et al. 2006; Labsphere
     integrating sphere guide.
     """
-    area = 4.0 * math.pi * _positive("radius", radius) ** 2
+    area = 4.0 * math.pi * positive("radius", radius) ** 2
     series = _bounce_series(sphere_chord(radius), edges_opl, 0.0, reflectance, first=1, last=max_flights)
     return energy / area * series
 
@@ -70,10 +71,10 @@ def integrating_sphere_radiance(
     (one for the delta), as a renderer with `max_depth = max_bounces + 1` does. The scene is
     `tt.scenes.integrating_sphere`.
     """
-    r = _positive("radius", radius)
+    r = positive("radius", radius)
     last = None if max_bounces is None else max_bounces - 1
     series = _bounce_series(sphere_chord(r), edges_opl, 2.0 * r, reflectance, first=0, last=last)
-    return _albedo(reflectance) / math.pi * intensity / r**2 * series
+    return share("reflectance", reflectance) / math.pi * intensity / r**2 * series
 
 
 def integrating_sphere_decay(radius: float, reflectance: float) -> float:
@@ -101,7 +102,7 @@ def integrating_sphere_decay(radius: float, reflectance: float) -> float:
     for _ in range(200):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if excess(middle) < 0.0 else (low, middle)
-    return 2.0 * _positive("radius", radius) / (0.5 * (low + high))
+    return 2.0 * positive("radius", radius) / (0.5 * (low + high))
 
 
 def furnace(
@@ -113,7 +114,7 @@ def furnace(
     `max_bounces` counts reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` does. The
     scene is `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
     """
-    r = _positive("radius", radius)
+    r = positive("radius", radius)
     return radiance * _bounce_series(sphere_chord(r), edges_opl, r, reflectance, first=0, last=max_bounces)
 
 
@@ -131,8 +132,8 @@ def parallel_plates(
     rho). `separation` h and `first_leg` z (camera to plate, h / 2 unless given) in metres. Source: the view factor of
     parallel planes. The scene is `tt.scenes.parallel_plates`.
     """
-    h = _positive("separation", separation)
-    z = h / 2.0 if first_leg is None else _positive("first_leg", first_leg)
+    h = positive("separation", separation)
+    z = h / 2.0 if first_leg is None else positive("first_leg", first_leg)
     return radiance * _bounce_series(plate_gap(h), edges_opl, z, reflectance, first=0, last=max_bounces)
 
 
@@ -142,7 +143,7 @@ def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[floa
     Rs = ((cos_i - n cos_t) / (cos_i + n cos_t))^2, Rp = ((n cos_i - cos_t) / (n cos_i + cos_t))^2 (Fresnel). Total
     reflection (index < 1 beyond the critical angle) gives (1, 1).
     """
-    n = _positive("index", index)
+    n = positive("index", index)
     cos_i = math.cos(math.radians(incidence_deg))
     sin2_t = (1.0 - cos_i**2) / n**2
     if sin2_t >= 1.0:
@@ -186,7 +187,7 @@ def etalon_orders(
     cos_t = math.sqrt(max(0.0, 1.0 - (math.sin(math.radians(incidence_deg)) / index) ** 2))
     if max(reflectances) >= 1.0:
         return [EtalonOrder(0.0, 1.0)] if side == "reflected" else []
-    length = _positive("thickness", thickness) / cos_t
+    length = positive("thickness", thickness) / cos_t
     orders: list[EtalonOrder] = []
     if side == "reflected":
         orders.append(EtalonOrder(0.0, float(np.mean(reflectances))))
@@ -223,7 +224,7 @@ def _bounce_series(
     The mass of n flights within the axis falls faster than geometrically once n exceeds the longest possible number of
     typical flights, so that the series ends by itself, at reflectance 1 too.
     """
-    rho = _albedo(reflectance)
+    rho = share("reflectance", reflectance)
     edges = checked_edges(edges_opl)
     total = np.zeros(edges.size - 1)
     if last is not None and last < first:
@@ -239,17 +240,3 @@ def _bounce_series(
         if n > MAX_TERMS:
             raise UnitError(f"the axis reaches {edges[-1]} m, more than {MAX_TERMS} flights; use a shorter axis")
     return total
-
-
-def _positive(name: str, value: float) -> float:
-    number = float(value)
-    if not math.isfinite(number) or number <= 0:
-        raise UnitError(f"{name}: expected a finite number greater than zero, got {value!r}")
-    return number
-
-
-def _albedo(value: float) -> float:
-    number = float(value)
-    if not 0.0 <= number <= 1.0:
-        raise UnitError(f"reflectance: expected a number between 0 and 1, got {value!r}")
-    return number

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import positive, share
 from torchtransient.testing.flight_lengths import Array, checked_edges
 
 
@@ -31,10 +32,10 @@ def confocal_plane(
     before which the scan point stands, which ends at r = hypot(depth, radius); infinite for the plane. Derivation: the
     patch of `hidden_patch` integrated over the plane. Raises UnitError and ShapeError.
     """
-    z = _positive("depth", depth)
-    reach = math.hypot(z, _positive("radius", radius)) if radius != math.inf else math.inf
+    z = positive("depth", depth)
+    reach = math.hypot(z, positive("radius", radius)) if radius != math.inf else math.inf
     r = np.clip(checked_edges(edges_opl) / 2.0, z, reach)
-    strength = energy * _albedo("wall_albedo", wall_albedo) ** 2 * _albedo("albedo", albedo) / math.pi**3
+    strength = energy * share("wall_albedo", wall_albedo) ** 2 * share("albedo", albedo) / math.pi**3
     return strength * math.pi * z**4 / 3.0 * -np.diff(r**-6.0)
 
 
@@ -58,28 +59,14 @@ def hidden_patch(
     """
     points = [_triple(name, value) for name, value in (("spot", spot), ("scan_point", scan_point), ("patch", patch))]
     wall, hidden = (_unit(name, value) for name, value in (("wall_normal", wall_normal), ("normal", normal)))
-    length, factor = 0.0, _positive("area", area) * energy
+    length, factor = 0.0, positive("area", area) * energy
     for point in points[:2]:
         way = points[2] - point
         distance = float(np.linalg.norm(way))
         cosines = max(0.0, float(way @ wall)) * max(0.0, float(-way @ hidden)) / distance**2
         factor *= cosines / distance**2
         length += distance
-    return length, factor * (_albedo("wall_albedo", wall_albedo) / math.pi) ** 2 * _albedo("albedo", albedo) / math.pi
-
-
-def _positive(name: str, value: float) -> float:
-    number = float(value)
-    if not math.isfinite(number) or number <= 0:
-        raise UnitError(f"{name}: expected a finite number greater than zero, got {value!r}")
-    return number
-
-
-def _albedo(name: str, value: float) -> float:
-    number = float(value)
-    if not 0.0 <= number <= 1.0:
-        raise UnitError(f"{name}: expected a number between 0 and 1, got {value!r}")
-    return number
+    return length, factor * (share("wall_albedo", wall_albedo) / math.pi) ** 2 * share("albedo", albedo) / math.pi
 
 
 def _triple(name: str, value: ArrayLike) -> Array:

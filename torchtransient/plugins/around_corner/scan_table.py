@@ -197,9 +197,10 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     for every laser position.
 
     ``fov``: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for those
-    of the sensor.
+    of the sensor. Raises SceneError where two say where the laser points, and for a field of view that is none.
     """
     transform, origin = laser_of(scene).world_transform(), origin_of(scene, sensor)
+    _check_said_once(sensor, capture, fov)
     given = sensor.spots() if hasattr(sensor, "spots") and capture is not CaptureType.CONFOCAL else None
     if given is not None:
         return given - origin
@@ -214,6 +215,22 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     x = (mi.Float(index % columns) + 0.5) / columns * 2 - 1
     y = (mi.Float(index // columns) + 0.5) / rows * 2 - 1
     return transform @ mi.Vector3f(-x * half, -y * half * rows / columns, 1)
+
+
+def _check_said_once(sensor: Any, capture: CaptureType, fov: float | None) -> None:
+    given = getattr(sensor, "laser_points", None) is not None
+    if given and capture is CaptureType.CONFOCAL:
+        raise SceneError(
+            "scan: a confocal capture lights its scanned points, got laser_points beside them. Leave laser_points out "
+            "of the sensor, or set capture_type to single or exhaustive."
+        )
+    if given and fov is not None:
+        raise SceneError(
+            "scan: laser_points and force_equal_illumination_scanning = false (a grid of illumination_scan_fov degrees "
+            "around the laser's axis) both say where the laser points; leave one of them out."
+        )
+    if fov is not None and not 0 < fov < 180:
+        raise SceneError(f"scan: illumination_scan_fov: expected an angle between 0 and 180 degrees, got {fov}.")
 
 
 def scan_rays(sensor: Any) -> Any:

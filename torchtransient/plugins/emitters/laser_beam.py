@@ -6,17 +6,23 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from torchtransient.errors import UnitError
 from torchtransient.plugins._registry import register
+from torchtransient.plugins.finite_values import numbers_of
+from torchtransient.plugins.mitsuba_compat import keeps_coefficients
+from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, ParameterEffect, declare_effects
+from torchtransient.plugins.physical_ranges import NUMBERS
 
 
 class LaserBeam(mi.Emitter):
     r"""A beam without width (:monosp:`laser_beam`), for the integrator ``transient_nlos_path``.
 
     ``to_world`` (transform): the laser stands at its origin and shines along its +z; scans that aim the laser
-    themselves use the origin alone. ``energy`` (spectrum, 1): what falls on the spot, per colour. Both are
-    differentiable.
+    themselves use the origin alone. ``energy`` (spectrum, 1): joules that fall on the spot, per colour, none of them
+    below zero. Both are differentiable.
 
     Nothing of it has an area or a solid angle: integrators that do not aim at its spot refuse it.
     """
@@ -25,7 +31,10 @@ class LaserBeam(mi.Emitter):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
+        if "energy" in props and isinstance(props["energy"], (bool, str)):
+            raise UnitError(f"laser_beam: energy: expected joules or a spectrum, got {props['energy']!r}.")
         self.energy = props.get_emissive_texture("energy", 1.0)
+        _check_light(self.energy)
         # That of the base class cannot be set from Python.
         self.to_world = mi.Transform4f(super().world_transform())
         dr.make_opaque(self.to_world)
@@ -65,6 +74,16 @@ class LaserBeam(mi.Emitter):
 
     def to_string(self) -> str:
         return f"LaserBeam[\n  energy = {self.energy}\n]"
+
+
+def _check_light(energy: Any) -> None:
+    """Raise UnitError for joules below zero or that are no number."""
+    for value in shown_by(energy)[0]:
+        numbers = numbers_of(value.read(energy)) if value.key in NUMBERS and not keeps_coefficients(energy) else None
+        if numbers is not None and not (np.isfinite(numbers) & (numbers >= 0)).all():
+            raise UnitError(
+                f"laser_beam: energy: expected joules of at least 0, finite ones, got {numbers.reshape(-1).tolist()}."
+            )
 
 
 register("emitter", "laser_beam", LaserBeam)

@@ -11,6 +11,8 @@ import numpy as np
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
+from torchtransient.plugins.sensors.places_on_mesh import PlacesOnMesh
+from torchtransient.quantities import real_array, shown
 
 
 class NLOSCaptureMeter(mi.Sensor):
@@ -20,7 +22,9 @@ class NLOSCaptureMeter(mi.Sensor):
         Where the sensor stands, metres.
     ``points`` (array (N, 3) or (H, W, 3); none)
         The scanned points, in the order of the film's pixels. Without them pixel (i, j) of a film of W x H scans the
-        point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H), so that no two pixels share one.
+        point of the shape with texture coordinates ((i + 1/2) / W, (j + 1/2) / H), so that no two pixels share one: of
+        a rectangle, or of a mesh with texture coordinates that say of all of them where they are. Other shapes need
+        ``points``.
     ``laser_points`` (array (M, 3) or (Lh, Lw, 3); none)
         Where the laser points, for captures of type single (M = 1) and exhaustive; without them as the integrator
         ``transient_nlos_path`` says.
@@ -28,7 +32,7 @@ class NLOSCaptureMeter(mi.Sensor):
         Where the laser stands.
     ``laser_lookat_pixel`` (point; none)
         Of scenes from before ``laser_points``: the laser points at the place of the shape with texture coordinates
-        (x / W, y / H).
+        (x / W, y / H), a place of the film.
     ``film`` (``transient_hdr_film`` or another film of this library)
 
     Every sample of a pixel looks along the same ray, so spatial filters do not spread it. A pixel measures the radiance
@@ -40,14 +44,16 @@ class NLOSCaptureMeter(mi.Sensor):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        self.origin = mi.Point3f(mi.ScalarPoint3f(props.get("sensor_origin", mi.ScalarPoint3f(0))))
+        self.origin = mi.Point3f(_place_of(props, "sensor_origin", mi.ScalarPoint3f(0)))
         self.points = _points_of(props, "points")
         self.laser_points = _points_of(props, "laser_points")
-        self.laser_origin = mi.Point3f(props["laser_origin"]) if "laser_origin" in props else None
-        self.lookat_pixel = list(props["laser_lookat_pixel"]) if "laser_lookat_pixel" in props else None
+        self.laser_origin = mi.Point3f(_place_of(props, "laser_origin")) if "laser_origin" in props else None
+        self.lookat_pixel = list(_place_of(props, "laser_lookat_pixel")) if "laser_lookat_pixel" in props else None
         # Said once more in older scenes: the integrator knows them.
         for name in ("account_first_and_last_bounces", "confocal"):
             props.get(name, None)
+        # Of a wall that is a mesh, once they are asked for.
+        self._grid = self._looked_at = None
         self._check()
         dr.make_opaque(self.origin, self.laser_origin)
 
@@ -57,6 +63,13 @@ class NLOSCaptureMeter(mi.Sensor):
             raise SceneError(
                 f"nlos_capture_meter: expected one of 'points' for each of the film's {size[0]} x {size[1]} pixels, "
                 f"got {dr.width(self.points)}. Set the film's width and height to the scan's."
+            )
+        if self.lookat_pixel is not None and not all(
+            0 <= place <= n for place, n in zip(self.lookat_pixel, size, strict=False)
+        ):
+            raise SceneError(
+                f"nlos_capture_meter: expected laser_lookat_pixel as a place of the film's {size[0]} x {size[1]} "
+                f"pixels, got {self.lookat_pixel}."
             )
         if self.lookat_pixel is not None and self.laser_points is not None:
             raise SceneError(
@@ -78,17 +91,33 @@ class NLOSCaptureMeter(mi.Sensor):
         """The scanned points (Point3f) of pixels, given by their index in the film."""
         if self.points is not None:
             return dr.gather(mi.Point3f, self.points, pixel)
+        shape, size = self._surface(), self.film().size()
+        if _is_rectangle(shape):
+            row = pixel // int(size[0])
+            column = pixel - row * int(size[0])
+            place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
+            return shape.sample_position(0.0, place).p
+        if self._grid is None:
+            x, y = ((np.arange(int(n)) + 0.5) / int(n) for n in size)
+            self._grid = PlacesOnMesh(shape, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+        return self._grid.points(pixel)
+
+    def _surface(self) -> Any:
+        """The shape, whose texture coordinates say where points of it are."""
         shape = self.get_shape()
         if shape is None:
             raise SceneError(
                 "nlos_capture_meter: expected a shape to scan or 'points', got neither. Put the sensor into the relay "
                 "wall's shape, or give the points."
             )
-        size = self.film().size()
-        row = pixel // int(size[0])
-        column = pixel - row * int(size[0])
-        place = (mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5) / mi.ScalarVector2f(size)
-        return shape.sample_position(0.0, place).p
+        if _is_rectangle(shape) or (shape.is_mesh() and shape.has_vertex_texcoords()):
+            return shape
+        kind = "a mesh without texture coordinates" if shape.is_mesh() else f"the shape {shape.class_name()}"
+        raise SceneError(
+            f"nlos_capture_meter: expected a rectangle, a mesh with texture coordinates, or 'points', got {kind}, "
+            "which does not say where the points of a grid are. Give the points: an array (N, 3), one for each pixel, "
+            "and the laser's as laser_points."
+        )
 
     def scanned(self) -> Any:
         """The scanned points (Point3f) of all pixels of the film's crop window, row by row."""
@@ -102,9 +131,13 @@ class NLOSCaptureMeter(mi.Sensor):
         """Where the laser points (Point3f), None where nothing of the sensor says so."""
         if self.lookat_pixel is None:
             return self.laser_points
-        size = self.film().size()
-        place = mi.Point2f(self.lookat_pixel[0] / int(size[0]), self.lookat_pixel[1] / int(size[1]))
-        return self.get_shape().sample_position(0.0, place).p
+        shape, size = self._surface(), self.film().size()
+        place = self.lookat_pixel[0] / int(size[0]), self.lookat_pixel[1] / int(size[1])
+        if _is_rectangle(shape):
+            return shape.sample_position(0.0, mi.Point2f(*place)).p
+        if self._looked_at is None:
+            self._looked_at = PlacesOnMesh(shape, np.array([place]))
+        return self._looked_at.points(mi.UInt32(0))
 
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         film = self.film()
@@ -127,6 +160,20 @@ class NLOSCaptureMeter(mi.Sensor):
 
     def to_string(self) -> str:
         return f"NLOSCaptureMeter[\n  sensor_origin = {self.origin},\n  film = {self.film()}\n]"
+
+
+def _is_rectangle(shape: Any) -> bool:
+    """Mitsuba's own, which counts as a mesh, too."""
+    return bool(shape.shape_type() == +mi.ShapeType.Rectangle)
+
+
+def _place_of(props: Any, name: str, default: Any = None) -> Any:
+    """A point of a sensor's properties. Raises SceneError unless it is one, and finite."""
+    given = props.get(name, default)
+    numbers = real_array(given)
+    if numbers is None or numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise SceneError(f"nlos_capture_meter: expected {name} as a point of three finite numbers, got {shown(given)}.")
+    return mi.ScalarPoint3f(numbers)
 
 
 def _points_of(props: Any, name: str) -> Any:

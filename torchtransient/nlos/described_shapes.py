@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from torchtransient import scenes
-from torchtransient.errors import SceneError, StorageError, TorchTransientError
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.nlos.mesh_file import mesh_arrays_shape, mesh_file
 from torchtransient.nlos.yaml_files import Section, file_beside
 from torchtransient.scenes.parts import diffuse
 from torchtransient.scenes.transforms import Matrix, rotate, scale, translate
@@ -22,17 +22,16 @@ SCENES: dict[str, Callable[..., dict[str, Any]]] = {
     for name in ("nlos_z", "nlos_letter", "nlos_plates", "nlos_corner", "nlos_mannequin", "nlos_room")
 }
 SHAPES = ("rectangle", "disk", "cube", "sphere")
-_MESH_FILES = {".obj": "obj", ".ply": "ply", ".serialized": "serialized"}
 _KINDS = ("scene", "file", "shape", "vertices")
 _PLACEMENT = ("scale", "rotate", "translate", "to_world")
 _SURFACE = ("albedo", "bsdf", "flip_normals")
 
 
-def hidden_shapes(data: Any, folder: Path) -> dict[str, Any]:
+def described_shapes(data: Any, folder: Path) -> dict[str, Any]:
     """The entry `hidden` of a description: things by name, each with one of
 
     - `scene`: a function of `tt.scenes` (`nlos_letter`, ...) and its arguments; its shapes are called after both;
-    - `file`: a mesh, .obj, .ply or .serialized, or .npz with `vertices` (V, 3) and `faces` (F, 3);
+    - `file`: a mesh (:func:`.mesh_file.mesh_file`);
     - `shape`: rectangle, disk, cube or sphere, as Mitsuba defines them;
     - `vertices` and `faces`: lists of rows;
 
@@ -84,9 +83,9 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
     if kind == "shape":
         shape: dict[str, Any] = {"type": section.choice("shape", SHAPES)}
     elif kind == "vertices":
-        shape = _mesh(section.get("vertices"), section.get("faces"), where)
+        shape = mesh_arrays_shape(section.get("vertices"), section.get("faces"), where)
     else:
-        shape = _of_file(file_beside(section.text("file"), (folder,), where), where)
+        shape = mesh_file(file_beside(section.text("file"), (folder,), where), where)
     place = _place(section)
     if place is not None:
         shape["to_world"] = place
@@ -103,33 +102,6 @@ def albedo_of(section: Section, default: float = 0.5) -> Any:
     if isinstance(section.get("albedo", default), list):
         return tuple(section.numbers("albedo", (3,)))
     return section.number("albedo", default)
-
-
-def _of_file(path: Path, where: str) -> dict[str, Any]:
-    if path.suffix.lower() == ".npz":
-        vertices, faces = mesh_of_npz(path, where)
-        return _mesh(vertices, faces, where)
-    if path.suffix.lower() not in _MESH_FILES:
-        raise SceneError(f"{where}: expected a mesh, {', '.join(_MESH_FILES)} or .npz, got '{path.name}'.")
-    return {"type": _MESH_FILES[path.suffix.lower()], "filename": str(path)}
-
-
-def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
-    """`vertices` and `faces` of an .npz file. Raises StorageError where they cannot be read."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return file["vertices"], file["faces"]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{where}: expected 'vertices' and 'faces' in '{path}': {error}.") from error
-
-
-def _mesh(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
-    try:
-        return scenes.triangle_mesh(vertices, faces)
-    except TorchTransientError as error:
-        raise type(error)(f"{where}: {error}") from error
-    except (TypeError, ValueError) as error:
-        raise SceneError(f"{where}: expected rows of three numbers as vertices and faces: {error}.") from error
 
 
 def _place(section: Section) -> Matrix | None:

@@ -1,0 +1,94 @@
+"""Checks of what captures are asked for with: counts, samples and seeds, the same for every route to a capture."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import nn
+
+from torchtransient.capture import Scan
+from torchtransient.errors import SceneError, UnitError
+from torchtransient.quantities import shown
+from torchtransient.render.arguments import samples
+from torchtransient.render.seeds import SEED_RANGE
+from torchtransient.sensing import Device
+
+# What samplers count with has 32 bits.
+MOST_SAMPLES = 2**32 - 1
+
+
+def checked_count(who: str, name: str, value: Any) -> int:
+    """A whole number of at least 1. Raises SceneError."""
+    number = _whole(value)
+    if number is None or number < 1:
+        raise SceneError(f"{who}: {name}: expected a whole number of at least 1, got {shown(value)}.")
+    return number
+
+
+def checked_samples(who: str, value: Any) -> int | None:
+    """Samples of a sensor point, or None. Raises UnitError."""
+    if samples("spp", value) is not None and value > MOST_SAMPLES:
+        raise UnitError(f"{who}: spp: expected at most {MOST_SAMPLES} samples, got {value}. Add up several captures.")
+    return None if value is None else int(value)
+
+
+def checked_seed(who: str, value: Any) -> int:
+    """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises SceneError."""
+    number = _whole(value)
+    if number is None or not 0 <= number < SEED_RANGE:
+        raise SceneError(
+            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
+            "modulo 2^32, and be the same as one of these."
+        )
+    return number
+
+
+def check_seeds(who: str, value: Any) -> None:
+    """Likewise for what a layer takes: None, one seed, one for each entry of a batch, or what ``vmap`` has given to its
+    entries, of which nothing can be said here.
+    """
+    if value is None:
+        return
+    if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 1:
+        for one in value:
+            check_seeds(who, one)
+        return
+    try:
+        checked_seed(who, value)
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+
+
+def check_is_scan(who: str, value: Any) -> None:
+    """Raise SceneError for what is no scan."""
+    if not isinstance(value, Scan):
+        raise SceneError(f"{who}: expected scan as a tt.nlos.Scan, got {type(value).__name__}.")
+
+
+def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
+    """Raise SceneError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
+    if not isinstance(sensor, nn.Module | Device | None):
+        raise SceneError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
+    if not isinstance(generator, torch.Generator | None):
+        raise SceneError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
+
+
+def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
+    """Parameters by key, of a mapping or a list of keys. Raises SceneError for what is neither."""
+    listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
+    keys = list(given) if listed else [given]
+    if not listed or not all(isinstance(key, str) for key in keys):
+        raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
+    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
+
+
+def _whole(value: Any) -> int | None:
+    """A whole number of any library; None for what is none. True is not one."""
+    try:
+        return None if "bool" in str(getattr(value, "dtype", type(value))) else operator.index(value)
+    except TypeError:
+        return None

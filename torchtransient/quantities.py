@@ -1,0 +1,123 @@
+"""Numbers as people give them, checked: finite, positive, shares, counts, arrays, transforms.
+
+What is none is a typed error that names it. A number is what Python, numpy or torch have for one; truth values and
+texts are none, although Python takes them.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+
+def finite(name: str, value: Any) -> float:
+    """``value`` as a float. Raises UnitError unless it is one finite number."""
+    number = _number(value)
+    if not math.isfinite(number):
+        raise UnitError(f"{name}: expected a finite number, got {shown(value)}.")
+    return number
+
+
+def positive(name: str, value: Any) -> float:
+    """``value`` as a float. Raises UnitError unless it is finite and greater than zero."""
+    number = _number(value)
+    if not math.isfinite(number) or number <= 0:
+        raise UnitError(f"{name}: expected a finite number greater than zero, got {shown(value)}.")
+    return number
+
+
+def share(name: str, value: Any) -> float:
+    """``value`` as a float, of an albedo for instance. Raises UnitError unless it lies in [0, 1]."""
+    number = _number(value)
+    if not 0.0 <= number <= 1.0:
+        raise UnitError(f"{name}: expected a number between 0 and 1, got {shown(value)}.")
+    return number
+
+
+def shares(name: str, values: Any) -> float | tuple[float, float, float]:
+    """One share, or three of a linear sRGB colour: a sequence or an array of three. Raises UnitError."""
+    if not isinstance(values, (list, tuple)) and getattr(values, "ndim", None) != 1:
+        return share(name, values)
+    plain = list(values)
+    if len(plain) != 3:
+        raise UnitError(f"{name}: expected one number between 0 and 1 or three, got {shown(values)}.")
+    red, green, blue = (share(name, value) for value in plain)
+    return red, green, blue
+
+
+def count(name: str, value: Any, least: int = 1) -> int:
+    """``value`` as an int. Raises SceneError unless it is a whole number of at least ``least``."""
+    try:
+        number = None if _is_truth(value) else operator.index(value)
+    except TypeError:
+        whole = _number(value)
+        number = int(whole) if math.isfinite(whole) and whole == round(whole) else None
+    if number is None or number < least:
+        raise SceneError(f"{name}: expected a whole number of at least {least}, got {shown(value)}.")
+    return number
+
+
+def flag(name: str, value: Any) -> bool:
+    """``value`` as a truth value. Raises SceneError for others: a text that says False would count as true."""
+    if not _is_truth(value) or getattr(value, "ndim", None):
+        raise SceneError(f"{name}: expected True or False, got {shown(value)}.")
+    return bool(value)
+
+
+def real_array(values: Any) -> NDArray[np.float64] | None:
+    """Real numbers of any library as a float64 array, detached; None for what is none: texts, None, truth values, rows
+    of different lengths, and numbers that float64 cannot hold.
+    """
+    try:
+        plain = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+        if plain.dtype.kind in "iuf":
+            return plain.astype(np.float64)
+        # Lists of tensors or of whole numbers beyond 64 bits.
+        return np.asarray(plain.tolist(), dtype=np.float64) if plain.dtype == object and _are_numbers(plain) else None
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return None
+
+
+def _are_numbers(objects: NDArray[Any]) -> bool:
+    return all(hasattr(value, "__float__") for value in objects.reshape(-1))
+
+
+def transform(name: str, given: Any) -> NDArray[np.float64]:
+    """A transform (4, 4), also one of Mitsuba's. Raises ShapeError unless it has as many finite numbers."""
+    matrix = real_array(getattr(given, "matrix", given))
+    if matrix is not None and matrix.ndim == 3:  # Dr.Jit's, of one entry
+        matrix = matrix[..., 0]
+    if matrix is None or matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ShapeError(f"{name}: expected a (4, 4) array of finite numbers, got {shown(given)}.")
+    return matrix
+
+
+def shown(value: Any) -> str:
+    """A value in a message, not more of it than tells what it is."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no whole numbers of thousands of digits
+        text = f"a {type(value).__name__} that is too long to be written"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _number(value: Any) -> float:
+    """NaN for what is no real number."""
+    if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+    except (TypeError, ValueError, RuntimeError):
+        return math.nan
+
+
+def _is_truth(value: Any) -> bool:
+    return isinstance(value, bool) or "bool" in str(getattr(value, "dtype", ""))
