@@ -20,7 +20,7 @@ from torchtransient.plugins.around_corner.shafts import pays, spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.around_corner.third_bounce_gradients import ThirdBounceGradients
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
-from torchtransient.plugins.bsdfs.lambertian import is_lambertian, scatters_behind
+from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.node_walk import objects_below
 from torchtransient.plugins.sampling.area_elements import can_be_listed, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements

@@ -10,6 +10,7 @@ import mitsuba as mi
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
+from torchtransient.plugins.properties import truth
 
 from .fresnel import fresnel
 from .ior import opaque, optional_texture, relative_index, specular_share, textured
@@ -32,7 +33,7 @@ class DiffPlastic(mi.BSDF):
         self.eta = relative_index(props, "diff_plastic", "polypropylene")
         self.diffuse_reflectance = props.get_texture("diffuse_reflectance", 0.5)
         self.specular_reflectance = optional_texture(props, "specular_reflectance")
-        self.nonlinear = bool(props.get("nonlinear", False))
+        self.nonlinear = truth(props, "nonlinear", default=False)
         front = mi.BSDFFlags.FrontSide
         self.m_components = [mi.BSDFFlags.DeltaReflection | front, mi.BSDFFlags.DiffuseReflection | front]
         self.m_flags = self.m_components[0] | self.m_components[1]

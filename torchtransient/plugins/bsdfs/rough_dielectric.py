@@ -10,6 +10,7 @@ import mitsuba as mi
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
+from torchtransient.plugins.properties import truth
 
 from .fresnel import fresnel, refract
 from .ior import opaque, optional_texture, relative_index, textured
@@ -58,7 +59,7 @@ class DiffRoughDielectric(mi.BSDF):
         if name not in _DISTRIBUTIONS:
             raise SceneError(f"diff_rough_dielectric: 'distribution' must be 'beckmann' or 'ggx', got '{name}'.")
         self.ggx = _DISTRIBUTIONS[name]
-        self.sample_visible = bool(props.get("sample_visible", True))
+        self.sample_visible = truth(props, "sample_visible", default=True)
         self._read_roughness(props)
 
         extra = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide

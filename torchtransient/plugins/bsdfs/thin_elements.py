@@ -14,6 +14,7 @@ import mitsuba as mi
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.bsdfs.mueller import two_by_two
 from torchtransient.plugins.polarized import rotate_mueller, rotation_along
+from torchtransient.plugins.properties import truth
 
 
 class ThinElement(mi.BSDF):
@@ -99,7 +100,7 @@ class DiffPolarizer(ThinElement):
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.theta = props.get_unbounded_texture("theta", 0.0)
-        self.polarizing = bool(props.get("polarizing", True))
+        self.polarizing = truth(props, "polarizing", default=True)
 
     def matrix(self, si: Any, forward: Any, active: Any) -> Any:
         if not self.polarizing:
@@ -143,7 +144,7 @@ class DiffCircular(ThinElement):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        self.left_handed = bool(props.get("left_handed", False))
+        self.left_handed = truth(props, "left_handed", default=False)
 
     def matrix(self, si: Any, forward: Any, active: Any) -> Any:
         # It has no axis: turning its frame changes nothing.

@@ -12,6 +12,7 @@ from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
+from torchtransient.plugins.properties import truth, whole_number
 
 # Dr.Jit arrays are indexed with 32 bits; a larger cube is stored in bands of whole rows.
 MAX_ARRAY_ENTRIES = 2**32 - 1
@@ -50,9 +51,9 @@ class TimeResolvedFilm(mi.Film):
         self.start_opl = float(props.get("start_opl", 0.0))
         if not abs(self.start_opl) < float("inf"):
             raise SceneError(f"{self.plugin}: start_opl must be a finite length in metres, got {self.start_opl}.")
-        self.exhaustive_scan = bool(props.get("exhaustive_scan", False))
-        self.laser_scan_width = int(props.get("laser_scan_width", 0))
-        self.laser_scan_height = int(props.get("laser_scan_height", 0))
+        self.exhaustive_scan = truth(props, "exhaustive_scan", default=False)
+        self.laser_scan_width = whole_number(props, "laser_scan_width", 0)
+        self.laser_scan_height = whole_number(props, "laser_scan_height", 0)
         self._check_laser_grid()
         self.curves = SensorResponse.of(props)
         self.bands = []

@@ -15,6 +15,7 @@ from torchtransient.plugins.films.long_kernel import read as read_long
 from torchtransient.plugins.films.pulsed_filter import PulsedFilter, pulse_of
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev, make_temporal_filter
 from torchtransient.plugins.films.window import ArrivalWindow
+from torchtransient.plugins.properties import truth, whole_number
 
 # Kernels of more bins are looped over instead of written out.
 MAX_UNROLLED = 9
@@ -95,11 +96,11 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     def __init__(self, props):
         super().__init__(props)
-        self.temporal_bins = int(props.get("temporal_bins", 2048))
+        self.temporal_bins = whole_number(props, "temporal_bins", 2048)
         self.bin_width_opl = float(props.get("bin_width_opl", 0.003))
         self._filter_name = str(props.get("temporal_filter", "box"))
         self._gaussian_stddev = float(props.get("gaussian_stddev", 0.5))
-        self.keeps_steady = self.has_window = bool(props.get("steady", True))
+        self.keeps_steady = self.has_window = truth(props, "steady", default=True)
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
         # Temporal filters by what they were made for, since a renderer changes the film's and puts it back.

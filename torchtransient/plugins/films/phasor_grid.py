@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
+from torchtransient.plugins.properties import whole_number
 
 LIST = ("frequencies",)
 GRID = ("frequency_first", "frequency_step", "frequency_count")
@@ -35,7 +36,7 @@ def frequencies_of(props) -> np.ndarray:
     found = transform_bins(
         float(props.get("wl_mean", 100.0)),
         float(props.get("wl_sigma", 1000.0)),
-        int(props.get("temporal_bins", 4096)),
+        whole_number(props, "temporal_bins", 4096),
         float(props.get("bin_width_opl", 0.003)),
     )
     if not given:

@@ -17,6 +17,7 @@ from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, pa
 from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
+from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
@@ -46,15 +47,11 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        max_depth = int(props.get("max_depth", 6))
-        if max_depth < -1:
-            raise SceneError(f"max_depth: expected -1 (no limit) or a number >= 0, got {max_depth}.")
+        max_depth = whole_number(props, "max_depth", 6)
         self.max_depth = max_depth if max_depth != -1 else UNLIMITED
-        self.rr_depth = int(props.get("rr_depth", 5))
-        if self.rr_depth <= 0:
-            raise SceneError(f"rr_depth: expected a number >= 1, got {self.rr_depth}.")
-        self.camera_unwarp = bool(props.get("camera_unwarp", False))
-        self.discard_direct_light = bool(props.get("discard_direct_light", False))
+        self.rr_depth = whole_number(props, "rr_depth", 5, least=1)
+        self.camera_unwarp = truth(props, "camera_unwarp", default=False)
+        self.discard_direct_light = truth(props, "discard_direct_light", default=False)
         self.temporal_filter = str(props.get("temporal_filter", ""))
         if self.temporal_filter:
             check_name(self.temporal_filter)

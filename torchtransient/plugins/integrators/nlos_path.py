@@ -25,6 +25,7 @@ from torchtransient.plugins.around_corner.shared_light import (
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.integrators.base import UNLIMITED
+from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
@@ -111,19 +112,19 @@ class TransientNLOSPath(base.TransientIntegrator):
                 "transient_nlos_path: camera_unwarp is account_first_and_last_bounces here; set that to false instead."
             )
         self.capture = capture_type(props.get("capture_type", "single"))
-        self.legs = bool(props.get("account_first_and_last_bounces", False))
+        self.legs = truth(props, "account_first_and_last_bounces", default=False)
         self.camera_unwarp = not self.legs
-        self.laser_sampling = bool(props.get("nlos_laser_sampling", False))
-        self.hidden_sampling = bool(props.get("nlos_hidden_geometry_sampling", False))
-        self.equal_shares = bool(props.get("nlos_hidden_geometry_sampling_do_rroulette", False))
-        self.samples_wall = bool(props.get("nlos_hidden_geometry_sampling_includes_relay_wall", False))
-        self.equal_grids = bool(props.get("force_equal_illumination_scanning", True))
+        self.laser_sampling = truth(props, "nlos_laser_sampling", default=False)
+        self.hidden_sampling = truth(props, "nlos_hidden_geometry_sampling", default=False)
+        self.equal_shares = truth(props, "nlos_hidden_geometry_sampling_do_rroulette", default=False)
+        self.samples_wall = truth(props, "nlos_hidden_geometry_sampling_includes_relay_wall", default=False)
+        self.equal_grids = truth(props, "force_equal_illumination_scanning", default=True)
         self.laser_fov = float(props.get("illumination_scan_fov", 20.0))
-        self.discard_direct_paths = bool(props.get("discard_direct_paths", False))
+        self.discard_direct_paths = truth(props, "discard_direct_paths", default=False)
         self.third_bounce = _choice(props, "third_bounce", "shared")
         self.late_light = _choice(props, "late_light", "chains")
         props.get("block_size", 0)
-        self.min_bounces = int(props.get("min_bounces", 0))
+        self.min_bounces = whole_number(props, "min_bounces", 0, least=0)
         self.only_bounces = self._bounces_of(props)
         settings = self.settings()
         if self.only_bounces is not None and self.only_bounces < self._fewest():
@@ -141,7 +142,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         return max(2 if self.discard_direct_paths else 0, self.min_bounces)
 
     def _bounces_of(self, props: Any) -> int | None:
-        depth, bounces = int(props.get("filter_depth", -1)), int(props.get("filter_bounces", -1))
+        depth, bounces = whole_number(props, "filter_depth", -1), whole_number(props, "filter_bounces", -1)
         if depth != -1 and bounces != -1:
             raise SceneError("transient_nlos_path: filter_depth and filter_bounces choose the same: give one of them.")
         if depth != -1:

@@ -41,7 +41,8 @@ class PrimaryRays:
     in its pixel), ``row`` and ``column`` of the pixel, the :class:`View` of every sensor (``seen``),
     and the index of refraction ``η`` where the rays start (attached to the glass that they start in); ``laser``:
     number of the laser position in an exhaustive scan, else None; ``strata``: (number of the sample in its pixel, how
-    many there are); ``leg``: how the first segment ends where that is known. A plain object, which Dr.Jit loops leave alone.
+    many there are); ``leg``: how the first segment ends where that is known. A plain object, which Dr.Jit loops leave
+    alone.
     """
 
     def __init__(self, sampler, ray, weight, scale, row, column, seen, η, laser=None, strata=None):
