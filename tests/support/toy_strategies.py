@@ -12,7 +12,7 @@ from torchtransient.plugins.polarized import product, scatter_unpolarized
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
 from torchtransient.plugins.transport.scattering.geometry_terms import distance
-from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Guide, Local, Proposal
+from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Guide, GuidedPoint, Local, Proposal
 
 
 def direction_to(p, q, active, otherwise):
@@ -100,7 +100,8 @@ class AreaOfShape(Guide):
         self.per_area = 1 / self.shape.surface_area()
 
     def draw(self, world, vertex, x, y):
-        return self.shape.sample_position(0.0, mi.Point2f(mi.Float(x), y)).p, mi.ShapePtr(self.shape), None
+        point = self.shape.sample_position(0.0, mi.Point2f(mi.Float(x), y)).p
+        return GuidedPoint(point, mi.ShapePtr(self.shape))
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         on_it = active & (shape == mi.ShapePtr(self.shape))

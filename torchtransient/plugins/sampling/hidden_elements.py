@@ -131,11 +131,13 @@ class HiddenElements:
         element, a = self.select_element(mi.Float64(u.x), active, tile)
         return self.point(element, a, u.y, active)
 
-    def draw_with_surface(self, x: Any, y: Any, active: Any = True) -> tuple[Any, Any, Any]:
-        """A point for two numbers in [0, 1) (``Float64``, ``Float``), and the shape and primitive that it lies on."""
+    def draw_with_surface(self, x: Any, y: Any, active: Any = True) -> tuple[Any, Any, Any, Any, Any]:
+        """A point for two numbers in [0, 1) (``Float64``, ``Float``), the geometric normal there, its place on the
+        primitive as in :meth:`coordinates`, and the shape and primitive that it lies on.
+        """
         element, a = self.select_element(x, active)
-        point, _ = self.point(element, a, y, active)
-        return point, *self.surface(element, active)
+        point, n = self.point(element, a, y, active)
+        return point, n, self.coordinates(element, a, y, active), *self.surface(element, active)
 
     def select_element(self, x: Any, active: Any = True, tile: Any = None) -> tuple[Any, Any]:
         """An element (its number in the table) for a ``Float64`` in [0, 1), and what is left of that number: uniform in

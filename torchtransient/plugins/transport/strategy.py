@@ -65,6 +65,16 @@ class Step(Local):
     """
 
 
+class GuidedPoint(Local):
+    """A point on a surface that a :class:`Guide` has drawn: ``p``, ``shape`` (ShapePtr), ``primitive`` (the number of
+    its triangle, None where that does not matter), and ``n`` and ``uv`` as intersections have them, both None where
+    they are not known: then a ray has to find the point.
+    """
+
+    def __init__(self, p, shape, primitive=None, n=None, uv=None):
+        super().__init__(p=p, shape=shape, primitive=primitive, n=n, uv=uv)
+
+
 class Event(Local):
     """Light that arrives: ``value`` (throughput included), ``opl`` (Float64, minus the film's start), ``active``,
     ``depth`` (UInt32, the smallest ``max_depth`` of a render that contains it), and what the strategy records of it.
@@ -124,6 +134,12 @@ class Segment(Strategy):
     def depart(self, world: Any, ray: Any, vertex: Vertex, β: Any, sampler: Any, active: Any) -> Any:
         """The leg of ``ray``, which leaves ``vertex`` with throughput ``β``."""
         raise NotImplementedError
+
+    def depart_guided(self, world: Any, ray: Any, vertex: Vertex, step: Step, sampler: Any, active: Any) -> Any:
+        """The same where some rays were sent to a point by a guide: ``step.guided``, ``step.point``, and in
+        ``step.target`` what is known of it (Local with ``n`` and ``uv``, or None).
+        """
+        return self.depart(world, ray, vertex, vertex.β, sampler, active)
 
     def arrive(self, world: Any, path: Any) -> Vertex:
         """The vertex at the end of the current leg. Sensors do not see lights where ``world.hide_emitters``."""
@@ -265,10 +281,8 @@ class Guide(Strategy):
         """
         return self.share
 
-    def draw(self, world: Any, vertex: Vertex, x: Any, y: Any) -> Any:
-        """(a Point3f on a surface for two uniform numbers (Float64, Float), the ShapePtr of that surface, the number of
-        its triangle or None where that does not matter).
-        """
+    def draw(self, world: Any, vertex: Vertex, x: Any, y: Any) -> GuidedPoint:
+        """A point on a surface for two uniform numbers (Float64, Float)."""
         raise NotImplementedError
 
     def density(self, world: Any, p: Any, q: Any, n: Any, shape: Any, active: Any, primitive: Any = None) -> Any:

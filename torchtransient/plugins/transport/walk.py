@@ -85,7 +85,7 @@ def bounce(world, path, kept, sampler, sink, *, dark=False):
         onward &= path.depth + 2 < world.max_depth
     ray, leg = vertex.at.spawn_ray(step.out), None
     if world.scattering.guides:  # the density of what a guide drew is known once the segment has ended
-        leg = world.segment.depart(world, ray, vertex, vertex.β, sampler, onward)
+        leg = world.segment.depart_guided(world, ray, vertex, step, sampler, onward)
         world.scattering.weigh(world, path, vertex, step, ray, leg)
     β, goes_on, rr = roulette(world, path, vertex, step, sampler, onward, sink.zeros)
     samples[world.segment.name], samples[world.scattering.name] = vertex, step

@@ -149,10 +149,12 @@ class Surface(Scattering):
             chosen = (u >= below) & (u < below + share)
             # What is left of the number that has chosen is uniform again.
             x = dr.clip((u - below) / mi.Float64(share), 0, 1 - dr.epsilon(mi.Float64))
-            point, shape, primitive = guide.draw(world, vertex, x, step.u_dir.y)
-            step.point, step.shape = dr.select(chosen, point, step.point), dr.select(chosen, shape, step.shape)
-            step.primitive = dr.select(chosen, _ANY if primitive is None else primitive, step.primitive)
+            drawn = guide.draw(world, vertex, x, step.u_dir.y)
+            step.point, step.shape = dr.select(chosen, drawn.p, step.point), dr.select(chosen, drawn.shape, step.shape)
+            step.primitive = dr.select(chosen, _ANY if drawn.primitive is None else drawn.primitive, step.primitive)
             below += share
+        # Of one guide all is known; where several could have drawn a point, a ray has to find it.
+        step.target = drawn if len(self.guides) == 1 and drawn.n is not None else None
         # Rays start beside the surface, from where a near point lies in another direction.
         step.out = dr.select(step.guided, vertex.at.spawn_ray_to(step.point).d, step.out)
         step.delta, step.unconnected = step.delta & ~step.guided, step.unconnected & ~step.guided

@@ -14,6 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.around_corner.geometry import OFFSET, occluded
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import distance, material_point
 from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
@@ -110,6 +111,34 @@ class FoundVacuum(MaterialVacuum):
     def depart(self, world, ray, vertex, β, sampler, active):
         # Most lanes follow guides, which send those beside each other to places beside each other.
         pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
+
+    def depart_guided(self, world, ray, vertex, step, sampler, active):
+        target = step.target
+        # Of triangles in triangles, a ray meets one.
+        if target is None or world.contents.doubled_faces:
+            return self.depart(world, ray, vertex, vertex.β, sampler, active)
+        # What a guide has drawn is there: all that is asked is whether it is seen, which rays find faster than what
+        # they meet.
+        guided = active & step.guided
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active & ~guided)
+        at = vertex.at
+        start = Local(p=at.p, geometric_n=mi.Vector3f(at.n))
+        end, n = step.point, mi.Vector3f(target.n)
+        to = end - at.p
+        line = Local(geometric_cos=dr.dot(start.geometric_n, to), r=dr.norm(to))
+        height = dr.dot(n, to)
+        n = dr.mulsign(n, -height)
+        # Points of one plane do not see each other.
+        least = OFFSET * (dr.max(dr.abs(end)) + line.r)
+        seen = guided & (dr.abs(line.geometric_cos) > least) & (dr.abs(height) > least)
+        seen &= ~occluded(world.scene, start, line, end, n, seen)
+        pi.t = dr.select(guided, dr.select(seen, dr.norm(end - ray.o), dr.inf), pi.t)
+        pi.prim_uv = dr.select(guided, target.uv, pi.prim_uv)
+        pi.prim_index = dr.select(guided, step.primitive, pi.prim_index)
+        pi.shape = dr.select(guided, step.shape, pi.shape)
+        pi.shape_index = dr.select(guided, 0xFFFFFFFF, pi.shape_index)
+        pi.valid = dr.select(guided, seen, pi.valid)
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
 
     def surface_of(self, leg):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.transport.strategy import Guide
+from torchtransient.plugins.transport.strategy import Guide, GuidedPoint
 
 
 class HiddenGeometry(Guide):
@@ -26,7 +26,8 @@ class HiddenGeometry(Guide):
         return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
 
     def draw(self, world, vertex, x, y):
-        return self.elements.draw_with_surface(x, y, vertex.goes_on)
+        p, n, uv, shape, primitive = self.elements.draw_with_surface(x, y, vertex.goes_on)
+        return GuidedPoint(p, shape, primitive, n, uv)
 
     def density(self, world, p, q, n, shape, active, primitive=None):
         v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
