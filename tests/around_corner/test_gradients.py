@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_pairs
 from support.moved_captures import MovedCapture, move, turn
 from support.nlos_scenes import film, plane, scan_scene, side
 
@@ -27,6 +28,7 @@ CASES = {
     "energy": ("laser.energy.value", lambda: add, 0.02),
     "sensor": ("wall.sensor.sensor_origin", lambda: move(1, 0, 0), 4e-3),
 }
+KINDS = ("confocal", "single", "exhaustive")
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
 
 
@@ -81,8 +83,16 @@ def test_a_wall_moves_behind_points_that_are_given():
     assert error < 0.1 * abs(reverse.mean())
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-@pytest.mark.parametrize("case", ["depth", "sideways", "albedo", "albedo of the wall", "the wall"])
+QUICK_PATHS = {
+    ("depth", "confocal"), ("the wall", "confocal"), ("sideways", "single"), ("albedo of the wall", "single"),
+    ("depth", "exhaustive"), ("albedo", "exhaustive"), ("the wall", "exhaustive"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "kind"),
+    long_pairs([name for name in CASES if name in {case for case, _ in QUICK_PATHS}], KINDS, QUICK_PATHS),
+)
 def test_general_paths(case, kind):
     key, change, h = CASES[case]
     points = 2 if kind == "exhaustive" else 3
@@ -113,8 +123,15 @@ def test_late_light(key):
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-@pytest.mark.parametrize("name", ["phasors", "gates", "gaussian", "no steady image"])
+QUICK_FILMS = {
+    ("phasors", "confocal"), ("gates", "single"), ("gaussian", "exhaustive"), ("no steady image", "confocal"),
+    ("phasors", "exhaustive"), ("gates", "exhaustive"), ("phasors", "single"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), long_pairs(["phasors", "gates", "gaussian", "no steady image"], KINDS, QUICK_FILMS)
+)
 def test_films(name, kind):
     """Every film and every type of capture has derivatives in both modes."""
     changes = {
