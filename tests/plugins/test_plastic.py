@@ -95,7 +95,7 @@ def test_a_black_lobe_has_its_slope(kind, lobe):
     key = f"wall.bsdf.{lobe}.value"
     info = scene.parameters()[key]
     assert info.differentiable and not info.biased and "diff_" in info.reason and info.shape == ()
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16384)
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=4096)
 
     def brightness(x, seed):
         return renderer(values={key: torch.tensor(float(x))}, seed=seed).steady.double().sum()
