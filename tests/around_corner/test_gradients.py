@@ -18,6 +18,11 @@ def add(start, θ):
     return start + θ
 
 
+def capture_of(description, key, change):
+    """Of a loss that every case changes by more than the rounding of its differences."""
+    return MovedCapture(description, key, change, wave=lambda i: np.sin(3 + 0.15 * i))
+
+
 CASES = {
     "depth": ("a.to_world", lambda: move(0, 0, 1), 4e-3),
     "sideways": ("a.to_world", lambda: move(1, 0, 0), 4e-3),
@@ -41,7 +46,7 @@ def plate(**changes):
 def test_shared_samples(case, kind):
     """Within 0.1 % of finite differences where nothing hides the body and its outline moves; modes agree."""
     key, change, h = CASES[case]
-    capture = MovedCapture(scan_scene(plate(), kind, film(3, **SMOOTH)), key, change())
+    capture = capture_of(scan_scene(plate(), kind, film(3, **SMOOTH)), key, change())
     spp = 2**16
     reverse = capture.reverse(0, spp)
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4, abs=1e-7)
@@ -59,7 +64,7 @@ def test_shared_samples(case, kind):
 def test_pose_of_the_laser(kind):
     """It moves the spot of a single capture, and the first leg of any."""
     scene = scan_scene(plate(), kind, film(3, **SMOOTH), account_first_and_last_bounces=True)
-    capture = MovedCapture(scene, "laser.to_world", move(1, 0, 0))
+    capture = capture_of(scene, "laser.to_world", move(1, 0, 0))
     spp = 2**14
     reverse = capture.reverse(0, spp)
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
@@ -72,7 +77,7 @@ def test_a_wall_moves_behind_points_that_are_given():
     scene = scan_scene(plate(), "single", film(2, **SMOOTH), third_bounce="paths")
     grid = np.float32([[x, y, 0] for y in (-0.2, 0.2) for x in (-0.2, 0.2)])
     scene["wall"]["sensor"] |= {"points": mi.TensorXf(grid)}
-    capture = MovedCapture(scene, "wall.to_world", move(0, 0, 1))
+    capture = capture_of(scene, "wall.to_world", move(0, 0, 1))
     runs = [
         (capture.reverse(s, 2**14), capture.forward(s, 2**14), capture.difference(4e-3, s, 2**14)) for s in range(4)
     ]
@@ -97,7 +102,7 @@ def test_general_paths(case, kind):
     key, change, h = CASES[case]
     points = 2 if kind == "exhaustive" else 3
     scene = scan_scene(plate(), kind, film(points, kind=kind, **SMOOTH), third_bounce="paths")
-    capture = MovedCapture(scene, key, change())
+    capture = capture_of(scene, key, change())
     seeds, spp = 8, 2**13
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
@@ -113,7 +118,7 @@ def test_late_light(key):
     """Light of four and five bounces, which a second plate sends to the first one."""
     change = add if key.endswith("value") else move(1, 0, 0)
     scene = scan_scene(plate() | {"b": side()}, "confocal", film(2, **SMOOTH), max_depth=5, min_bounces=4)
-    capture = MovedCapture(scene, key, change)
+    capture = capture_of(scene, key, change)
     seeds, spp, h = 8, 2**15, 0.02 if key.endswith("value") else 3e-2
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     differences = np.array([capture.difference(h, 10 + seed, spp) for seed in range(seeds)])
@@ -142,7 +147,7 @@ def test_films(name, kind):
     }[name]
     points = 2 if kind == "exhaustive" else 3
     size = {k: v for k, v in film(points, kind=kind).items() if not k.startswith(("temporal", "bin", "start", "type"))}
-    capture = MovedCapture(scan_scene(plate(), kind, changes | size), "a.to_world", move(0, 0, 1))
+    capture = capture_of(scan_scene(plate(), kind, changes | size), "a.to_world", move(0, 0, 1))
     seeds, spp = 4, 2**12
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
@@ -159,7 +164,7 @@ def test_colours():
     coloured = plane(1.0, 0.6, 0.1, 0.05)
     coloured["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}
     scene = scan_scene({"a": coloured}, "single", film(2, **SMOOTH))
-    capture = MovedCapture(scene, "a.bsdf.reflectance.value", lambda start, θ: start + mi.Color3f(0, θ, 0))
+    capture = capture_of(scene, "a.bsdf.reflectance.value", lambda start, θ: start + mi.Color3f(0, θ, 0))
     reverse, spp = capture.reverse(0, 2**12), 2**12
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
     assert reverse == pytest.approx(capture.difference(0.05, 0, spp), rel=1e-3)
@@ -167,6 +172,6 @@ def test_colours():
 
 def test_second_backward_and_batches():
     """Adjoints accumulate; nothing of one pass is left in the next."""
-    capture = MovedCapture(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
+    capture = capture_of(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
     first, again = capture.reverse(1, 4096), capture.reverse(1, 4096)
     assert first == pytest.approx(again, rel=1e-5)  # threads add in the order they come
