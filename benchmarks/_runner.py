@@ -42,6 +42,16 @@ def arguments(description: str | None, *, peer: bool = True) -> argparse.Argumen
     return parser
 
 
+def curve_arguments(description: str | None, picture: str, numbers: str, *, repeats: int) -> argparse.ArgumentParser:
+    """The options of a benchmark that draws error against time into `picture` and writes `numbers` next to it."""
+    parser = argparse.ArgumentParser(description=(description or "").split("\n", 1)[0])
+    parser.add_argument("--picture", type=Path, default=Path(picture))
+    parser.add_argument("--json", type=Path, default=Path(numbers))
+    parser.add_argument("--repeats", type=int, default=repeats)
+    parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
+    return parser
+
+
 class ChildProcess:
     """A process that reads one JSON object per line and answers each with one line; it speaks first."""
 

@@ -5,19 +5,15 @@ Writes the picture and the numbers next to it. The choices compared are the samp
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from _runner import curve_arguments
 
 import torchtransient as tt
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", type=Path, default=Path("docs/images/accuracy_cornell.png"))
-    parser.add_argument("--json", type=Path, default=Path("benchmarks/results/accuracy_cornell.json"))
+    picture, numbers = "docs/images/accuracy_cornell.png", "benchmarks/results/accuracy_cornell.json"
+    parser = curve_arguments(__doc__, picture, numbers, repeats=12)
     parser.add_argument("--resolution", type=int, default=64)
-    parser.add_argument("--repeats", type=int, default=12)
-    parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
     options = parser.parse_args()
     resolution, spp = (8, (4, 16)) if options.quick else (options.resolution, (16, 64, 256))
 

@@ -7,9 +7,9 @@ next to it.
 
 from __future__ import annotations
 
-import argparse
 import json
-from pathlib import Path
+
+from _runner import curve_arguments
 
 import torchtransient as tt
 from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
@@ -28,12 +28,9 @@ HIDDEN = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", type=Path, default=Path("docs/images/nlos/accuracy.png"))
-    parser.add_argument("--json", type=Path, default=Path("benchmarks/results/nlos_accuracy.json"))
+    picture, numbers_file = "docs/images/nlos/accuracy.png", "benchmarks/results/nlos_accuracy.json"
+    parser = curve_arguments(__doc__, picture, numbers_file, repeats=4)
     parser.add_argument("--points", type=int, default=32)
-    parser.add_argument("--repeats", type=int, default=4)
-    parser.add_argument("--quick", action="store_true", help="tiny: shows that it runs, measures nothing")
     options = parser.parse_args()
     points, spp = (2, (4, 16)) if options.quick else (options.points, (256, 1024, 4096, 16384))
     curves, numbers = [], {}

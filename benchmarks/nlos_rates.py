@@ -19,6 +19,7 @@ from _runner import arguments, environment, interleave, ratio, report, summary
 
 import torchtransient  # noqa: F401  before Mitsuba: finds LLVM
 from torchtransient import plugins
+from torchtransient.scenes.meshes import Mesh, joined, octahedral_ellipsoid, plate
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -28,48 +29,22 @@ WALL_ALBEDO, ALBEDO = 0.9, 0.7
 BINS, BIN_WIDTH, START = 512, 0.005, 1.6
 
 
-def plate(width: float, height: float, center: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """A rectangle that faces the wall."""
-    v = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]]) * [width / 2, height / 2, 0] + np.array(center)
-    return v, np.array([[0, 2, 1], [1, 2, 3]])
-
-
-def ellipsoid(center: list[float], radii: list[float], level: int) -> tuple[np.ndarray, np.ndarray]:
-    """8 times 4^level triangles."""
-    v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-    f = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    for _ in range(level):
-        edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-        unique, place = np.unique(edges, axis=0, return_inverse=True)
-        a, b, c = len(v) + place.reshape(3, -1)
-        v = np.concatenate([v, v[unique].mean(1)])
-        f = np.concatenate([np.stack(t, 1) for t in ((f[:, 0], a, c), (f[:, 1], b, a), (f[:, 2], c, b), (a, b, c))])
-    return v / np.linalg.norm(v, axis=1, keepdims=True) * radii + center, f
-
-
-def join(*meshes: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    first = np.cumsum([0, *(len(v) for v, _ in meshes[:-1])])
-    return np.concatenate([v for v, _ in meshes]), np.concatenate(
-        [f + k for (_, f), k in zip(meshes, first, strict=True)]
-    )
-
-
-def letter() -> tuple[np.ndarray, np.ndarray]:
+def letter() -> Mesh:
     bar = np.array([[-0.5, -0.3, 1], [-0.25, -0.3, 1], [0.25, 0.3, 1], [0.5, 0.3, 1]])
-    return join(plate(1, 0.2, (0, 0.4, 1)), plate(1, 0.2, (0, -0.4, 1)), (bar, np.array([[0, 2, 1], [1, 2, 3]])))
+    return joined(plate(1, 0.2, (0, 0.4, 1)), plate(1, 0.2, (0, -0.4, 1)), (bar, np.array([[0, 2, 1], [1, 2, 3]])))
 
 
-def body(level: int) -> tuple[np.ndarray, np.ndarray]:
+def body(level: int) -> Mesh:
     parts = [
         ([0, 0.55, 1.2], [0.11, 0.14, 0.12]), ([0, 0.15, 1.2], [0.2, 0.28, 0.13]),
         ([0.12, -0.38, 1.2], [0.08, 0.34, 0.09]), ([-0.12, -0.38, 1.2], [0.08, 0.34, 0.09]),
         ([0.33, 0.2, 1.15], [0.22, 0.06, 0.06]),
         ([-0.2, 0.2, 0.93], [0.06, 0.06, 0.24]),
     ]  # fmt: skip
-    return join(*[ellipsoid(center, radii, level) for center, radii in parts])
+    return joined(*[octahedral_ellipsoid(center, radii, level) for center, radii in parts])
 
 
-def mesh(name: str, arrays: tuple[np.ndarray, np.ndarray], albedo: float) -> Any:
+def mesh(name: str, arrays: Mesh, albedo: float) -> Any:
     v, f = arrays
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": albedo})
@@ -92,9 +67,7 @@ def grid(count: int) -> tuple[np.ndarray, np.ndarray]:
 class Case:
     """One hidden object: what is timed."""
 
-    def __init__(
-        self, arrays: tuple[np.ndarray, np.ndarray], scan: int, pairs: int, samples: int, rays_too: bool = True
-    ) -> None:
+    def __init__(self, arrays: Mesh, scan: int, pairs: int, samples: int, rays_too: bool = True) -> None:
         # Plugins know their variant: their modules are imported when one is active.
         from torchtransient.plugins.around_corner import exhaustive, shafts, third_bounce, wall_points
         from torchtransient.plugins.sampling import hidden_elements, shared_samples

@@ -6,8 +6,20 @@ import gc
 
 import mitsuba as mi
 import pytest
+import torch
 
 from torchtransient import plugins
+
+# Tensors of tests are small: a second thread is no faster, and where the cores are busy all wait for it (five-fold).
+torch.set_num_threads(1)
+
+
+def pytest_collection_finish(session):
+    """What is there before the first test stays: collections look at what tests have made, not at every module and
+    item each time (0.3 s for each of a hundred and more).
+    """
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -20,8 +32,15 @@ def _variant_of_module(request):
     _activate(request.module)
 
 
+@pytest.fixture(scope="module")
+def _no_earlier_modules():
+    """Before the fixtures of a module are made: what is alive now belongs to no test."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture
-def no_leftovers():
+def no_leftovers(_no_earlier_modules):
     """Kernels are those of the test's own objects: a method call is compiled for all that are alive, and what an
     earlier test left to the collector would be freed between two renders.
     """

@@ -7,6 +7,7 @@ import pytest
 import torchtransient.plugins.around_corner.late_light as late_light
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.late_light_runs import agree, chains, density_of, rendered, scan_scene
+from support.marks import long_pairs
 from support.third_bounce_runs import film_of, table_of, wall_of
 from torchtransient.errors import SceneError, UnitError
 
@@ -35,8 +36,13 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-@pytest.mark.parametrize("name", SCENES)
+QUICK = {
+    ("V and plate", "confocal"), ("V and plate", "exhaustive"), ("two-sided", "single"),
+    ("body before a wall", "confocal"), ("body before a wall", "single"), ("interpolated normals", "exhaustive"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "kind"), long_pairs(SCENES, ["confocal", "single", "exhaustive"], QUICK))
 def test_chains_bring_what_paths_do(name, kind):
     size = (2, 1) if kind == "exhaustive" else (3, 2)
     given = {"min_bounces": 4, "max_depth": 6, "kind": kind, "size": size}

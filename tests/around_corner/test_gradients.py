@@ -2,88 +2,38 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_pairs
+from support.moved_captures import MovedCapture, move, turn
 from support.nlos_scenes import film, plane, scan_scene, side
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.usefixtures("no_leftovers")
 
 
-def move(*v):
-    return lambda start, θ: mi.Transform4f().translate(mi.Vector3f(*v) * θ) @ mi.Transform4f(start)
-
-
-def turn(start, θ):
-    """About the vertical through the middle of the plate."""
-    there = mi.Transform4f().translate([0.1, 0.05, 1.0]).rotate([0, 1, 0], mi.Float(np.degrees(1.0)) * θ)
-    return there.translate([-0.1, -0.05, -1.0]) @ mi.Transform4f(start)
-
-
 def add(start, θ):
     return start + θ
 
 
-def along_x(start, θ):
-    return start + mi.Vector3f(1, 0, 0) * θ
-
-
-class Capture:
-    """A scene, one of its parameters and a loss that is linear in the capture."""
-
-    def __init__(self, description, key, change):
-        self.scene = mi.load_dict(description)
-        self.parameters, self.key, self.change = mi.traverse(self.scene), key, change
-        self.start = type(self.parameters[key])(self.parameters[key])
-        film = self.scene.sensors()[0].film()
-        shape = tuple(film.cube_shape())
-        rng = np.random.default_rng(5)
-        t = 1.0 + 0.05 * np.arange(shape[-2])
-        weights = (1 + np.sin(3 * t))[:, None] * (1 + 0.3 * rng.normal(size=(*shape[:-2], 1, shape[-1])))
-        self.adjoint = mi.TensorXf(weights.astype(np.float32))
-
-    def install(self, θ):
-        self.parameters[self.key] = self.change(self.start, θ)
-        self.parameters.update()
-
-    def loss(self, θ, seed, spp):
-        self.install(mi.Float(θ))
-        with dr.suspend_grad():
-            _, cube = self.scene.integrator().render(self.scene, seed=seed, spp=spp)
-        return float((np.array(cube, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
-
-    def reverse(self, seed, spp):
-        θ = mi.Float(0)
-        dr.enable_grad(θ)
-        self.install(θ)
-        self.scene.integrator().render_backward(self.scene, self.parameters, (None, self.adjoint), seed=seed, spp=spp)
-        return float(dr.grad(θ)[0])
-
-    def forward(self, seed, spp):
-        θ = mi.Float(0)
-        dr.enable_grad(θ)
-        self.install(θ)
-        dr.set_grad(θ, 1.0)
-        _, cube = self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp)
-        return float((np.array(cube, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
-
-    def difference(self, h, seed, spp):
-        return (self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
+def capture_of(description, key, change):
+    """Of a loss that every case changes by more than the rounding of its differences."""
+    return MovedCapture(description, key, change, wave=lambda i: np.sin(3 + 0.15 * i))
 
 
 CASES = {
     "depth": ("a.to_world", lambda: move(0, 0, 1), 4e-3),
     "sideways": ("a.to_world", lambda: move(1, 0, 0), 4e-3),
-    "turns": ("a.to_world", lambda: turn, 8e-3),
+    "turns": ("a.to_world", lambda: turn((0.1, 0.05, 1.0)), 8e-3),
     "albedo": ("a.bsdf.reflectance.value", lambda: add, 0.02),
     "albedo of the wall": ("wall.bsdf.reflectance.value", lambda: add, 0.02),
     "the wall": ("wall.to_world", lambda: move(0, 0, 1), 4e-3),
     "energy": ("laser.energy.value", lambda: add, 0.02),
-    "sensor": ("wall.sensor.sensor_origin", lambda: along_x, 4e-3),
+    "sensor": ("wall.sensor.sensor_origin", lambda: move(1, 0, 0), 4e-3),
 }
+KINDS = ("confocal", "single", "exhaustive")
 SMOOTH = {"start": 1.0, "width": 0.05, "bins": 100, "temporal_filter": "tent"}
 
 
@@ -96,7 +46,7 @@ def plate(**changes):
 def test_shared_samples(case, kind):
     """Within 0.1 % of finite differences where nothing hides the body and its outline moves; modes agree."""
     key, change, h = CASES[case]
-    capture = Capture(scan_scene(plate(), kind, film(3, **SMOOTH)), key, change())
+    capture = capture_of(scan_scene(plate(), kind, film(3, **SMOOTH)), key, change())
     spp = 2**16
     reverse = capture.reverse(0, spp)
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4, abs=1e-7)
@@ -114,7 +64,7 @@ def test_shared_samples(case, kind):
 def test_pose_of_the_laser(kind):
     """It moves the spot of a single capture, and the first leg of any."""
     scene = scan_scene(plate(), kind, film(3, **SMOOTH), account_first_and_last_bounces=True)
-    capture = Capture(scene, "laser.to_world", move(1, 0, 0))
+    capture = capture_of(scene, "laser.to_world", move(1, 0, 0))
     spp = 2**14
     reverse = capture.reverse(0, spp)
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
@@ -127,7 +77,7 @@ def test_a_wall_moves_behind_points_that_are_given():
     scene = scan_scene(plate(), "single", film(2, **SMOOTH), third_bounce="paths")
     grid = np.float32([[x, y, 0] for y in (-0.2, 0.2) for x in (-0.2, 0.2)])
     scene["wall"]["sensor"] |= {"points": mi.TensorXf(grid)}
-    capture = Capture(scene, "wall.to_world", move(0, 0, 1))
+    capture = capture_of(scene, "wall.to_world", move(0, 0, 1))
     runs = [
         (capture.reverse(s, 2**14), capture.forward(s, 2**14), capture.difference(4e-3, s, 2**14)) for s in range(4)
     ]
@@ -138,13 +88,21 @@ def test_a_wall_moves_behind_points_that_are_given():
     assert error < 0.1 * abs(reverse.mean())
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-@pytest.mark.parametrize("case", ["depth", "sideways", "albedo", "albedo of the wall", "the wall"])
+QUICK_PATHS = {
+    ("depth", "confocal"), ("the wall", "confocal"), ("sideways", "single"), ("albedo of the wall", "single"),
+    ("depth", "exhaustive"), ("albedo", "exhaustive"), ("the wall", "exhaustive"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "kind"),
+    long_pairs([name for name in CASES if name in {case for case, _ in QUICK_PATHS}], KINDS, QUICK_PATHS),
+)
 def test_general_paths(case, kind):
     key, change, h = CASES[case]
     points = 2 if kind == "exhaustive" else 3
     scene = scan_scene(plate(), kind, film(points, kind=kind, **SMOOTH), third_bounce="paths")
-    capture = Capture(scene, key, change())
+    capture = capture_of(scene, key, change())
     seeds, spp = 16, 2**12
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
@@ -160,7 +118,7 @@ def test_late_light(key):
     """Light of four and five bounces, which a second plate sends to the first one."""
     change = add if key.endswith("value") else move(1, 0, 0)
     scene = scan_scene(plate() | {"b": side()}, "confocal", film(2, **SMOOTH), max_depth=5, min_bounces=4)
-    capture = Capture(scene, key, change)
+    capture = capture_of(scene, key, change)
     seeds, spp, h = 8, 2**15, 0.02 if key.endswith("value") else 3e-2
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     differences = np.array([capture.difference(h, 10 + seed, spp) for seed in range(seeds)])
@@ -170,8 +128,15 @@ def test_late_light(key):
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-@pytest.mark.parametrize("name", ["phasors", "gates", "gaussian", "no steady image"])
+QUICK_FILMS = {
+    ("phasors", "confocal"), ("gates", "single"), ("gaussian", "exhaustive"), ("no steady image", "confocal"),
+    ("phasors", "exhaustive"), ("gates", "exhaustive"), ("phasors", "single"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), long_pairs(["phasors", "gates", "gaussian", "no steady image"], KINDS, QUICK_FILMS)
+)
 def test_films(name, kind):
     """Every film and every type of capture has derivatives in both modes."""
     changes = {
@@ -182,7 +147,7 @@ def test_films(name, kind):
     }[name]
     points = 2 if kind == "exhaustive" else 3
     size = {k: v for k, v in film(points, kind=kind).items() if not k.startswith(("temporal", "bin", "start", "type"))}
-    capture = Capture(scan_scene(plate(), kind, changes | size), "a.to_world", move(0, 0, 1))
+    capture = capture_of(scan_scene(plate(), kind, changes | size), "a.to_world", move(0, 0, 1))
     seeds, spp = 4, 2**12
     reverse = np.array([capture.reverse(seed, spp) for seed in range(seeds)])
     assert capture.forward(0, spp) == pytest.approx(reverse[0], rel=1e-3)
@@ -199,7 +164,7 @@ def test_colours():
     coloured = plane(1.0, 0.6, 0.1, 0.05)
     coloured["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}
     scene = scan_scene({"a": coloured}, "single", film(2, **SMOOTH))
-    capture = Capture(scene, "a.bsdf.reflectance.value", lambda start, θ: start + mi.Color3f(0, θ, 0))
+    capture = capture_of(scene, "a.bsdf.reflectance.value", lambda start, θ: start + mi.Color3f(0, θ, 0))
     reverse, spp = capture.reverse(0, 2**12), 2**12
     assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
     assert reverse == pytest.approx(capture.difference(0.05, 0, spp), rel=1e-3)
@@ -207,6 +172,6 @@ def test_colours():
 
 def test_second_backward_and_batches():
     """Adjoints accumulate; nothing of one pass is left in the next."""
-    capture = Capture(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
+    capture = capture_of(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
     first, again = capture.reverse(1, 4096), capture.reverse(1, 4096)
     assert first == pytest.approx(again, rel=1e-5)  # threads add in the order they come

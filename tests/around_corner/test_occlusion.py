@@ -8,6 +8,7 @@ import pytest
 
 import torchtransient as tt
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh
+from support.marks import long
 from support.moved_captures import MovedCapture, move, noted, turn
 from support.nlos_scenes import film, plane, scan_scene, transform
 from torchtransient.errors import GradientError, TorchTransientWarning
@@ -31,11 +32,6 @@ def agree(capture, spp=2**12, seeds=6, spp_differences=2**16, seeds_differences=
     assert error < most_error * abs(found.mean())
     with noted():
         return capture.reverse(0, spp), found.mean(), error
-
-
-def long(values, quick):
-    """Parameters of a test, of which those that are not ``quick`` are run with the slow ones."""
-    return [pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values]
 
 
 def plates(**changes):
@@ -72,7 +68,7 @@ def test_a_plate_before_a_plate(case, kind):
 @pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
 def test_paths_have_the_same_term(kind):
     capture = capture_of(plates(), "front.to_world", move(1, 0, 0), kind, third_bounce="paths", max_depth=4)
-    agree(capture, 2**13, spp_differences=2**16, most_error=0.05)
+    agree(capture, 2**13, spp_differences=2**14, most_error=0.05)
 
 
 def test_light_that_is_not_of_three_bounces():
@@ -99,12 +95,13 @@ FILMS = {
 @pytest.mark.parametrize("name", long(FILMS, ["phasors", "gates"]))
 def test_films(name, kind):
     capture = capture_of(plates(), "front.to_world", move(1, 0, 0), kind, response=FILMS[name]())
-    agree(capture, 2**13, spp_differences=2**18, most_error=0.05)
+    # Of the flanks of gates differences are noisier than the derivative.
+    agree(capture, 2**13, spp_differences=2**17 if name == "gates" else 2**16, most_error=0.05)
 
 
 def test_the_steady_image():
     scene = scan_scene(plates(), "single", film(4, **SMOOTH))
-    agree(MovedCapture(scene, "front.to_world", move(1, 0, 0), steady=True), spp_differences=2**18)
+    agree(MovedCapture(scene, "front.to_world", move(1, 0, 0), steady=True), spp_differences=2**17)
 
 
 @pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))

@@ -11,9 +11,15 @@ from torchtransient.testing.statistics import pool_small_bins, standard_error, z
 RUNS = 12
 
 
-@pytest.fixture(autouse=True, params=["llvm_ad_rgb", "llvm_ad_mono"])
+@pytest.fixture(scope="module", params=["llvm_ad_rgb", "llvm_ad_mono"])
 def variant(request):
-    mi.set_variant(request.param)
+    """Of the module, so that all tests of a variant come one after the other."""
+    return request.param
+
+
+@pytest.fixture(autouse=True)
+def _active(variant):
+    mi.set_variant(variant)
     plugins.sync()
 
 
@@ -86,9 +92,8 @@ def test_furnace_bins(emitter_sampling):
     np.testing.assert_allclose(in_window[-1] + outside, steady[-1], rtol=1e-5)
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_furnace_in_spectral():
-    mi.set_variant("llvm_ad_spectral")
-    plugins.sync()
     description = scenes.furnace(1.0, 0.8, 2.0, **FURNACE)
     _, transient, _ = runs(description)
     expected = cf.furnace(edges_of(description), 1.0, 0.8, 2.0, max_bounces=47)

@@ -16,9 +16,15 @@ RUNS = 8
 BIN = 0.02
 
 
-@pytest.fixture(autouse=True, params=["llvm_ad_mono", "llvm_ad_rgb"])
+@pytest.fixture(scope="module", params=["llvm_ad_mono", "llvm_ad_rgb"])
 def variant(request):
-    mi.set_variant(request.param)
+    """Of the module, so that all tests of a variant come one after the other."""
+    return request.param
+
+
+@pytest.fixture(autouse=True)
+def _active(variant):
+    mi.set_variant(variant)
     plugins.sync()
 
 

@@ -22,11 +22,16 @@ ROUNDING = 2 * 16 * 1.2e-7
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
 
 
-@pytest.fixture(autouse=True, params=VARIANTS)
+@pytest.fixture(scope="module", params=VARIANTS)
 def variant(request):
-    mi.set_variant(request.param)
-    plugins.sync()
+    """Of the module, so that all tests of a variant come one after the other."""
     return request.param
+
+
+@pytest.fixture(autouse=True)
+def _active(variant):
+    mi.set_variant(variant)
+    plugins.sync()
 
 
 # What does not depend on the variant runs once.

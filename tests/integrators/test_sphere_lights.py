@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from support.runs import T, runs
-from torchtransient import plugins
+from support.surface_samples import start
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.testing.statistics import two_sample_z_test
 
@@ -17,9 +17,8 @@ RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
 
 
 @pytest.fixture(autouse=True)
-def _variant():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
+def _variant(request):
+    start(request, "llvm_ad_mono")
 
 
 def film(bins=400, width=0.02, start=2.0):
@@ -92,8 +91,6 @@ def test_lights_beside_it():
 @pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1])
 @pytest.mark.parametrize("variant", ["llvm_ad_mono_polarized", "llvm_ad_rgb", "llvm_ad_spectral"])
 def test_other_variants(variant, ratio):
-    mi.set_variant(variant)
-    plugins.sync()
     scene = over_a_plane(lamp(ratio))
     images = runs(scene, 8, 1 << 14)[0][:, 0, 0]
     intensity = images[:, 0] if "polarized" in variant else images.mean(-1)

@@ -17,6 +17,7 @@ from torchtransient.testing.gradient_sweep.lights import area_emitters
 from torchtransient.testing.gradient_sweep.shapes import lamp_shapes
 from torchtransient.testing.gradient_sweep.stages import lit_by, matte, move, stretch, turn
 
+VARIANT = "llvm_ad_rgb"
 REFLECTANCE = "plate.bsdf.reflectance.value"
 
 

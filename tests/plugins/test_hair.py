@@ -267,6 +267,7 @@ def test_values_and_derivatives_are_finite_at_the_ends(settings):
 
 
 def scene_with(description, bare=False):
+    activate(RGB)
     scene = room(bsdf=description, light=area_light())
     return mi.load_dict(scene, optimize=False) if bare else tt.load(scene, variant=RGB)
 
@@ -305,7 +306,6 @@ def test_its_absorption_is_built_with_it():
     ("sigma_a.value", {"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}),
 ])  # fmt: skip
 def test_derivatives_of_mitsubas_own_are_refused(key, description):
-    activate(RGB)
     scene = scene_with(description, bare=True)
     params = mi.traverse(scene)
     value = type(params[f"wall.bsdf.{key}"])(params[f"wall.bsdf.{key}"])

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
-from support.surface_samples import activate
+from support.surface_samples import activate, start
 from torchtransient.errors import GradientError
 
 CASES = [
@@ -24,8 +24,8 @@ VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_pol
 
 
 @pytest.fixture(autouse=True)
-def mono():
-    activate("llvm_ad_mono")
+def mono(request):
+    start(request, "llvm_ad_mono")
 
 
 def directions(count):
@@ -36,8 +36,8 @@ def directions(count):
     return si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("settings", CASES, ids=str)
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_values_densities_and_samples_are_those_of_mitsuba(settings, variant):
     activate(variant)
     theirs, ours = (
@@ -70,10 +70,10 @@ def black(name):
     return {name: {"type": "uniform", "value": 0.0}}
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(
     "settings", [{"alpha": 0.3}, {"alpha_u": 0.1, "alpha_v": 0.4, "specular_reflectance": 0.3}], ids=str
 )
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_polarized_plastic_is_that_of_mitsuba(settings, variant):
     activate(variant)
     settings = {"diffuse_reflectance": 0.6, "int_ior": 1.4, "distribution": "ggx", **settings}
@@ -95,7 +95,7 @@ def test_a_black_lobe_has_its_slope(kind, lobe):
     key = f"wall.bsdf.{lobe}.value"
     info = scene.parameters()[key]
     assert info.differentiable and not info.biased and "diff_" in info.reason and info.shape == ()
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16384)
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=4096)
 
     def brightness(x, seed):
         return renderer(values={key: torch.tensor(float(x))}, seed=seed).steady.double().sum()

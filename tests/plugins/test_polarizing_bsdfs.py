@@ -55,8 +55,8 @@ def test_metal_equals_mitsubas(variant):
             np.testing.assert_allclose(got, expected, atol=5e-6)
 
 
-@pytest.mark.parametrize("variant", [MONO, SPECTRAL, "llvm_ad_mono"])
 @pytest.mark.parametrize("name", ["polarizer", "retarder", "circular"])
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL, "llvm_ad_mono"])
 def test_thin_element_equals_mitsubas(variant, name):
     activate(variant)
     settings = {

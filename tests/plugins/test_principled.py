@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, camera, glass_slab, room
-from torchtransient import plugins
+from support.surface_samples import start
 from torchtransient.errors import GradientError
 
 TWINS = {"principled": "diff_principled", "principledthin": "diff_principled_thin"}
@@ -45,9 +45,8 @@ ENDS = [
 
 
 @pytest.fixture(autouse=True)
-def mono():
-    mi.set_variant("llvm_ad_mono")
-    plugins.sync()
+def mono(request):
+    start(request, "llvm_ad_mono")
 
 
 def interactions(count):
@@ -57,11 +56,9 @@ def interactions(count):
     return si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 @pytest.mark.parametrize(("kind", "settings"), SETTINGS)
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 def test_values_densities_and_samples_are_those_of_mitsuba(kind, settings, variant):
-    mi.set_variant(variant)
-    plugins.sync()
     theirs, ours = (mi.load_dict({"type": name, **settings}) for name in (kind, TWINS[kind]))
     assert [theirs.flags(i) for i in range(theirs.component_count())] == [
         ours.flags(i) for i in range(ours.component_count())

@@ -61,12 +61,13 @@ def test_variant_context_there_and_back():
     assert isinstance(build("transient_path"), mi.Integrator)
 
 
-@pytest.mark.parametrize("name", [name for _, name in OWN])
-def test_scalar_variants_register_and_refuse(name):
+def test_scalar_variants_register_and_refuse():
     with mi.variant_context("scalar_rgb"):
         assert plugins.sync() == "scalar_rgb"
-        with pytest.raises(VariantError, match=f"'{name}'.*llvm_ad.*scalar_rgb"):
-            build(name)
+        assert len(OWN) > 20
+        for _, name in OWN:
+            with pytest.raises(VariantError, match=f"'{name}'.*llvm_ad.*scalar_rgb"):
+                build(name)
 
 
 def test_refusal_reaches_those_who_load_with_mitsuba_alone():

@@ -56,7 +56,7 @@ def test_values_densities_and_samples_are_those_of_mitsuba(settings):
 
 @pytest.mark.parametrize("ggx", [True, False])
 @pytest.mark.parametrize("table", [external_transmittance, internal_reflectance])
-@pytest.mark.parametrize(("alpha", "eta"), [(0.1, 1.5), (0.3, 1.3), (0.6, 1.9)])
+@pytest.mark.parametrize(("alpha", "eta"), [(0.1, 1.5), pytest.param(0.3, 1.3, marks=pytest.mark.slow), (0.6, 1.9)])
 def test_derivatives_of_the_tables(monkeypatch, table, ggx, alpha, eta):
     """Against differences of the fourth order on a quadrature that is fine enough for them."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import pytest
 import torch
 
@@ -31,6 +32,7 @@ def room(bands=False, late=None):
 
 
 def render(node, variant, **settings):
+    mi.set_variant(variant)  # or every render switches there and back
     return tt.render(tt.load(node, variant=variant), seed=2, spp=64, **settings)
 
 

@@ -10,6 +10,7 @@ import torchtransient as tt
 from torchtransient.cli.main import main
 from torchtransient.data.result_file import read_result
 
+VARIANT = "llvm_ad_mono"
 SCENE = """<scene version="3.0.0">
     <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
     <sensor type="perspective">

@@ -6,6 +6,7 @@ import copy
 import pickle
 import warnings
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -147,6 +148,7 @@ def test_what_may_be_larger_than_one_is_left_alone(room):
 
 
 def test_coefficients_of_spectra_are_no_shares(room):
+    mi.set_variant("llvm_ad_spectral")
     scene = tt.load(room, variant="llvm_ad_spectral")
     assert said(tt.TransientRenderer, scene, parameters=[COLOUR], spp=1)[1] == []
     renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=1)

@@ -2,6 +2,7 @@
 
 import json
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -383,6 +384,7 @@ def operations(renderer) -> list[int]:
 
 def test_a_planned_render_runs_the_plain_integrator_s_kernels():
     """Nothing is added to a scene without effects, not even by the integrator for media. What is there is added."""
+    mi.set_variant("llvm_ad_rgb")
     scene = tt.load(tt.scenes.cornell_box(8), variant="llvm_ad_rgb")
     settings = {"max_depth": 7, "time_axis": "scene", "pilot": False}
     plain = operations(tt.TransientRenderer(scene, max_depth=7))

@@ -101,6 +101,7 @@ UNREADABLE = {
 @pytest.mark.parametrize("name", UNREADABLE)
 def test_textures_of_other_channels(name):
     make, kind, words = UNREADABLE[name]
+    mi.set_variant(f"llvm_ad_{kind}")
     with pytest.raises(SceneError, match=words):
         tt.render(tt.load(make(), variant=f"llvm_ad_{kind}"), spp=1, seed=0)
     # Nothing of it is left to be traced with other scenes.

@@ -73,7 +73,8 @@ def test_mitsuba_loads_every_entry(name):
 
 def test_scenes_need_no_variant():
     code = (
-        "import torchtransient.scenes as s, mitsuba as mi; s.cornell_box(); raise SystemExit(mi.variant() is not None)"
+        "import torchtransient.scenes as s, mitsuba as mi; s.cornell_box(); s.nlos_room(); "
+        "raise SystemExit(mi.variant() is not None)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

@@ -131,7 +131,7 @@ def test_learnable_dead_time_is_found():
     assert float(spad.dead_time_s.detach()) == pytest.approx(40e-10, rel=0.01)
 
 
-@pytest.mark.parametrize("dead", [10.5, 25.2, 80.5])
+@pytest.mark.parametrize("dead", [10.5, pytest.param(25.2, marks=pytest.mark.slow), 80.5])
 def test_samples(dead):
     rate, cycles, repeats = as_image(pulse(2.0)), 300, 3000
     spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10, grad="straight_through")

@@ -83,8 +83,8 @@ def both_modes(scene, scale=1.0, spp=64):
     return np.concatenate([np.zeros(1), *reverse]), forward
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", list(DARK))
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_dark_scenes(name, variant):
     """Guards against 0 / 0 in weights of paths that carry nothing, and against null pointers to shapes and emitters."""
     mi.set_variant(variant)

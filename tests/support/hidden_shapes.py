@@ -5,15 +5,9 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-
-def plate(width, height, center, cells=1):
-    """A rectangle that faces the wall: vertices ``(V, 3)`` and faces ``(F, 3)``."""
-    x, y = np.linspace(-width / 2, width / 2, cells + 1), np.linspace(-height / 2, height / 2, cells + 1)
-    X, Y = np.meshgrid(x, y)
-    v = np.stack([X, Y, 0 * X], -1).reshape(-1, 3) + center
-    i = np.arange(cells * (cells + 1)).reshape(cells, cells + 1)[:, :cells].ravel()
-    low, high = np.stack([i, i + cells + 1, i + 1], 1), np.stack([i + 1, i + cells + 1, i + cells + 2], 1)
-    return v, np.concatenate([low, high])
+from torchtransient.scenes.meshes import joined as join
+from torchtransient.scenes.meshes import octahedral_ellipsoid as ball
+from torchtransient.scenes.meshes import plate as plate
 
 
 def disc(radius, z, corners=720):
@@ -23,28 +17,6 @@ def disc(radius, z, corners=720):
     v = np.concatenate([[[0, 0, z]], np.stack([outer * np.cos(a), outer * np.sin(a), 0 * a + z], 1)])
     k = np.arange(corners)
     return v, np.stack([0 * k, 1 + (k + 1) % corners, 1 + k], 1)
-
-
-def ball(center, radii, level=2):
-    """An ellipsoid of triangles, made of an octahedron."""
-    v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-    f = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    for _ in range(level):
-        edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-        unique, place = np.unique(edges, axis=0, return_inverse=True)
-        a, b, c = len(v) + place.reshape(3, -1)
-        v = np.concatenate([v, v[unique].mean(1)])
-        f = np.concatenate([np.stack(t, 1) for t in ((f[:, 0], a, c), (f[:, 1], b, a), (f[:, 2], c, b), (a, b, c))])
-    return v / np.linalg.norm(v, axis=1, keepdims=True) * radii + center, f
-
-
-def join(*meshes):
-    vertices, faces, first = [], [], 0
-    for v, f in meshes:
-        vertices.append(v)
-        faces.append(f + first)
-        first += len(v)
-    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def mannequin(level=2, z=1.2):

@@ -40,10 +40,10 @@ def turn(center):
 
 class MovedCapture:
     """A scene, the parameters that ``change(start, θ)`` moves, and a loss that is linear in the capture, or in its
-    steady image (``steady``).
+    steady image (``steady``). ``wave(i)`` is how much the weight of bin i differs from one.
     """
 
-    def __init__(self, description, keys, change, steady=False):
+    def __init__(self, description, keys, change, steady=False, wave=lambda i: np.sin(i / 7)):
         self.scene = mi.load_dict(description, optimize=False)
         self.parameters, self.change = mi.traverse(self.scene), change
         keys = [keys] if isinstance(keys, str) else keys
@@ -53,7 +53,7 @@ class MovedCapture:
         rng = np.random.default_rng(5)
         weights = 1 + 0.3 * rng.normal(size=shape[:2])
         if not steady:
-            bins = 1 + np.sin(np.arange(shape[-2]) / 7)
+            bins = 1 + wave(np.arange(shape[-2]))
             weights = weights.reshape(*shape[:2], *[1] * (len(shape) - 3)) * bins
         weights = weights[..., None] * (1 + 0.5 * np.arange(shape[-1]))
         self.adjoint = mi.TensorXf(np.broadcast_to(weights, shape if not steady else weights.shape).astype(np.float32))

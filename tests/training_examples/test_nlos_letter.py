@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+VARIANT = "llvm_ad_mono"  # that of the example
 SCRIPT = Path(__file__).parents[2] / "training_examples" / "nlos_letter.py"
 
 

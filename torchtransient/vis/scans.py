@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.vis.arrival import peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
-from torchtransient.vis.video import Frames, frames
+from torchtransient.vis.video import Frames, FrameSettings, frames
 from torchtransient.vis.video_file import check_video, write_video
 
 STYLES = ("curves", "image")
@@ -72,25 +72,15 @@ def transients_grid(
 
 
 def wall_frames(
-    capture: Capture,
-    *,
-    laser: int | tuple[int, ...] | None = None,
-    exposure: float | None = None,
-    curve: str = "srgb",
-    accumulate: bool = False,
-    stamp: bool = True,
-    scale: int | None = None,
-    every: int = 1,
+    capture: Capture, *, laser: int | tuple[int, ...] | None = None, **settings: Unpack[FrameSettings]
 ) -> Frames:
     """The wall as the light arrives on it, a bin a frame: `frames` of the sensor grid, y up.
 
-    `laser` as in `transients_grid`; the other arguments as in `frames`. Raises ShapeError for captures without a grid
-    of sensor points.
+    `laser` as in `transients_grid`; `settings` (exposure, curve, accumulate, stamp, scale, every) are those of
+    `frames`. Raises ShapeError for captures without a grid of sensor points.
     """
     cube, axis = _grid(capture, laser, "wall_frames")
-    return frames(
-        cube, axis=axis, exposure=exposure, curve=curve, accumulate=accumulate, stamp=stamp, scale=scale, every=every
-    )
+    return frames(cube, axis=axis, **settings)
 
 
 def wall_video(

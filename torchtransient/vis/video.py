@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -19,6 +20,17 @@ from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone
 from torchtransient.vis.video_file import check_video, write_video
 
 _VISIBLE = 320  # pixels: smaller pictures are enlarged to about this, else a player shows a stamp
+
+
+class FrameSettings(TypedDict, total=False):
+    """What `frames` is told besides what it shows; its own defaults hold for what is left out."""
+
+    exposure: float | None
+    curve: str
+    accumulate: bool
+    stamp: bool
+    scale: int | None
+    every: int
 
 
 @dataclass(frozen=True)
@@ -87,22 +99,16 @@ def video(
     fps: float = 25.0,
     progress: bool = False,
     axis: TimeAxis | None = None,
-    exposure: float | None = None,
-    curve: str = "srgb",
-    accumulate: bool = False,
-    stamp: bool = True,
-    scale: int | None = None,
-    every: int = 1,
+    **settings: Unpack[FrameSettings],
 ) -> Path:
     """Write the `frames` of a transient as `.mp4` or `.gif`; returns the path.
 
-    `progress` shows a bar. Other arguments as in `frames`. Raises StorageError for another ending, a folder that is
+    `progress` shows a bar. `axis` and `settings` (exposure, curve, accumulate, stamp, scale, every) are those of
+    `frames`. Raises StorageError for another ending, a folder that is
     missing, or a missing package (`pip install 'torchtransient[vis]'`), before any frame is made.
     """
     check_video(path)
-    shown = frames(
-        source, axis=axis, exposure=exposure, curve=curve, accumulate=accumulate, stamp=stamp, scale=scale, every=every
-    )
+    shown = frames(source, axis=axis, **settings)
     return write_video(path, shown, len(shown), fps=fps, progress=progress)
 
 

@@ -213,7 +213,7 @@ CASES = [
         0.0,
         2e-2,
         spp=4096,
-        fd_spp=65536,
+        fd_spp=16384,
     ),
     Case(
         "pattern_and_light_move",
@@ -243,7 +243,7 @@ CASES = [
         along("light.vertex_positions", GROWS),
         0.0,
         1e-2,
-        spp=4096,
+        spp=2048,
     ),
     Case(
         "bare_light_with_a_cone_grows",

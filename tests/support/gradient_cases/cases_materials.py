@@ -156,7 +156,7 @@ CASES = [
         0.2,
         side=1,
         spp=16384,
-        fd_spp=65536,
+        fd_spp=16384,
     ),
     Case(
         "black_base_of_a_plastic",
@@ -186,7 +186,7 @@ CASES = [
         set_color("slab.bsdf.eta"),
         1.4,
         4e-3,
-        spp=16384,
+        spp=4096,
     ),
     # Of very rough glass, a tenth of the samples leads to the wrong side of the surface and is thrown away.
     Case(
@@ -198,7 +198,7 @@ CASES = [
         set_color("slab.bsdf.specular_transmittance.value"),
         0.7,
         0.02,
-        spp=8192,
+        spp=2048,
     ),
     Case(
         "principled_thin_colour",
@@ -207,7 +207,7 @@ CASES = [
         set_color("slab.bsdf.base_color.value"),
         0.8,
         0.02,
-        spp=16384,
+        spp=4096,
     ),
     Case(
         "principled_roughness",

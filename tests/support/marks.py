@@ -1,0 +1,21 @@
+"""Which rows of a table of tests are in the default set."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+
+def long(values, quick):
+    """Parameters of a test, of which those that are not ``quick`` are run with the slow ones."""
+    return [pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values]
+
+
+def long_pairs(first, second, quick):
+    """Likewise every pair of two values; every value is in one that is ``quick``."""
+    first, second = list(first), list(second)
+    if {a for a, _ in quick} != set(first) or {b for _, b in quick} != set(second):
+        raise ValueError(f"long_pairs: expected all of {first} and of {second} to be in quick pairs, got {quick}.")
+    pairs = itertools.product(first, second)
+    return [pytest.param(*pair, marks=[] if pair in quick else [pytest.mark.slow]) for pair in pairs]
