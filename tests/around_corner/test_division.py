@@ -1,4 +1,4 @@
-"""Which light is found how, in scans that are not those of one flat wall, and in scenes where surfaces all but touch."""
+"""Which light is found how, in scans that are not of one flat wall, and where surfaces all but touch."""
 
 from __future__ import annotations
 
