@@ -100,7 +100,7 @@ class NLOSCaptureMeter(mi.Sensor):
         if self._grid is None:
             x, y = ((np.arange(int(n)) + 0.5) / int(n) for n in size)
             self._grid = PlacesOnMesh(shape, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
-        return self._grid.points(pixel)
+        return self._grid.points(shape, pixel)
 
     def _surface(self) -> Any:
         """The shape, whose texture coordinates say where points of it are."""
@@ -137,7 +137,7 @@ class NLOSCaptureMeter(mi.Sensor):
             return shape.sample_position(0.0, mi.Point2f(*place)).p
         if self._looked_at is None:
             self._looked_at = PlacesOnMesh(shape, np.array([place]))
-        return self._looked_at.points(mi.UInt32(0))
+        return self._looked_at.points(shape, mi.UInt32(0))
 
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         film = self.film()

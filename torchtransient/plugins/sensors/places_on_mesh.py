@@ -17,11 +17,11 @@ class PlacesOnMesh:
     points when the mesh moves. Where coordinates are used twice, the first triangle counts.
 
     Mitsuba's own ``eval_parameterization`` builds a scene for it, which must not happen while a kernel is traced, and
-    forgets vertices that have moved. Raises SceneError where the mesh has no point.
+    forgets vertices that have moved. The mesh is not kept: the sensor that keeps these places is a child of it, and
+    neither would ever be freed. Raises SceneError where the mesh has no point.
     """
 
     def __init__(self, mesh: Any, places: np.ndarray) -> None:
-        self._mesh = mesh
         shown = mi.traverse(mesh)
         faces = np.array(shown["faces"]).reshape(-1, 3)
         corners = np.zeros((len(faces), 3, 3))
@@ -42,9 +42,9 @@ class PlacesOnMesh:
         self._along = [mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in along.T]
         dr.make_opaque(self._triangle, self._along)
 
-    def points(self, index: Any) -> Any:
-        """The points (Point3f) of places given by their index, attached where the mesh's vertices are."""
-        face = self._mesh.face_indices(dr.gather(mi.UInt32, self._triangle, index))
-        a, b, c = (mi.Point3f(self._mesh.vertex_position(corner)) for corner in face)
+    def points(self, mesh: Any, index: Any) -> Any:
+        """The points (Point3f) of places given by their index, attached where the vertices of ``mesh`` are."""
+        face = mesh.face_indices(dr.gather(mi.UInt32, self._triangle, index))
+        a, b, c = (mi.Point3f(mesh.vertex_position(corner)) for corner in face)
         first, second = (dr.gather(mi.Float, column, index) for column in self._along)
         return a + (b - a) * first + (c - a) * second
