@@ -4,6 +4,7 @@ Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitra
 the named library, so that each side of a comparison runs in its own environment. Requests:
   {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
   {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
+  {"do": "save", "name", "spp", "seed", "file"}   render, and write the transient as .npy -> {"seconds", "mean"}
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
   {"do": "first", "what": "render" or "backward", "name", "spp", "seed"}   with its kernels -> {"seconds", "kernels"}
   {"do": "memory"}                                                                     -> {"peak_bytes"}
@@ -69,7 +70,7 @@ class Job:
             self.initial[key] = type(value)(value)
         dr.eval(self.initial)
 
-    def render(self, spp, seed):
+    def render(self, spp, seed, file=None):
         """Seconds of one render, everything evaluated; the mean of the result as a check."""
         begin = time.perf_counter()
         images = self.integrator.render(self.scene, sensor=0, seed=seed, spp=spp)
@@ -77,6 +78,8 @@ class Job:
         dr.sync_thread()
         seconds = time.perf_counter() - begin
         image = images[0] if isinstance(images, tuple) else images
+        if file is not None:
+            np.save(file, np.array(images[1]))
         return {"seconds": seconds, "mean": float(np.array(image, dtype=np.float64).mean())}
 
     def backward(self, spp, seed):
@@ -153,6 +156,8 @@ def answer_to(request, jobs):
             return {"ok": True}
         case "render":
             return jobs[request["name"]].render(request["spp"], request["seed"])
+        case "save":
+            return jobs[request["name"]].render(request["spp"], request["seed"], request["file"])
         case "backward":
             return jobs[request["name"]].backward(request["spp"], request["seed"])
         case "first":

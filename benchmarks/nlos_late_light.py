@@ -13,10 +13,11 @@ import time
 from typing import Any
 
 from _runner import arguments, environment, interleave, report, summary
-from nlos_rates import ALBEDO, WALL_ALBEDO, body, join, mesh, plate
+from nlos_rates import ALBEDO, WALL_ALBEDO, body, mesh
 
 import torchtransient  # noqa: F401  before Mitsuba: finds LLVM
 from torchtransient import plugins
+from torchtransient.scenes.meshes import joined, plate
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -31,7 +32,7 @@ def folded_plates() -> tuple[np.ndarray, np.ndarray]:
     v, f = plate(1, 1, (0.5, 0, 0))
     left = np.stack([-0.5 + 0.5 * v[:, 0], v[:, 1], 1 + 0.5 * v[:, 0]], 1)
     right = np.stack([0.5 * v[:, 0], v[:, 1], 1.5 - 0.5 * v[:, 0]], 1)
-    return join((left, f), (right, f), plate(0.25, 0.25, (0.3, 0.2, 0.9)))
+    return joined((left, f), (right, f), plate(0.25, 0.25, (0.3, 0.2, 0.9)))
 
 
 def scene(arrays: tuple[np.ndarray, np.ndarray], scan: int, way: str) -> Any:

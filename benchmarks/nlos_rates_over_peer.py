@@ -2,7 +2,9 @@
 
 Letter Z, a plane and a body of 3 072 triangles before a wall of one metre, confocal and single scans, 512 bins, the
 laser as a projector, which the peer has. A path is a sample of a scan point in all of them. Bars: general paths twice
-as fast as the peer, shared samples 10 times. mitransient 1.3.1 runs in the environment of `--peer-python`, or of the
+as fast as the peer, shared samples 10 times. Exhaustive captures of the letter: a path is a sample of a pair of
+positions; 8 times, and 12 times where a beam falls on the scanned points themselves, so that pairs are worth two.
+mitransient 1.3.1 runs in the environment of `--peer-python`, or of the
 variable TORCHTRANSIENT_PEER_PYTHON; without it our own rows are timed alone.
 """
 
@@ -62,30 +64,41 @@ def scene(mesh_file: str, scan: int, kind: str, **integrator: object) -> dict:
     }  # fmt: skip
 
 
+def exhaustive(mesh_file: str, scan: int, **integrator: object) -> dict:
+    """The same for every pair of positions."""
+    description = scene(mesh_file, scan, "exhaustive", **integrator)
+    film = description["wall"]["sensor"]["film"]
+    film |= {"exhaustive_scan": True, "laser_scan_width": scan, "laser_scan_height": scan}
+    return description
+
+
 def main() -> None:
     parser = comparison_arguments(__doc__)
     parser.set_defaults(variant="llvm_ad_mono", peer_python=os.environ.get("TORCHTRANSIENT_PEER_PYTHON"))
     options = parser.parse_args()
-    scan, spp = (4, 16) if options.quick else (32, 4096)
+    scan, pairs, spp = (4, 2, 16) if options.quick else (32, 10, 4096)
     hidden = {"Z": letter(), "plane": plate(1, 1, (0, 0, 1)), "body": body(1 if options.quick else 3)}
     comparison = Comparison(options, spp)
     with tempfile.TemporaryDirectory() as folder:
         files = {name: write_ply(Path(folder) / f"{name}.ply", arrays) for name, arrays in hidden.items()}
         cases = [(f"{name}, {kind}", file, kind) for name, file in files.items() for kind in KINDS]
         ways = {"paths": "paths", "shared": "auto"}
-        comparison.add(
-            OURS,
-            [
-                Row(f"{name}, {way}", scene(file, scan, kind, third_bounce=choice))
-                for name, file, kind in cases
-                for way, choice in ways.items()
-            ],
-        )
-        comparison.add(PEER, [Row(name, scene(file, scan, kind)) for name, file, kind in cases])
+        of_pairs = exhaustive(files["Z"], pairs)
+        beam = {**of_pairs, "laser": {"type": "laser_beam", "to_world": of_pairs["laser"]["to_world"]}}
+        ours = [
+            Row(f"{name}, {way}", scene(file, scan, kind, third_bounce=choice))
+            for name, file, kind in cases
+            for way, choice in ways.items()
+        ]
+        comparison.add(OURS, [*ours, Row("Z, exhaustive", of_pairs), Row("Z, exhaustive, reciprocal", beam)])
+        peers = [Row(name, scene(file, scan, kind)) for name, file, kind in cases]
+        comparison.add(PEER, [*peers, Row("Z, exhaustive", of_pairs)])
         for name, _, _ in cases:
             comparison.add_ratio(f"{OURS}: {name}, paths", f"{PEER}: {name}", 0.5)
             comparison.add_ratio(f"{OURS}: {name}, shared", f"{PEER}: {name}", 0.1)
-        comparison.run("nlos_rates_over_peer", {"scan": scan, "spp": spp, "bins": BINS}, options.json)
+        comparison.add_ratio(f"{OURS}: Z, exhaustive", f"{PEER}: Z, exhaustive", 1 / 8)
+        comparison.add_ratio(f"{OURS}: Z, exhaustive, reciprocal", f"{PEER}: Z, exhaustive", 1 / 12)
+        comparison.run("nlos_rates_over_peer", {"scan": scan, "pairs": pairs**4, "spp": spp, "bins": BINS}, options.json)
 
 
 if __name__ == "__main__":
