@@ -1,4 +1,4 @@
-"""Time to the noise of mitransient's NLOS captures: what it takes for single bins, and what shared samples take for them.
+"""Time to the noise that mitransient's NLOS captures have in single bins: its own, and that of shared samples.
 
 Letter Z, a plane and a body of 3 072 triangles before a wall of one metre, confocal and single scans. Noise is the
 standard deviation between renders of other seeds, as root mean square over all bins and relative to that of the

@@ -96,8 +96,8 @@ def main() -> None:
         for name, _, _ in cases:
             comparison.add_ratio(f"{OURS}: {name}, paths", f"{PEER}: {name}", 0.5)
             comparison.add_ratio(f"{OURS}: {name}, shared", f"{PEER}: {name}", 0.1)
-        comparison.add_ratio(f"{OURS}: Z, exhaustive", f"{PEER}: Z, exhaustive", 1 / 8)
-        comparison.add_ratio(f"{OURS}: Z, exhaustive, reciprocal", f"{PEER}: Z, exhaustive", 1 / 12)
+        for row, bar in {"Z, exhaustive": 1 / 8, "Z, exhaustive, reciprocal": 1 / 12}.items():
+            comparison.add_ratio(f"{OURS}: {row}", f"{PEER}: Z, exhaustive", bar)
         comparison.run("nlos_rates_over_peer", {"scan": scan, "pairs": pairs**4, "spp": spp, "bins": BINS}, options.json)
 
 

@@ -144,3 +144,19 @@ def test_films_and_spots_are_checked():
         runs.exhaustive(wall_of(points, normals))
     with pytest.raises(SceneError, match="exhaustive"):
         captured(runs.pairs, lambda: runs.job(runs.pairs).add_confocal())
+
+
+def test_light_is_added_to_what_the_film_holds():
+    runs = Runs(SCENES["V and plate"]())
+
+    def twice():
+        for _ in range(2):
+            exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors)
+
+    steady, cube = runs.exhaustive()
+    both_steady, both = captured(runs.pairs, twice)
+    np.testing.assert_allclose(both_steady, 2 * steady, rtol=1e-5)
+    np.testing.assert_allclose(both.reshape(cube.shape), 2 * cube, rtol=1e-5, atol=1e-7 * cube.max())
+    with pytest.raises(SceneError, match="without light in it"):
+        captured(runs.pairs, lambda: [exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors, True), twice(),
+                                      exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors, True)])  # fmt: skip

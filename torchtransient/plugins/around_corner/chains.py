@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import SceneError
 from torchtransient.plugins.around_corner.geometry import OFFSET, occluded
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 from torchtransient.plugins.sampling.shared_samples import samples_at
@@ -197,6 +198,9 @@ class VertexTable:
 def _gather(array: Any, index: Any) -> Any:
     return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0))
 
+# Numbers of chains stand in rows of single precision, which counts so far.
+MOST_CHAINS = 2**24
+
 
 class Links:
     """The connections of all heads and tails of groups that carry light, group by group: rows of ``[weight, r, head,
@@ -207,6 +211,11 @@ class Links:
 
     def __init__(self, scene: Any, plan: ChainPlan, heads: VertexTable, starts: VertexTable, area_density: Any) -> None:
         n = plan.size
+        if dr.width(heads.p) > MOST_CHAINS:
+            raise SceneError(
+                f"late light: expected at most 2^24 chains at a time, got {dr.width(heads.p)}: too many tiles of "
+                "scanned points. Scan fewer points at a time, or set late_light to paths."
+            )
         lane = dr.arange(mi.UInt32, dr.width(heads.p) * n)
         tail, head = _ends(lane, n)
         x, v = heads.take(head), starts.take(tail)

@@ -31,7 +31,7 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
 
     ``reciprocal``: use that light goes either way, so that half of the pairs need no work. None: where that is exact
     to the last digit, which it is where ``lasers`` and scan points are one object (legs too), normals are not
-    interpolated and the film is stored in one band. Raises SceneError, ShapeError.
+    interpolated, and the film is stored in one band and holds no light yet. Raises SceneError, ShapeError.
     """
     film = job.film
     job.check_region(lasers)
@@ -56,10 +56,12 @@ def add_exhaustive(job: ThirdBounce, lasers: WallPoints, reciprocal: bool | None
             f"{lasers.width}."
         )
     possible = lasers is job.sensors and not job.samples.smooth and len(film.band_layout()) == 1
+    # Pairs in descending order are copies, which would take the place of what is there.
+    possible = possible and not bool(dr.any(film.steady != 0))
     if reciprocal and not possible:
         raise SceneError(
             "add_exhaustive: reciprocity needs the scan points themselves as laser spots, normals that are not "
-            "interpolated, and a film of less than 2^32 values; leave reciprocal out."
+            "interpolated, and a film of less than 2^32 values without light in it; leave reciprocal out."
         )
     mirrored = possible if reciprocal is None else reciprocal
     points = job.sensors.width + (0 if lasers is job.sensors else lasers.width)
