@@ -98,7 +98,8 @@ def main() -> None:
             comparison.add_ratio(f"{OURS}: {name}, shared", f"{PEER}: {name}", 0.1)
         for row, bar in {"Z, exhaustive": 1 / 8, "Z, exhaustive, reciprocal": 1 / 12}.items():
             comparison.add_ratio(f"{OURS}: {row}", f"{PEER}: Z, exhaustive", bar)
-        comparison.run("nlos_rates_over_peer", {"scan": scan, "pairs": pairs**4, "spp": spp, "bins": BINS}, options.json)
+        settings = {"scan": scan, "pairs": pairs**4, "spp": spp, "bins": BINS}
+        comparison.run("nlos_rates_over_peer", settings, options.json)
 
 
 if __name__ == "__main__":

@@ -77,11 +77,12 @@ class TransientNLOSPath(base.TransientIntegrator):
     ``nlos_hidden_geometry_sampling_includes_relay_wall`` (bool, false): draw points of the relay wall, too.
     ``third_bounce`` (``auto`` | ``shared`` | ``paths``; auto)
         Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
-        which costs less than a tenth, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling``
-        and ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that
-        can be drawn on every hidden shape, an ``nlos_capture_meter`` on a flat wall, and a variant without wavelengths
-        and polarization. Both have the same mean. Where a curved wall lights itself, points of it next to a scanned
-        one weigh without bound, and ``auto`` takes paths.
+        which costs less, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling`` and
+        ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that can
+        be drawn on every hidden shape, no triangles in others, an ``nlos_capture_meter``, one flat wall that scan and
+        laser meet, and a variant without wavelengths and polarization. Both have the same mean. Where a wall lights
+        itself, points of it next to a scanned one weigh without bound, and ``auto`` takes paths. So do derivatives of
+        exhaustive captures.
     ``late_light`` (``auto`` | ``chains`` | ``paths``; auto)
         Light of four to seven bounces from chains that scanned points far from each other share
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
