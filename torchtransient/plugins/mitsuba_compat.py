@@ -390,7 +390,7 @@ def varies(texture: Any) -> bool:
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
 
 
-_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl")
+_COEFFICIENT_CLASSES = ("SRGBReflectanceSpectrum", "BitmapTextureImpl", "D65Spectrum")
 
 
 def keeps_coefficients(texture: Any) -> bool:
