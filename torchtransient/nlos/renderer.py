@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import nn
 
-from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError
+from torchtransient.errors import PhysicsWarning, SceneError, TorchTransientError
 from torchtransient.nlos import defaults
+from torchtransient.nlos.answers import checked_module, measured, say_black
 from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
 from torchtransient.nlos.scan_watch import ScanWatch
-from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, laser_size
+from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.opaque import opaque
@@ -23,11 +25,14 @@ from torchtransient.render.parameters import needing_slope
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant
-from torchtransient.sensing import Device, GradPolicy
+from torchtransient.sensing import Device
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
 ORIGIN, LASER_ORIGIN = f"{WALL}.{SENSOR}.sensor_origin", f"{WALL}.{SENSOR}.laser_origin"
+_FIELDS = {POINTS: "sensor_points", SPOTS: "laser_points", ORIGIN: "sensor_origin", LASER_ORIGIN: "laser_origin"}
+# Settings of a renderer that say what is measured.
+_WHAT_IS_MEASURED = frozenset(("time_axis", "frequencies", "gates", "film", "effects"))
 
 
 class CaptureRenderer(nn.Module):
@@ -37,15 +42,17 @@ class CaptureRenderer(nn.Module):
     :class:`Scan` that knows its wall. ``parameters``: keys of ``renderer.scene.parameters()`` that get an
     ``nn.Parameter`` each, or a mapping to start values; hidden nodes keep their names (``chair.vertex_positions``,
     ``hidden.to_world``, ``hidden.bsdf.reflectance.value``), the wall is ``wall``. ``settings``: those of
-    :class:`TransientRenderer`, ``time_axis`` or another film and ``spp`` (paths for each sensor point, or for each pair
-    of an exhaustive scan) among them. ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a
-    device, whose expected answer is taken (``device.sensor(axis, grad=...)`` makes modules with noise).
+    :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that hold all light of
+    three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive scan; 4) among them.
+    ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
+    (``device.sensor(axis, grad=...)`` makes modules with noise).
 
     Where points of the scan require gradients they get them: the tensors of the scan themselves, as they are when it is
     called, so that an optimizer may change them. Points that were computed of other tensors (or given in another
     precision than the scan's float64) are what they were when the scan was made: once those tensors have changed, a
     call raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
-    :class:`Capture`.
+    :class:`Capture`, whose scan has the points of the call. ``parameters()`` and ``state_dict()`` hold nothing of
+    points that the scan brings: give optimizers the leaves themselves.
 
     Values that put something hidden between the wall and an origin, all of it behind the wall, or points off the wall
     are rendered as they are, and said as a ``PhysicsWarning``, once a scene (the constructor raises SceneError for
@@ -68,8 +75,13 @@ class CaptureRenderer(nn.Module):
         check_is_scan("CaptureRenderer", scan)
         check_sensor("CaptureRenderer", sensor)
         wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
-        checked_samples("CaptureRenderer", settings.get("spp"))
+        settings["spp"] = checked_samples("CaptureRenderer", settings.get("spp"))
+        if settings.get("max_depth") is not None:
+            raise SceneError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
         scene = load(capture_scene(hidden, scan, bounces, energy), variant=variant)
+        if not _WHAT_IS_MEASURED & {name for name, value in settings.items() if value is not None}:
+            bounds = hidden_bounds(hidden, scene.variant)
+            settings["time_axis"] = scan.detach().default_axis(bounds, defaults.BIN_WIDTH_OPL)
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
         _check_once(wanted, followed)
@@ -79,7 +91,8 @@ class CaptureRenderer(nn.Module):
             self.renderer.values[key].requires_grad_(requires_grad=False)
         if sensor is not None and self.renderer.axis is None:
             raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
-        self.sensor = None if sensor is None else as_module(sensor, self.renderer.axis)
+        self.sensor = None if sensor is None else checked_module(sensor, self.renderer.axis)
+        self.says_black = True
         check_scan(self.renderer.scene, scan, self.renderer._options)
         moving = needing_slope(self.renderer._infos, self.renderer._keys)
         if moving:
@@ -112,12 +125,42 @@ class CaptureRenderer(nn.Module):
         if values is not None:
             given |= keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
-        return as_capture(out, self.scan, sensor=self.sensor, generator=generator)
+        if self.says_black and not bool(out.steady.detach().any()):
+            self.says_black = False  # once
+            say_black("CaptureRenderer")
+        return as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
+
+    def _scan_of(self, given: Mapping[str, Any]) -> Scan:
+        """The scan with the points of this call, which later steps do not change. Points that differ in a batch leave
+        it as it was made.
+        """
+        now = {key: {**self.renderer.values, **given}.get(key) for key in _points_of(self.scan)}
+        if all(value is None for value in now.values()):
+            return self.scan
+        changed: dict[str, torch.Tensor] = {}
+        for key, old in _points_of(self.scan).items():
+            value = now[key]
+            if value is not None and value.numel() != old.numel():
+                return self.scan
+            changed[_FIELDS[key]] = old if value is None else value.to(old.dtype).reshape(old.shape).clone()
+        if self.scan.kind == "confocal":
+            changed["laser_points"] = changed["sensor_points"]
+        try:
+            return replace(self.scan, **changed, **_lasting(self.scan))
+        except TorchTransientError as error:
+            warnings.warn(
+                f"CaptureRenderer: the points of this call are no scan ({error}) capture.scan is the one it was made with.",
+                PhysicsWarning,
+                stacklevel=3,
+            )
+            return self.scan
 
 
-def as_module(sensor: nn.Module | Device, axis: TimeAxis | None, grad: GradPolicy = "expected") -> nn.Module:
-    """A sensor as the module that takes transients on ``axis``; ``grad``: what becomes of a device's noise."""
-    return sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
+def _lasting(scan: Scan) -> dict[str, torch.Tensor | None]:
+    """Normals of points that have moved: those of a flat wall, None elsewhere."""
+    found = {"sensor_normals": scan.sensor_normals, "laser_normals": scan.laser_normals}
+    flat = all(n is None or bool((n == n.reshape(-1, 3)[0]).all()) for n in found.values())
+    return found if flat else dict.fromkeys(found)
 
 
 def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
@@ -234,14 +277,3 @@ def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
 def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
     """The same for an image (..., H, W)."""
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)
-
-
-def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
-    """What ``sensor`` makes of (..., T, [Lh, Lw,] H, W): each pair is a pixel of its own."""
-    if scan.kind == "exhaustive":
-        (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)
-        flat = transient.reshape(*transient.shape[:-4], laser_rows * laser_columns, rows * columns)
-        seen = sensor(flat, generator=generator)
-        return seen.reshape(*seen.shape[:-2], *transient.shape[-4:])
-    result: torch.Tensor = sensor(transient, generator=generator)
-    return result

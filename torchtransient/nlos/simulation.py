@@ -25,11 +25,12 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.data.array_file import path_of
 from torchtransient.errors import SceneError
 from torchtransient.nlos import defaults
+from torchtransient.nlos.answers import checked_module, measured, say_black
 from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed
 from torchtransient.nlos.forecast import Forecast, forecast_of
 from torchtransient.nlos.part_file import PartFile
 from torchtransient.nlos.point_rows import RowLayout, Rows
-from torchtransient.nlos.renderer import as_module, in_film_shape, in_scan_shape, measured
+from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
 from torchtransient.nlos.scene import capture_scene, hidden_bounds
 from torchtransient.nlos.variant_choice import choose_variant
 from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
@@ -91,6 +92,8 @@ def simulate(
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     if sensor is not None and work.axes()[0] is None:
         raise SceneError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
+    # Counts as they are drawn: nothing of a simulation has gradients.
+    chain = None if sensor is None else checked_module(sensor, work.axes()[0], "straight_through")
     with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
         forecast = forecast_of(work, timed=progress and not finished)
@@ -98,9 +101,10 @@ def simulate(
             print(forecast, file=sys.stderr)
         whole = kept is None and work.count == 1
         capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
-        if sensor is not None:
-            # Counts as they are drawn: nothing of a simulation has gradients.
-            chain = as_module(sensor, capture.axis, "straight_through")
+        light = capture.steady if capture.steady is not None else capture.transient
+        if light is not None and not bool(light.any()):
+            say_black("simulate")
+        if chain is not None:
             capture = replace(capture, transient=_through(capture.transient, capture.scan, chain, generator))
         if kept is not None and not keep_part:
             kept.remove()

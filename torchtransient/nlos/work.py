@@ -88,7 +88,10 @@ class HiddenWork:
             scan, parameters = self.scan, ()  # type: Scan, tuple[str, ...]
             if self.count > 1:
                 scan, parameters = _listed(self.scan, first, last), (POINTS,)
-            self._renderers[last - first] = CaptureRenderer(self.hidden, scan, parameters, **self._settings)
+            made = CaptureRenderer(self.hidden, scan, parameters, **self._settings)
+            # Parts may be dark; of the whole capture it is said.
+            made.says_black = False
+            self._renderers[last - first] = made
         return self._renderers[last - first]
 
 

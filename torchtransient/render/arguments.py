@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -20,9 +21,13 @@ def samples(name: str, value: int | None) -> int | None:
     """A number of samples per pixel, or None. Raises ``UnitError``."""
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    try:
+        number = 0 if isinstance(value, bool) or getattr(value, "dtype", None) == torch.bool else operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1:
         raise UnitError(f"{name}: expected a positive integer or None, got {value!r}.")
-    return value
+    return number
 
 
 def checked_filter(name: str) -> str:

@@ -113,20 +113,25 @@ class Compose(Sensor):
         """UnitError when a stage was made for other bins than those of ``axis``, or without an axis."""
         if not isinstance(axis, TimeAxis):
             raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
-        for name, module in self.named_modules():
-            if not isinstance(module, Sensor):
-                continue  # a measured response has bins of its own
-            own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
-            if isinstance(own, TimeAxis):
-                slack = _SAME_BIN * axis.bin_width_opl
-                same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
-                same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
-            elif isinstance(width_s, float):
-                own, same = width_s, abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
-            else:
-                continue
-            if not same:
-                raise UnitError(
-                    f"Compose: expected the axis of stage '{name}' ({type(module).__name__}: {own}), got {axis}. Make "
-                    "the sensor with the renderer's axis."
-                )
+        check_axis(self, axis)
+
+
+def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
+    """UnitError when a sensor, or one that is part of it, was made for other bins than those of ``axis``."""
+    for name, module in sensor.named_modules():
+        if not isinstance(module, Sensor):
+            continue  # a measured response has bins of its own
+        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
+        if isinstance(own, TimeAxis):
+            slack = _SAME_BIN * axis.bin_width_opl
+            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
+            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
+        elif isinstance(width_s, float):
+            own, same = width_s, abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
+        else:
+            continue
+        if not same:
+            raise UnitError(
+                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {own}), got {axis}. Make "
+                "the sensor with the renderer's axis."
+            )

@@ -256,7 +256,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         return World(scene, contents, settings, self.strategies(contents, table), wanted, window)
 
     def add_light(self, world: Any, sensor: Any, film: Any, job: Any) -> None:
-        division, parts = world.division, []
+        # Not by the class's name in a function: that is another class once plugins are made for another variant.
+        division, parts, follow_paths = world.division, [], super().add_light
         if division.third_bounce:
             parts.append(lambda run: self._shared(world, film, run.seed, run.samples).add(run.progress))
         if division.chained:
@@ -264,7 +265,7 @@ class TransientNLOSPath(base.TransientIntegrator):
             of_scan = Local(light=self._light(table), elements=self._elements(world), capture=self.capture)
             parts.append(lambda run: add_late_light(table, film, of_scan, division.chained, run))
         if division.walks:
-            parts.append(lambda run: super(TransientNLOSPath, self).add_light(world, sensor, film, run))
+            parts.append(lambda run: follow_paths(world, sensor, film, run))
         for i, part in enumerate(parts):
             part(replace(job, progress=_share_of(job.progress, i, len(parts))))
 

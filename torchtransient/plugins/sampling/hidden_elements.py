@@ -57,8 +57,8 @@ class HiddenElements:
         self.left_out = every.left_out
         if not np.any(every.area > 0):
             raise SceneError(
-                "HiddenElements: expected shapes with a surface to draw points on, got "
-                f"{len(shapes)} without any; left out: {', '.join(self.left_out) or 'none'}."
+                f"hidden shapes: expected a surface to draw points on, got none on {_named(shapes)}: triangles without "
+                "area, or shapes that have no surface. Give them an area."
             )
         cuts = cuts_of(every, points.reshape(-1, 3))
         parts, uncut, cell = cut(every, cuts)
@@ -240,3 +240,9 @@ def _tiles_of(values: Any, name: str) -> np.ndarray:
             f"HiddenElements: expected finite {name} of the wall, (P, 3) or (tiles, P, 3), got {array.shape}."
         )
     return array
+
+
+def _named(shapes: list[Any]) -> str:
+    """Up to three shapes in words."""
+    names = [repr(shape.id() or shape.class_name()) for shape in shapes]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "") or "no shape"
