@@ -184,7 +184,7 @@ def test_pictures(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(("own.yaml", "-o", "a.exr"), "ends in .h5"), (("own.yaml", "-o", "no/a.h5"), "does not exist"),
-     (("no.yaml",), "cannot be read"), (("own.yaml", "--param", "a=1"), "only have a meaning for XML"),
+     (("no.yaml",), "cannot be read"), (("own.yaml", "--param", "a=1"), "fill the $NAMES of XML files alone, got a"),
      (("own.txt",), "expected a capture as YAML"), (("own.yaml", "--variant", "scalar_rgb"), "scalar_rgb"),
      (("own.yaml", "--layout", "a.xyz"), "ends in .png")],
 )  # fmt: skip

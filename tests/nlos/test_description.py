@@ -1,5 +1,6 @@
 """Captures as YAML files: what the entries mean, and what is refused."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.nlos.described_shapes import SCENES
-from torchtransient.nlos.description import read_description
+from torchtransient.nlos.description import _SCAN as SCAN_ENTRIES
+from torchtransient.nlos.description import ENTRIES, read_description
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.sensing import Device
 from torchtransient.units import SPEED_OF_LIGHT
@@ -134,6 +136,7 @@ def test_a_sensor_in_place():
     assert read(sensor=entries).sensor == Device.from_dict(entries)
 
 
+DEVICE = {"name": "d", "description": "a detector", "sources": [], "stages": [{"kind": "ShotNoise"}]}
 MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
 
 
@@ -160,6 +163,16 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"hidden": {"a": {"shape": "cube", "albedo": 2}}}, UnitError, "between 0 and 1"),
         ({"hidden": {"a": {"shape": "cube", "albedo": 0.5, "bsdf": {}}}}, SceneError, "exclude each other"),
         ({"hidden": {"a": {"shape": "cube", "rotate": [10, 20]}}}, SceneError, "rotate: expected"),
+        *(
+            ({"hidden": {"a": {"shape": "cube", "rotate": value}}}, SceneError, "hidden: a: rotate: expected")
+            for value in (30, True, "y", {"y": 30}, [30], [[0, 1, 0]], [[0, 1, 0], [30]])
+        ),
+        *(
+            ({"hidden": {"a": {"shape": "cube", "bsdf": value}}}, SceneError, "hidden: a: bsdf: expected a dict")
+            for value in (3, "conductor", ["conductor"], {}, {"type": 3})
+        ),
+        ({"hidden": {"": {"shape": "cube"}}}, SceneError, "expected a name"),
+        ({"hidden": {"a": {"shape": "cube", "scale": 10**400}}}, SceneError, "a: scale: expected a finite number"),
         ({"hidden": {"a": {"shape": "cube", "to_world": [[1]]}}}, SceneError, "four rows"),
         ({"hidden": {"a": {"shape": "cube", "to_world": [[1]] * 4}}}, SceneError, "a list of 4 numbers"),
         (
@@ -188,7 +201,9 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"bounces": [2.5]}, SceneError, "bounces: expected"),
         ({"bounces": []}, SceneError, "bounces: expected"),
         ({"seed": -1}, SceneError, "at least 0"),
-        ({"sensor": "none.yaml"}, SceneError, "no file 'none.yaml'"),
+        ({"sensor": "none.yaml"}, SceneError, "^sensor: no file 'none.yaml'"),
+        ({"sensor": DEVICE | {"stages": 3}}, StorageError, "sensor: Device 'd': expected stages as a list, got 3"),
+        ({"sensor": DEVICE | {"sources": "me"}}, StorageError, "expected sources as a list, got 'me'"),
         ({"sensor": {"name": "d"}}, StorageError, "sensor: Device"),
         ({"sensor": 3}, SceneError, "the file of a device"),
         ({"variant": 3}, SceneError, "variant: expected a text"),
@@ -213,3 +228,40 @@ def test_bins_of_a_mesh_file_have_to_be_given(tmp_path):
     path.write_text("hidden: {letter: {file: mesh.stl}}\nscan: {kind: confocal, size: 2}\n")
     with pytest.raises(SceneError, match="expected a mesh"):
         read_description(path)
+
+
+# What somebody may write where a number, a text, a list or a mapping belongs.
+VALUES = (
+    None, True, 0, -1, 30, 10**400, float("inf"), "", "x", [], [30], [None], [{}], ["x", "y", "z"], [0, 0, 0], [[1]],
+    [[0, 1, 0], 30], [[0, 1, 0], [30]], [[["x", 1, 0], 30]], [True, True, True], {}, {"x": 1}, {1: 2}, {"type": 3},
+)  # fmt: skip
+THINGS = (
+    {"shape": "cube"}, {"scene": "nlos_letter"}, {"scene": "nlos_plates"}, {"scene": "nlos_room"}, {"file": "a.obj"},
+    MESH,
+)  # fmt: skip
+PLACES = ("scale", "rotate", "translate", "to_world", "albedo", "bsdf", "flip_normals")
+OF_SCENES = ("letter", "size", "depth", "thickness", "subdivide", "person", "level", "width", "gap", "second_size")
+AXES = ({"start_opl": 1, "bin_width_opl": 0.1, "num_bins": 4}, {"start_s": 0, "bin_width_s": 1e-11, "num_bins": 4})
+FREQUENCIES = {"first": 1.0, "step": 0.5, "count": 4, "start_opl": 0.0}
+
+
+def _wrong_entries(value):
+    for thing in THINGS:
+        yield from ({"hidden": {"a": thing | {key: value}}} for key in (*thing, *PLACES, *OF_SCENES))
+    yield {"hidden": {"a": value}}
+    yield from ({key: value} for key in ENTRIES)
+    yield from ({"wall": {key: value}} for key in ("width", "height", "center", "normal", "up", "albedo", "file"))
+    for kind in ("single", "confocal", "exhaustive"):
+        yield from ({"scan": {"kind": kind, "size": 2, key: value}} for key in SCAN_ENTRIES)
+    for axis in AXES:
+        yield from ({"time_axis": axis | {key: value}} for key in axis)
+    yield from ({"frequencies": FREQUENCIES | {key: value}} for key in FREQUENCIES)
+    yield from ({"sensor": DEVICE | {key: value}} for key in DEVICE)
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: repr(value)[:20])
+def test_entries_of_any_kind_are_read_or_refused(value):
+    """Nothing but errors of this library, whatever stands where."""
+    for entries in _wrong_entries(value):
+        with contextlib.suppress(TorchTransientError):
+            read(**entries)

@@ -13,6 +13,7 @@ from torchtransient import scenes
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.nlos.mesh_file import mesh_arrays_shape, mesh_file
 from torchtransient.nlos.yaml_files import Section, file_beside
+from torchtransient.quantities import shown
 from torchtransient.scenes.parts import diffuse
 from torchtransient.scenes.transforms import Matrix, rotate, scale, translate
 
@@ -42,15 +43,15 @@ def described_shapes(data: Any, folder: Path) -> dict[str, Any]:
     """
     if not isinstance(data, Mapping) or not data:
         raise SceneError(
-            f"hidden: expected things by name, 'letter: {{scene: nlos_letter}}' for instance, got {data!r}."
+            f"hidden: expected things by name, 'letter: {{scene: nlos_letter}}' for instance, got {shown(data)}."
         )
     shapes: dict[str, Any] = {}
     for name, entry in data.items():
         where = f"hidden: {name}"
         given = [kind for kind in _KINDS if isinstance(entry, Mapping) and kind in entry]
-        if not isinstance(name, str) or "." in name or len(given) != 1:
+        if not isinstance(name, str) or not name or "." in name or len(given) != 1:
             raise SceneError(
-                f"{where}: expected a name without dots, and one of {', '.join(_KINDS)}, got {given or entry!r}."
+                f"{where}: expected a name without dots, and one of {', '.join(_KINDS)}, got {given or shown(entry)}."
             )
         if given == ["scene"]:
             shapes.update(_scene(name, entry, where))
@@ -93,8 +94,18 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
         shape["flip_normals"] = True
     if "bsdf" in section and "albedo" in section:
         raise SceneError(f"{where}: albedo and bsdf exclude each other; give one.")
-    shape["bsdf"] = section.get("bsdf") if "bsdf" in section else diffuse(albedo_of(section))
+    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(albedo_of(section))
     return shape
+
+
+def _bsdf(section: Section) -> dict[str, Any]:
+    given = section.get("bsdf")
+    if not isinstance(given, Mapping) or not isinstance(given.get("type"), str):
+        raise SceneError(
+            f"{section.where}: bsdf: expected a dictionary of Mitsuba, {{type: conductor}} for instance, got "
+            f"{shown(given)}."
+        )
+    return dict(given)
 
 
 def albedo_of(section: Section, default: float = 0.5) -> Any:
@@ -110,7 +121,7 @@ def _place(section: Section) -> Matrix | None:
             raise SceneError(f"{section.where}: to_world excludes scale, rotate and translate.")
         rows = section.get("to_world")
         if not isinstance(rows, list) or len(rows) != 4:
-            raise SceneError(f"{section.where}: to_world: expected four rows of four numbers, got {rows!r}.")
+            raise SceneError(f"{section.where}: to_world: expected four rows of four numbers, got {shown(rows)}.")
         return np.array([Section({"row": row}, section.where, ("row",)).numbers("row", (4,)) for row in rows])
     matrix = None
     if "scale" in section:
@@ -126,12 +137,14 @@ def _place(section: Section) -> Matrix | None:
 
 def _turns(section: Section) -> list[Matrix]:
     given = section.get("rotate", [])
+    pairs = [given] if _is_pair(given) else given
+    if not isinstance(pairs, list) or not all(map(_is_pair, pairs)):
+        raise SceneError(
+            f"{section.where}: rotate: expected [[x, y, z], degrees], [[0, 1, 0], 30] for instance, or a list of "
+            f"those, got {shown(given)}."
+        )
     turns = []
-    for pair in [given] if _is_pair(given) else given:
-        if not _is_pair(pair):
-            raise SceneError(
-                f"{section.where}: rotate: expected [[x, y, z], degrees], or a list of those, got {given!r}."
-            )
+    for pair in pairs:
         part = Section({"axis": pair[0], "degrees": pair[1]}, f"{section.where}: rotate", ("axis", "degrees"))
         turns.append(rotate(part.numbers("axis", (3,)), part.number("degrees")))
     return turns

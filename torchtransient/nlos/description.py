@@ -30,6 +30,7 @@ from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
 from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
+from torchtransient.quantities import shown
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
 
@@ -127,7 +128,7 @@ def _size(section: Section, name: str) -> tuple[int, int]:
     given = section.get(name)
     pair = given if isinstance(given, list) else [given, given]
     if len(pair) != 2:
-        raise SceneError(f"scan: {name}: expected one number or [x, y], got {given!r}.")
+        raise SceneError(f"scan: {name}: expected one number or [x, y], got {shown(given)}.")
     parts = Section({"x": pair[0], "y": pair[1]}, f"scan: {name}", ("x", "y"))
     return parts.whole("x"), parts.whole("y")
 
@@ -175,19 +176,22 @@ def _bounces(section: Section) -> tuple[int, ...] | None:
     wanted = given if isinstance(given, list) else [given]
     numbers = [as_number(value, "bounces") for value in wanted]
     if not numbers or any(number != round(number) or number < 1 for number in numbers):
-        raise SceneError(f"bounces: expected whole numbers of at least 1, [3] for instance, or 'all', got {given!r}.")
+        raise SceneError(
+            f"bounces: expected whole numbers of at least 1, [3] for instance, or 'all', got {shown(given)}."
+        )
     return tuple(sorted({int(number) for number in numbers}))
 
 
 def _sensor(given: Any, folder: Path) -> Device | None:
     if given is None:
         return None
+    if not isinstance(given, Mapping | str):
+        raise SceneError(f"sensor: expected the file of a device or its entries, got {shown(given)}.")
+    if isinstance(given, str):
+        path = file_beside(given, (folder,), "sensor")
     try:
         if isinstance(given, Mapping):
             return Device.from_dict(given)
-        if isinstance(given, str):
-            path = file_beside(given, (folder,), "sensor")
-            return Device.from_json(path) if path.suffix.lower() == ".json" else Device.from_yaml(path)
+        return Device.from_json(path) if path.suffix.lower() == ".json" else Device.from_yaml(path)
     except TorchTransientError as error:
         raise type(error)(f"sensor: {error}") from error
-    raise SceneError(f"sensor: expected the file of a device or its entries, got {given!r}.")

@@ -36,7 +36,8 @@ def read_setup(path: str | Path, **xml_parameters: str) -> dict[str, Any]:
     if source.suffix.lower() == ".xml":
         return {"hidden": load(source, **xml_parameters)}
     if xml_parameters:
-        raise SceneError(f"{source.name}: {', '.join(xml_parameters)} only have a meaning for XML files.")
+        given = ", ".join(xml_parameters)
+        raise SceneError(f"{source.name}: parameters fill the $NAMES of XML files alone, got {given}; leave them out.")
     if not source.is_dir() and source.suffix.lower() not in (".yaml", ".yml"):
         raise SceneError(
             f"expected a capture as YAML (.yaml, .yml), the folder of a y-tal scene, or Mitsuba's XML, got '{source}'."

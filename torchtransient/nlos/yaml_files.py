@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.errors import SceneError, StorageError
+from torchtransient.quantities import shown
 
 _MISSING = object()
 
@@ -70,7 +71,7 @@ class Section:
     def __init__(self, data: Any, where: str, known: Iterable[str]):
         self.where = where
         if not isinstance(data, Mapping):
-            raise SceneError(f"{where}: expected names and values, got {_shown(data)}.")
+            raise SceneError(f"{where}: expected names and values, got {shown(data)}.")
         names = list(known)
         for name in data:
             if name not in names:
@@ -104,28 +105,28 @@ class Section:
         number = as_number(value, self._at(name))
         if number != round(number) or (least is not None and number < least):
             bound = "" if least is None else f" of at least {least}"
-            raise SceneError(f"{self._at(name)}: expected a whole number{bound}, got {_shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected a whole number{bound}, got {shown(value)}.")
         return int(number)
 
     def flag(self, name: str, default: bool) -> bool:
         """true or false."""
         value = self.get(name, default)
         if not isinstance(value, bool):
-            raise SceneError(f"{self._at(name)}: expected true or false, got {_shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected true or false, got {shown(value)}.")
         return value
 
     def text(self, name: str, default: Any = _MISSING) -> Any:
         """A text; `default` as it is."""
         value = self.get(name, default)
         if name in self and not isinstance(value, str):
-            raise SceneError(f"{self._at(name)}: expected a text, got {_shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected a text, got {shown(value)}.")
         return value
 
     def choice(self, name: str, choices: Sequence[str], default: Any = _MISSING) -> Any:
         """One of some texts."""
         value = self.get(name, default)
         if value not in choices:
-            raise SceneError(f"{self._at(name)}: expected one of {', '.join(choices)}, got {_shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected one of {', '.join(choices)}, got {shown(value)}.")
         return value
 
     def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
@@ -135,7 +136,7 @@ class Section:
             return value
         if not isinstance(value, list) or len(value) not in counts:
             words = " or ".join(map(str, counts))
-            raise SceneError(f"{self._at(name)}: expected a list of {words} numbers, got {_shown(value)}.")
+            raise SceneError(f"{self._at(name)}: expected a list of {words} numbers, got {shown(value)}.")
         return [as_number(entry, self._at(name)) for entry in value]
 
     def _at(self, name: str) -> str:
@@ -146,16 +147,11 @@ def as_number(value: Any, where: str) -> float:
     """A finite number. YAML 1.1 reads 1e-3 as a text: it counts too. Raises SceneError for others."""
     number = math.nan
     if isinstance(value, int | float | str) and not isinstance(value, bool):
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, OverflowError):
             number = float(value)
     if not math.isfinite(number):
-        raise SceneError(f"{where}: expected a finite number, got {_shown(value)}.")
+        raise SceneError(f"{where}: expected a finite number, got {shown(value)}.")
     return number
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:

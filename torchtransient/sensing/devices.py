@@ -24,6 +24,7 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.quantities import shown
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.compose import Compose
@@ -84,7 +85,8 @@ class Device:
 
     ``sources``: one line each, with "assumed:" in front of numbers that no source gives. ``stages``: dictionaries as
     above. ``bin_width_s`` and ``num_bins``: what the device records with, for `axis`; None where it has no bins.
-    Plain data: equal when all of it is. Raises StorageError for a stage that is no such dictionary.
+    Plain data: equal when all of it is. Raises StorageError for sources or stages that are no lists, and for a
+    stage that is no such dictionary.
     """
 
     name: str
@@ -95,6 +97,10 @@ class Device:
     num_bins: int | None = None
 
     def __post_init__(self) -> None:
+        for name in ("sources", "stages"):
+            given = getattr(self, name)
+            if not isinstance(given, (list, tuple)):
+                raise StorageError(f"Device '{self.name}': expected {name} as a list, got {shown(given)}.")
         object.__setattr__(self, "sources", tuple(self.sources))
         object.__setattr__(self, "stages", tuple(copy.deepcopy(s) for s in self.stages))
         if not self.stages:
@@ -166,7 +172,7 @@ class Device:
         """A device from a file (a `Path`, or a name without a brace) or from JSON text. Raises StorageError."""
         try:
             return cls.from_dict(json.loads(_text(source, "{")))
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise StorageError(f"Device.from_json: expected a JSON file or text: {error}.") from error
 
     def to_yaml(self, path: str | Path | None = None) -> str:
@@ -182,7 +188,7 @@ class Device:
         yaml = _yaml()
         try:
             return cls.from_dict(yaml.safe_load(_text(source, "\n")))
-        except (OSError, yaml.YAMLError) as error:
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
 
 
