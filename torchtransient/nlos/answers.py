@@ -35,6 +35,15 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
     return module
 
 
+def is_readable(tensor: torch.Tensor) -> bool:
+    """False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that)."""
+    try:
+        bool(tensor.detach().reshape(-1)[:1].any())
+    except RuntimeError:
+        return False
+    return True
+
+
 def say_black(who: str) -> None:
     """Warn of a capture without light."""
     warnings.warn(

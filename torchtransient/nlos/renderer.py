@@ -13,7 +13,7 @@ from torch import nn
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import PhysicsWarning, SceneError, TorchTransientError
 from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import checked_module, measured, say_black
+from torchtransient.nlos.answers import checked_module, is_readable, measured, say_black
 from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
 from torchtransient.nlos.scan_watch import ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
@@ -125,14 +125,14 @@ class CaptureRenderer(nn.Module):
         if values is not None:
             given |= keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
-        if self.says_black and not bool(out.steady.detach().any()):
+        if self.says_black and is_readable(out.steady) and not bool(out.steady.detach().any()):
             self.says_black = False  # once
             say_black("CaptureRenderer")
         return as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
 
     def _scan_of(self, given: Mapping[str, Any]) -> Scan:
-        """The scan with the points of this call, which later steps do not change. Points that differ in a batch leave
-        it as it was made.
+        """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or that
+        ``torch.vmap`` hides, leave it as it was made.
         """
         now = {key: {**self.renderer.values, **given}.get(key) for key in _points_of(self.scan)}
         if all(value is None for value in now.values()):
@@ -140,7 +140,7 @@ class CaptureRenderer(nn.Module):
         changed: dict[str, torch.Tensor] = {}
         for key, old in _points_of(self.scan).items():
             value = now[key]
-            if value is not None and value.numel() != old.numel():
+            if value is not None and (value.numel() != old.numel() or not is_readable(value)):
                 return self.scan
             changed[_FIELDS[key]] = old if value is None else value.to(old.dtype).reshape(old.shape).clone()
         if self.scan.kind == "confocal":
@@ -149,7 +149,7 @@ class CaptureRenderer(nn.Module):
             return replace(self.scan, **changed, **_lasting(self.scan))
         except TorchTransientError as error:
             warnings.warn(
-                f"CaptureRenderer: the points of this call are no scan ({error}) capture.scan is the one it was made with.",
+                f"CaptureRenderer: these points are no scan ({error}) capture.scan is the one of the constructor.",
                 PhysicsWarning,
                 stacklevel=3,
             )
