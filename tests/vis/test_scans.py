@@ -1,5 +1,7 @@
 """Pictures of scans against captures whose light is known: the arrays that matplotlib is given, and the files."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,8 @@ from support.cubes import read_gif, read_png
 from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, StorageError, TorchTransientError, UnitError
+from torchtransient.vis.hidden_shapes import hidden_polygons
 
 ORIGIN = (-0.5, 0.0, 0.25)
 
@@ -47,7 +50,7 @@ def test_curves_stand_where_their_points_do(tmp_path):
     expected = index[0, [2, 6, 10, 14]].tolist()
     assert shown == expected * 3 and expected == sorted(expected)
     titles = [panel.get_title() for panel in figure.axes]
-    assert titles[0] == "2, 10" and titles[-1] == "14, 2", "the highest row of the wall is on top"
+    assert titles[0] == "(10, 2)" and titles[-1] == "(2, 14)", "the highest row of the wall is on top"
     assert (read_png(tmp_path / "a.png") < 100).any()
 
 
@@ -61,7 +64,9 @@ def test_curves_hold_the_closed_form():
 
 def test_more_panels_than_points_show_every_point_once():
     figure = tt.vis.transients_grid(confocal_plane(size=(3, 2)), rows=9, columns=9)
-    assert [panel.get_title() for panel in figure.axes] == ["0, 1", "1, 1", "2, 1", "0, 0", "1, 0", "2, 0"]
+    assert [panel.get_title() for panel in figure.axes] == [
+        f"({row}, {column})" for row in (1, 0) for column in range(3)
+    ]
 
 
 def test_lists_are_an_image_of_points_against_time(tmp_path):
@@ -141,8 +146,68 @@ def test_the_layout_of_a_curved_wall_and_of_a_capture():
     assert len(tt.vis.scan_layout(scan).axes[0].collections) == 4
     single = confocal_plane()
     assert tt.vis.scan_layout(single, title="name").axes[0].get_title() == "name"
-    with pytest.raises(SceneError, match="'sphere' at 'ball'"):
-        tt.vis.scan_layout(scan, hidden={"ball": {"type": "sphere"}})
+
+
+VERTICES = np.array([[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.5, 0.5, 1.5]])
+FACES = np.array([[0, 2, 1]])
+MESH = scenes.triangle_mesh(VERTICES, FACES)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        (VERTICES, FACES), [VERTICES.tolist(), FACES.tolist()], SimpleNamespace(vertices=VERTICES, faces=FACES), MESH,
+        {"a": MESH}, {"type": "scene", "a": MESH}, (torch.tensor(VERTICES, requires_grad=True), torch.tensor(FACES)),
+        {"white": {"type": "diffuse"}, "a": MESH | {"bsdf": {"type": "ref", "id": "white"}}},
+    ],
+)  # fmt: skip
+def test_the_layout_draws_what_simulations_take(hidden):
+    """However triangles are given, they are drawn where they are."""
+    panel = tt.vis.scan_layout(confocal_plane(), hidden=hidden).axes[0]
+    (found,) = panel.collections[1]._faces
+    np.testing.assert_allclose(found, VERTICES[[0, 2, 1]])
+    assert panel.get_zlim()[1] > 1.5
+    tt.nlos.capture_scene(hidden, confocal_plane().scan)
+
+
+@pytest.mark.parametrize(
+    ("shape", "low", "high"),
+    [
+        ({"type": "sphere", "center": [0.4, 0, 0.8], "radius": 0.2}, [0.2, -0.2, 0.6], [0.6, 0.2, 1.0]),
+        ({"type": "disk"}, [-1, -1, 0], [1, 1, 0]),
+        ({"type": "cube"}, [-1, -1, -1], [1, 1, 1]),
+        ({"type": "cylinder", "p0": [1, 0, 0], "p1": [3, 0, 0], "radius": 0.5}, [1, -0.5, -0.5], [3, 0.5, 0.5]),
+    ],
+)
+def test_round_things_are_as_large_as_they_are(shape, low, high):
+    for matrix in (np.eye(4), scenes.transforms.translate([0.0, 0.1, 2.0]) @ scenes.transforms.scale(0.5)):
+        (faces,) = hidden_polygons({"ball": shape | {"to_world": matrix}}, "x")
+        points = np.concatenate(faces)
+        expected = np.array([low, high]) @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose([points.min(0), points.max(0)], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "message"),
+    [
+        (3, "expected hidden as shapes by name"),
+        ("a.obj", "mesh files are not drawn"),
+        ({"body": {"type": "obj", "filename": "a.obj"}}, "hidden 'body': shapes that are drawn are .*'obj'"),
+        ({"body": 3}, "'body': expected a dictionary"),
+        ((VERTICES, [[0, 1, 7]]), "expected faces of whole numbers from 0 to 2"),
+        ({"ball": {"type": "sphere", "to_world": 3}}, "'ball': to_world"),
+        ({"ball": {"type": "sphere", "radius": "x"}}, "'ball': radius"),
+    ],
+)
+def test_layouts_of_what_is_no_hidden_thing(hidden, message):
+    with pytest.raises(TorchTransientError, match=message):
+        tt.vis.scan_layout(confocal_plane(), hidden=hidden)
+
+
+@pytest.mark.parametrize("given", [WALL, None, torch.zeros(3), {}, "scan"])
+def test_layouts_of_what_is_no_scan(given):
+    with pytest.raises(ShapeError, match="expected a Scan or a Capture"):
+        tt.vis.scan_layout(given)
 
 
 @pytest.mark.parametrize(

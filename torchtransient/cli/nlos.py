@@ -120,7 +120,9 @@ def _drawable(hidden: Any) -> tuple[dict[str, Any], list[str]]:
     """The shapes that a layout can show, and the names of the others."""
     if not isinstance(hidden, dict):
         return {}, ["the shapes of the scene"]
-    drawn = {name: shape for name, shape in hidden.items() if shape.get("type") in ("mesh_arrays", "rectangle", "cube")}
+    from torchtransient.vis.hidden_shapes import DRAWN
+
+    drawn = {name: shape for name, shape in hidden.items() if shape.get("type") in DRAWN}
     return drawn, [name for name in hidden if name not in drawn]
 
 
@@ -130,7 +132,7 @@ def _check_pictures(options: dict[str, Any]) -> None:
 
     for name in PICTURES:
         if options[name]:
-            check_picture(options[name])
+            check_picture(options[name], f"--{name.replace('_', '-')}")
     if options["video"]:
         check_video(options["video"])
 

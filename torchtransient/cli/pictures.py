@@ -55,13 +55,13 @@ def check_pictures(options: dict[str, Any], film: FilmChoice | None) -> None:
     for name in PICTURES:
         if not options[name]:
             continue
+        flag = f"--{name.replace('_', '-')}"
         if film is not None and name not in film.pictures:
-            flag = name.replace("_", "-")
-            raise click.UsageError(f"--{flag} shows a histogram over time; leave it out for {film.plural}.")
+            raise click.UsageError(f"{flag} shows a histogram over time; leave it out for {film.plural}.")
         if name == "video":
             check_video(options[name])
         else:
-            check_picture(options[name])
+            check_picture(options[name], flag)
 
 
 def write_pictures(output: Any, film: FilmChoice, options: dict[str, Any], title: str) -> None:

@@ -137,17 +137,17 @@ def plot_overview(
     return shown
 
 
-def check_picture(path: str | Path) -> None:
-    """Raise StorageError when `plot_overview` could not write to `path`. For before a long render."""
+def check_picture(path: str | Path, who: str = "picture") -> None:
+    """Raise StorageError when matplotlib could not write to `path`. For before a long render."""
     folder = Path(path).parent
     if not folder.is_dir():
-        raise StorageError(f"plot_overview: the folder '{folder}' does not exist. Create it first.")
+        raise StorageError(f"{who}: the folder '{folder}' does not exist. Create it first.")
     figure_type()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     endings = FigureCanvasAgg.get_supported_filetypes()
     if Path(path).suffix.lstrip(".").lower() not in endings:
-        raise StorageError(f"plot_overview: expected a name that ends in .png, got '{path}'.")
+        raise StorageError(f"{who}: expected a name that ends in .png, got '{path}'.")
 
 
 def _draw_steady(panel: Any, steady: Tensor, pixel: tuple[int, int]) -> None:

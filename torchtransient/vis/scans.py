@@ -4,7 +4,6 @@ along v upwards.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,18 +14,16 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import shown
 from torchtransient.vis.arrival import peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
+from torchtransient.vis.hidden_shapes import SQUARE, hidden_polygons
 from torchtransient.vis.video import Frames, FrameSettings, frames
 from torchtransient.vis.video_file import check_video, write_video
 
 STYLES = ("curves", "image")
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
-# Corners of Mitsuba's square and cube, and the faces that are drawn of them.
-_SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-_CUBE = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-_CUBE_FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
 def transients_grid(
@@ -43,11 +40,11 @@ def transients_grid(
     """A matplotlib figure of the transients of a capture, point by point.
 
     `style` "curves" draws a small histogram for each of up to `rows` x `columns` sensor points, evenly chosen, where
-    they stand on the wall, on one scale; "image" a picture of all points (downwards) against time, of which the
-    channels are added up. None: curves of a grid, an image of a list of points. `laser` chooses the spot of an
-    exhaustive capture, by its index (None: the middle one). `limits` in metres cut the time axis. Writes the figure
-    when `path` is given. Raises ShapeError for a batch, more than 3 channels or no transient, UnitError for limits
-    without a bin or an unknown style, StorageError.
+    they stand on the wall, on one scale, under their (row, column); "image" a picture of all points (downwards) against
+    time, of which the channels are added up. None: curves of a grid, an image of a list of points. `laser` chooses the
+    spot of an exhaustive capture, by its index (None: the middle one). `limits` in metres cut the time axis. Writes the
+    figure when `path` is given. Raises ShapeError for a batch, more than 3 channels or no transient, UnitError for
+    limits without a bin or an unknown style, StorageError.
     """
     cube, axis, scan = _one_spot(capture, laser, "transients_grid")
     if limits is not None:
@@ -117,29 +114,32 @@ def scan_layout(
     scan: Scan | Capture,
     path: str | Path | None = None,
     *,
-    hidden: Mapping[str, Any] | None = None,
+    hidden: Any = None,
     title: str = "",
 ) -> Any:
     """A matplotlib figure of a scan in space: wall, sensor points, laser spots and both origins; lengths in metres.
 
-    `hidden`: shapes by name, as the functions `tt.scenes.nlos_*` return them, drawn transparent: meshes as arrays,
-    rectangles and cubes; SceneError for others. Writes the figure when `path` is given; raises StorageError.
+    `hidden`: as in `tt.nlos.simulate`, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
+    with both, of meshes as arrays, rectangles, cubes, disks, spheres and cylinders. Writes the figure when `path` is given.
+    Raises ShapeError for what is no scan, SceneError for other shapes and mesh files, StorageError.
     """
     scan = scan.scan if isinstance(scan, Capture) else scan
+    if not isinstance(scan, Scan):
+        raise ShapeError(f"scan_layout: expected a Scan or a Capture, got {shown(scan)}; Scan.grid makes one.")
+    shapes = hidden_polygons(hidden, "scan_layout")
     figure = figure_type()(figsize=(7.0, 6.0), layout="constrained")
     panel = figure.add_subplot(projection="3d")
     drawn = [scan.sensor_points, scan.laser_points, scan.sensor_origin, scan.laser_origin]
     corners = [tensor.detach().cpu().numpy().reshape(-1, 3) for tensor in drawn]
     if scan.wall is not None:
         surface = Wall.of(scan.wall)
-        faces = _SQUARE[:, :1] * surface.half_u + _SQUARE[:, 1:2] * surface.half_v + surface.center
+        faces = SQUARE[:, :1] * surface.half_u + SQUARE[:, 1:2] * surface.half_v + surface.center
         polygons = [faces] if surface.vertices is None else list(surface.vertices[surface.faces])
         corners.append(np.concatenate(polygons))
         _draw_faces(panel, polygons, "0.5", 0.2)
-    for name, shape in (hidden or {}).items():
-        polygons = _polygons(name, shape)
-        corners.append(np.concatenate(polygons))
-        _draw_faces(panel, polygons, "tab:orange", 0.25)
+    for faces_of_shape in shapes:
+        corners.append(np.concatenate(faces_of_shape))
+        _draw_faces(panel, faces_of_shape, "tab:orange", 0.25)
     sensor, laser, sensor_origin, laser_origin = corners[:4]
     count = "confocal" if scan.kind == "confocal" else f"{len(sensor)}"
     panel.scatter(*sensor.T, s=8, color="tab:blue", label=f"sensor points ({count})", depthshade=False)
@@ -229,7 +229,7 @@ def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -
         for panel, column in zip(line, columns, strict=True):
             for values, colour in zip(cube[:, :, row, column].numpy(), _COLOURS[cube.shape[0]], strict=True):
                 panel.stairs(values, edges, color=colour, linewidth=0.9)
-            panel.set_title(f"{column}, {row}", fontsize=7, pad=2)
+            panel.set_title(f"({row}, {column})", fontsize=7, pad=2)
             panel.margins(x=0)
             panel.tick_params(labelsize=7)
     figure.supxlabel("optical path length (m)", fontsize=9)
@@ -252,21 +252,6 @@ def _image(cube: Tensor, axis: TimeAxis) -> Any:
     panel.set_xlabel("optical path length (m)")
     panel.set_ylabel("sensor point, row by row" if cube.ndim == 4 else "sensor point")
     return figure
-
-
-def _polygons(name: str, shape: Mapping[str, Any]) -> list[NDArray[np.float64]]:
-    """Corners (N, 3) of the faces of a shape."""
-    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64)
-    kind = shape.get("type")
-    if kind == "mesh_arrays":
-        points = np.asarray(shape["vertices"], dtype=np.float64)[np.asarray(shape["faces"])]
-    elif kind == "rectangle":
-        points = _SQUARE[None]
-    elif kind == "cube":
-        points = _CUBE[np.array(_CUBE_FACES)]
-    else:
-        raise SceneError(f"scan_layout: expected mesh_arrays, rectangles and cubes, got {kind!r} at '{name}'.")
-    return list(points @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def _draw_faces(panel: Any, polygons: list[NDArray[np.float64]], colour: str, alpha: float) -> None:
