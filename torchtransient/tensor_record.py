@@ -6,11 +6,13 @@ rest, sees its tensors; ``torch.utils.data.default_collate`` stacks records as i
 
 from __future__ import annotations
 
+import copy
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
@@ -18,9 +20,12 @@ from torch.utils.data._utils.collate import collate, default_collate_fn_map
 from torchtransient.errors import ShapeError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TensorRecord:
     """Base of a frozen dataclass whose fields, and the entries of whose ``others``, are tensors, settings or None.
+
+    Two records are equal when their settings are, and their tensors hold the same numbers of the same kind, on any
+    device (``eq=False`` of derived dataclasses leaves it so).
 
     ``notes``: fields that say how the record was made. They do not tell records apart, and become those of a batch by
     :meth:`merged_notes`. All other settings must agree in a batch.
@@ -141,6 +146,17 @@ class TensorRecord:
             changes["others"] = {name: entries.get(name, value) for name, value in others.items()}
         return replace(self, **changes)
 
+    # ----------------------------------------------------------------------------------------------------- compared
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        assert isinstance(other, TensorRecord)
+        return same(self._settings(), other._settings()) and same(self.tensors(), other.tensors())
+
+    def __hash__(self) -> int:
+        return hash((type(self), *((name, *tensor.shape) for name, tensor in self.tensors().items())))
+
     # -------------------------------------------------------------------------------------------------------- shown
 
     def _shown(self) -> dict[str, str]:
@@ -191,7 +207,7 @@ class _Rest:
 
     def __init__(self, record: TensorRecord):
         self.names = _leaves_of(record)
-        self.record = record._with(dict.fromkeys(self.names))
+        self.record = _unchecked(record, dict.fromkeys(self.names))
         settings = self.record._settings()
         self._settings = {"class": type(record), **settings, "tensors": tuple(self.names)}
 
@@ -220,11 +236,23 @@ def _taken_apart_with_keys(record: TensorRecord) -> tuple[list[Any], _Rest]:
 
 def _put_together(leaves: Any, rest: _Rest) -> Any:
     given = dict(zip(rest.names, leaves, strict=True))
-    record = rest.record._with(given)
-    if not all(isinstance(leaf, torch.Tensor) for leaf in given.values()):
-        # Trees carry anything: dimensions, names, objects that stand for tensors.
-        object.__setattr__(record, "_leaves", rest.names)
+    if all(isinstance(leaf, torch.Tensor) for leaf in given.values()):
+        return rest.record._with(given)
+    # Trees carry anything: dimensions, names, objects that stand for tensors.
+    record = _unchecked(rest.record, given)
+    object.__setattr__(record, "_leaves", rest.names)
     return record
+
+
+def _unchecked(record: TensorRecord, entries: Mapping[str, Any]) -> TensorRecord:
+    """A copy with anything in the places of tensors, which is no record as its class has them."""
+    twin, others = copy.copy(record), getattr(record, "others", {})
+    twin.__dict__.pop("_leaves", None)
+    for name in entries.keys() - others.keys():
+        object.__setattr__(twin, name, entries[name])
+    if others:
+        object.__setattr__(twin, "others", {name: entries.get(name, value) for name, value in others.items()})
+    return twin
 
 
 def _collated(batch: Any, *, collate_fn_map: Any = None) -> Any:
@@ -234,3 +262,19 @@ def _collated(batch: Any, *, collate_fn_map: Any = None) -> Any:
         return together
 
     return type(batch[0])._joined(batch, join)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two tensors, arrays or dictionaries of them hold equal values, NaN in the same places, wherever they are.
+    Tensors of different dtypes are different.
+    """
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        if a.shape != b.shape or a.dtype != b.dtype:
+            return False
+        here, there = a.detach().cpu(), b.detach().cpu()
+        return bool(torch.equal(here, there)) or bool(((here == there) | (here.isnan() & there.isnan())).all())
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.shape(a) == np.shape(b) and bool(np.array_equal(a, b))
+    return bool(a == b)

@@ -2,7 +2,10 @@
 
 import json
 import pickle
+import warnings
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch.utils import _pytree
@@ -144,6 +147,52 @@ def test_steady_has_the_shape_of_the_scan():
         capture("single", steady=torch.zeros(2, 4, 3))
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        lambda t: t.numpy(), lambda t: t.double().numpy(), lambda t: t.tolist(), lambda t: tuple(t.tolist()),
+        lambda t: t.numpy().astype(">f4"), lambda t: np.ascontiguousarray(t.flip(3).numpy())[..., ::-1],
+        lambda t: np.frombuffer(t.numpy().tobytes(), np.float32).reshape(t.shape),
+    ],
+)  # fmt: skip
+def test_arrays_and_lists_are_measured_too(given):
+    expected = capture("single", steady=torch.rand(2, 3, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made = Capture(given(expected.transient), AXIS, expected.scan, steady=expected.steady.numpy())
+    assert torch.equal(made.transient.float(), expected.transient) and torch.equal(made.steady, expected.steady)
+    assert made.crop(1.1, 1.3).total().shape == (2, 3, 4)
+    axis = FrequencyAxis.uniform(1.0, 0.5, 5)
+    phasor = Capture(None, None, SCANS["single"], phasor=np.ones((1, 5, 3, 4), np.complex64), frequencies=axis).phasor
+    assert phasor.dtype == torch.complex64 and bool((phasor == 1).all())
+
+
+@pytest.mark.parametrize("given", ["x", {}, object(), np.array(["a"]), [[1.0, 2.0], [3.0]], [torch.zeros(2)], 10**400])
+def test_what_is_no_tensor(given):
+    with pytest.raises(ShapeError, match="expected transient"):
+        Capture(given, AXIS, SCANS["single"])
+
+
+def test_a_capture_holds_what_was_measured():
+    for settings in ({}, {"steady": torch.zeros(1, 3, 4)}):
+        with pytest.raises(ShapeError, match=r"expected a transient \(with axis=\).*got neither"):
+            Capture(None, None, SCANS["single"], **settings)
+
+
+def test_captures_are_compared():
+    made = capture("single", steady=torch.rand(2, 3, 4), metadata={"seconds": 1.0})
+    assert made == pickle.loads(pickle.dumps(made)) == replace(made, metadata={}) and made in [capture("list"), made]
+    assert hash(made) == hash(made.clone())
+    unlike = [
+        made.map(lambda t: t + 1), made.to(torch.float64), replace(made, steady=None), made.crop(1.0, 1.5),
+        replace(made, channels=("a", "b")), replace(made, scan=SCANS["confocal"]),
+        replace(made, axis=TimeAxis(1.1, 0.1, 8)), made.transient, None,
+    ]  # fmt: skip
+    assert all(made != other for other in unlike)
+    holes = made.map(lambda t: torch.where(t > 0.5, t, torch.nan))
+    assert holes == holes.clone() != made
+
+
 def test_metadata_is_plain():
     made = capture("single", metadata={"spp": 64, "name": "Z"})
     assert json.loads(json.dumps(made.metadata))["spp"] == 64
@@ -167,5 +216,8 @@ def test_captures_are_records():
     leaves, tree = _pytree.tree_flatten(made)
     again = _pytree.tree_unflatten([2 * leaf for leaf in leaves], tree)
     assert torch.equal(again.transient, 2 * made.transient)
+    for anything in (None, 3, np.zeros(2)):
+        (leaf,), _ = _pytree.tree_flatten(_pytree.tree_unflatten([anything], tree))
+        assert leaf is anything
     grown = made.map(lambda t: t.requires_grad_())
     assert grown.transient.requires_grad and not grown.detach().transient.requires_grad

@@ -72,7 +72,7 @@ FUNCTIONS = {
     ),
     "Capture": (
         tt.nlos.Capture, {"transient": CAPTURE.transient, "axis": AXIS, "scan": PAIRS},
-        "axis scan metadata frequencies channels polarized",
+        "transient axis scan metadata phasor frequencies steady channels polarized",
     ),
     "Capture.crop": (CAPTURE.crop, {"start_opl": 2.0, "end_opl": 2.5}, "start_opl end_opl"),
     "Capture.single": (CAPTURE.single, {}, "laser"),

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from torchtransient.tensor_record import TensorRecord
 _CHANNEL_AND_TIME = 2
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Capture(TensorRecord):
     """A capture around a corner: the light that leaves each sensor point of `scan` towards the sensor's origin.
 
@@ -36,9 +37,12 @@ class Capture(TensorRecord):
     JSON can hold); that of a batch is a list under ``batch``. ``axis`` is in metres of optical path, counted as the
     scan's ``first_and_last_leg`` says.
 
+    Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory where they can.
+    Two captures are equal when all but ``metadata`` is.
+
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in results of renders: they concern the measured
     tensors; the scan stays where it is, as the axes do (``capture.scan.to(device)`` moves it). Raises ShapeError where
-    tensors, scan and axis do not fit, StorageError for metadata that is not plain.
+    tensors, scan and axis do not fit or nothing was measured, StorageError for metadata that is not plain.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
@@ -55,13 +59,18 @@ class Capture(TensorRecord):
 
     def __post_init__(self) -> None:
         self._check_settings()
-        # Trees of tensors (``torch.utils._pytree``) take records apart and put anything into their places.
-        if isinstance(self.transient, Tensor):
+        for name in ("transient", "phasor", "steady"):
+            object.__setattr__(self, name, _measured(name, getattr(self, name)))
+        if self.transient is None and self.phasor is None:
+            raise ShapeError(
+                "Capture: expected a transient (with axis=), a phasor (with frequencies=) or both, got neither."
+            )
+        if self.transient is not None:
             self._check("transient", self.transient, None if self.axis is None else self.axis.num_bins, "axis")
-        if isinstance(self.phasor, Tensor):
+        if self.phasor is not None:
             count = None if self.frequencies is None else self.frequencies.num_frequencies
             self._check("phasor", self.phasor, count, "frequencies")
-        if isinstance(self.steady, Tensor):
+        if self.steady is not None:
             self._check_shape("steady", self.steady, ("C",), self.scan.shape)
         try:
             json.dumps(self.metadata, default=_refuse_plain)
@@ -190,3 +199,17 @@ class Capture(TensorRecord):
 
 def _refuse_plain(value: object) -> Any:
     raise TypeError(f"{type(value).__name__} is not plain data")
+
+
+def _measured(name: str, values: Any) -> Tensor | None:
+    """Numbers of any library as a tensor. Raises ShapeError for what holds none."""
+    if values is None or isinstance(values, Tensor):
+        return values
+    try:
+        if hasattr(values, "__array__"):
+            array = np.asarray(values)
+            # Torch knows neither other byte orders, nor negative strides, nor memory that is not to be written to.
+            return torch.from_numpy(np.require(array, array.dtype.newbyteorder("="), ["C", "W"]))
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ShapeError(f"Capture: expected {name} as a tensor of numbers, got {shown(values)}: {error}.") from None

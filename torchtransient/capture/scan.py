@@ -13,10 +13,11 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture.distances import bounds_of, longest, shortest
-from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, same, unit_normals
+from torchtransient.capture.scan_checks import check_shapes, check_sides, float64_points, unit_normals
 from torchtransient.capture.wall import Wall, grid_size, triple
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.quantities import flag, positive, real_array, shown
+from torchtransient.tensor_record import same
 
 KINDS = ("single", "confocal", "exhaustive")
 # Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -83,17 +81,10 @@ def check_sides(scan: Scan) -> None:
         if behind:
             raise SceneError(
                 f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
-                f"{heights.numel()} points do not see: it is behind them by up to {-float(heights.min()):.4g} m. Move "
+                f"{heights.numel()} points do not see: it is {_behind(float(heights.min()))}. Move "
                 "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
             )
 
 
-def same(a: Any, b: Any) -> bool:
-    """Whether two tensors, arrays or dictionaries of them have equal values, wherever they are."""
-    if isinstance(a, Tensor) and isinstance(b, Tensor):
-        return a.shape == b.shape and bool(torch.equal(a.detach().cpu(), b.detach().cpu()))
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return np.shape(a) == np.shape(b) and bool(np.array_equal(a, b))
-    return bool(a == b)
+def _behind(height: float) -> str:
+    return f"behind them by up to {-height:.4g} m" if height < 0 else "in the wall itself"

@@ -33,7 +33,7 @@ FORMAT = "torchtransient result 1"
 _WHAT = "result file"
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result(TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 

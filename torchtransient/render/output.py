@@ -65,7 +65,7 @@ class RenderStats:
 _OF_FILMS = ("transient", "phasor", "gated", "axis", "frequencies", "gates")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RenderOutput(TensorRecord):
     """A rendered scene.
 

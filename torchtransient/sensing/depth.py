@@ -125,7 +125,7 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     return (weights * (_positions(scores) - middle)).sum(TIME) + middle
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Returns(TensorRecord):
     """``position`` in bins and ``strength`` (the entry there), (..., C, R, H, W), in order of time; ``valid``: bool,
     the same shape. Entries that are not valid come last and hold zero."""

@@ -32,7 +32,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 _TURN = 2 * math.pi
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ItofReading(TensorRecord):
     """``phase`` (..., C, F, H, W) radians in [0, 2 pi); ``amplitude`` and ``offset`` in electrons per tap and
     ``confidence`` = amplitude / offset, all (..., C, F, H, W); ``depth_m`` (..., C, H, W) metres from the camera."""

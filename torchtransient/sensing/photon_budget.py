@@ -73,7 +73,7 @@ class Optics:
         return angle * self.pixel_area_m2 * self.transmission
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BudgetReport(TensorRecord):
     """Where the detections of a pixel come from. Rates per laser cycle, before pile-up and dead time.
 

@@ -120,8 +120,8 @@ def scan_layout(
     """A matplotlib figure of a scan in space: wall, sensor points, laser spots and both origins; lengths in metres.
 
     `hidden`: as in `tt.nlos.simulate`, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
-    with both, of meshes as arrays, rectangles, cubes, disks, spheres and cylinders. Writes the figure when `path` is given.
-    Raises ShapeError for what is no scan, SceneError for other shapes and mesh files, StorageError.
+    with both, of meshes as arrays, rectangles, cubes, disks, spheres and cylinders. Writes the figure when `path` is
+    given. Raises ShapeError for what is no scan, SceneError for other shapes and mesh files, StorageError.
     """
     scan = scan.scan if isinstance(scan, Capture) else scan
     if not isinstance(scan, Scan):
