@@ -210,3 +210,11 @@ def test_a_grid_of_one_point_is_a_scan():
     assert Scan.grid(WALL, 1, kind="confocal").sensor_points.tolist() == [[[0, 0, 0]]]
     assert Scan.grid(WALL, 1, kind="single", laser=(0.2, 0.2)).pairs == 1
     assert Scan.grid(WALL, 1, kind="exhaustive", laser_grid=2).shape == (2, 2, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("height", "words"), [(0.0, "it is in the wall itself"), (-0.25, "behind them by up to 0.25 m")]
+)
+def test_origins_that_see_nothing(height, words):
+    with pytest.raises(SceneError, match=words):
+        Scan.grid(Wall.plane(2.0, 2.0), 2, kind="confocal", sensor_origin=(0.0, 0.0, height))

@@ -186,7 +186,8 @@ def test_pictures(folder):
     [(("own.yaml", "-o", "a.exr"), "ends in .h5"), (("own.yaml", "-o", "no/a.h5"), "does not exist"),
      (("no.yaml",), "cannot be read"), (("own.yaml", "--param", "a=1"), "fill the $NAMES of XML files alone, got a"),
      (("own.txt",), "expected a capture as YAML"), (("own.yaml", "--variant", "scalar_rgb"), "scalar_rgb"),
-     (("own.yaml", "--layout", "a.xyz"), "ends in .png")],
+     (("own.yaml", "--layout", "a.xyz"), "--layout: expected a name that ends in .png"),
+     (("own.yaml", "--peak-time", "no/a.png"), "--peak-time: the folder 'no' does not exist")],
 )  # fmt: skip
 def test_mistakes_are_said_before_anything_is_rendered(folder, arguments, message):
     result = run(*arguments, "--quiet")

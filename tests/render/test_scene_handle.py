@@ -318,7 +318,7 @@ def test_bad_arguments(scene, message):
 
 
 def test_xml_parameters_need_xml():
-    with pytest.raises(tt.errors.SceneError, match="spp only have a meaning for XML"):
+    with pytest.raises(tt.errors.SceneError, match=r"XML files \(spp\) are for these alone, got dict"):
         tt.load(make_room(), spp=4)
 
 

@@ -160,7 +160,9 @@ def load(
         return Scene(describe_xml(scene, xml_parameters), variant)
     if xml_parameters:
         names = ", ".join(sorted(xml_parameters))
-        raise SceneError(f"tt.load: {names} only have a meaning for XML files, got {type(scene).__name__}.")
+        raise SceneError(
+            f"tt.load: $parameters of XML files ({names}) are for these alone, got {type(scene).__name__}."
+        )
     if isinstance(scene, Scene):
         return scene if variant is None or variant == scene.variant else Scene(scene._description, variant)
     if isinstance(scene, Mapping):
