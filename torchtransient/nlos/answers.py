@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Scan
+from torchtransient.capture import Capture, Scan
 from torchtransient.errors import PhysicsWarning, SceneError
 from torchtransient.nlos.scene import film_size, laser_size
 from torchtransient.sensing import Compose, Device, GradPolicy, Sensor
@@ -44,15 +44,23 @@ def is_readable(tensor: torch.Tensor) -> bool:
     return True
 
 
-def say_black(who: str) -> None:
-    """Warn of a capture without light."""
-    warnings.warn(
-        f"{who}: no light comes back from the hidden things. Meshes scatter on the side that their normals point to "
-        "(corners run counterclockwise as seen from there), which has to face the wall; others need a 'twosided' bsdf. "
-        "Black albedos, energy 0 and things behind the wall give nothing, either.",
-        PhysicsWarning,
-        stacklevel=3,
+def black_message(who: str, within: str = "") -> str:
+    """What is said of a capture without light. ``within``: where there is none, of what is known of a part alone."""
+    return (
+        f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
+        "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
+        "'twosided' bsdf. Black albedos, energy 0, things behind the wall and bounces= that no light takes give nothing, "
+        "either."
     )
+
+
+def say_black(who: str, capture: Capture) -> None:
+    """Warn of a capture without light."""
+    found = (capture.steady, capture.transient, capture.phasor)
+    light = next(tensor for tensor in found if tensor is not None)
+    if not bool(light.any()):
+        within = " within the bins" if light is capture.transient else ""
+        warnings.warn(black_message(who, within), PhysicsWarning, stacklevel=3)
 
 
 def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:

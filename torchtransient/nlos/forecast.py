@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from torchtransient.errors import PhysicsWarning, StorageError
+from torchtransient.nlos.renderer import light_of
 from torchtransient.nlos.work import Work
 from torchtransient.render.memory import available_bytes
 from torchtransient.render.variant import active_variant
@@ -57,12 +58,7 @@ def forecast_of(work: Work, *, timed: bool) -> Forecast:
     taken = math.prod(shape) * _BYTES * (1 if work.film.frequencies is None else 2)
     _check_fits(taken, shape, work)
     with active_variant(work.variant.name):
-        from torchtransient.plugins.around_corner.explanation import explanation
-
-        renderer = work.renderer(0)
-        built = renderer.scene.built(renderer._options).scene
-        integrator, sensor = built.integrator(), built.sensors()[0]
-        light = explanation(integrator, built, integrator.contents(built, sensor))
+        light = light_of(work.renderer(0))
         seconds = _seconds(work) if timed else None
     return Forecast(
         scan=repr(work.scan), shape=shape, bytes=taken, seconds=seconds, spp=work.film.spp, parts=work.count,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,11 +10,11 @@ import torch
 from torch import nn
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import PhysicsWarning, SceneError, TorchTransientError
+from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import checked_module, is_readable, measured, say_black
+from torchtransient.nlos.answers import black_message, checked_module, is_readable, measured
 from torchtransient.nlos.arguments import check_is_scan, check_seeds, check_sensor, checked_samples, keys_and_values
-from torchtransient.nlos.scan_watch import ScanWatch
+from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
 from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
 from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
 from torchtransient.render.build import BuildOptions
@@ -31,6 +30,8 @@ from torchtransient.sensing import Device
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
 ORIGIN, LASER_ORIGIN = f"{WALL}.{SENSOR}.sensor_origin", f"{WALL}.{SENSOR}.laser_origin"
 _FIELDS = {POINTS: "sensor_points", SPOTS: "laser_points", ORIGIN: "sensor_origin", LASER_ORIGIN: "laser_origin"}
+# What a finding about a capture without light is about.
+_BLACK = "light of a capture"
 # Settings of a renderer that say what is measured.
 _WHAT_IS_MEASURED = frozenset(("time_axis", "frequencies", "gates", "film", "effects"))
 
@@ -56,7 +57,11 @@ class CaptureRenderer(nn.Module):
 
     Values that put something hidden between the wall and an origin, all of it behind the wall, or points off the wall
     are rendered as they are, and said as a ``PhysicsWarning``, once a scene (the constructor raises SceneError for
-    such a set-up; ``physics="error"`` does for values too, ``"ignore"`` does not look).
+    such a set-up; ``physics="error"`` raises PhysicsError for values too, ``"ignore"`` does not look). So are captures
+    without any light.
+
+    ``metadata`` of a capture: ``spp``, ``seed`` (a list of a batch), ``seconds``, ``variant``, and ``light``: how which
+    light was found in the first call.
     """
 
     def __init__(
@@ -93,6 +98,7 @@ class CaptureRenderer(nn.Module):
             raise SceneError("CaptureRenderer: a sensor takes transients; give time_axis= instead of another film.")
         self.sensor = None if sensor is None else checked_module(sensor, self.renderer.axis)
         self.says_black = True
+        self._explained: str | None = None
         check_scan(self.renderer.scene, scan, self.renderer._options)
         moving = needing_slope(self.renderer._infos, self.renderer._keys)
         if moving:
@@ -125,10 +131,23 @@ class CaptureRenderer(nn.Module):
         if values is not None:
             given |= keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
-        if self.says_black and is_readable(out.steady) and not bool(out.steady.detach().any()):
-            self.says_black = False  # once
-            say_black("CaptureRenderer")
-        return as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
+        self._say_black(out)
+        capture = as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
+        return replace(capture, metadata={**capture.metadata, "light": self._light()})
+
+    def _light(self) -> str:
+        """How which light is found, as it was with the values of the first call."""
+        if self._explained is None:
+            self._explained = light_of(self.renderer)
+        return self._explained
+
+    def _say_black(self, out: RenderOutput) -> None:
+        """Of a capture without light, unless what was said of its scan explains it."""
+        watch, told = self.renderer._watch, self.renderer.scene.told
+        if not self.says_black or not watch.looks or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
+            return
+        if (watch.mode == "error" or _BLACK not in told) and is_readable(out.steady) and not bool(out.steady.any()):
+            watch.tell(_BLACK, black_message("CaptureRenderer"))
 
     def _scan_of(self, given: Mapping[str, Any]) -> Scan:
         """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or
@@ -148,11 +167,11 @@ class CaptureRenderer(nn.Module):
         try:
             return replace(self.scan, **changed, **_lasting(self.scan))
         except TorchTransientError as error:
-            warnings.warn(
-                f"CaptureRenderer: these points are no scan ({error}) capture.scan is the one of the constructor.",
-                PhysicsWarning,
-                stacklevel=3,
-            )
+            if self.renderer._watch.looks:
+                self.renderer._watch.tell(
+                    "points of a scan",
+                    f"CaptureRenderer: points of a call are no scan, capture.scan is the constructor's: {error}",
+                )
             return self.scan
 
 
@@ -161,6 +180,16 @@ def _lasting(scan: Scan) -> dict[str, torch.Tensor | None]:
     found = {"sensor_normals": scan.sensor_normals, "laser_normals": scan.laser_normals}
     flat = all(n is None or bool((n == n.reshape(-1, 3)[0]).all()) for n in found.values())
     return found if flat else dict.fromkeys(found)
+
+
+def light_of(renderer: TransientRenderer) -> str:
+    """How a capture's scene, as it is built, finds which light."""
+    with active_variant(renderer.scene.variant):
+        from torchtransient.plugins.around_corner.explanation import explanation
+
+        built = renderer.scene.built(renderer._options).scene
+        integrator, sensor = built.integrator(), built.sensors()[0]
+        return explanation(integrator, built, integrator.contents(built, sensor))
 
 
 def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
@@ -255,7 +284,11 @@ def as_capture(
     # The steady image of an exhaustive scan sums over the laser's positions.
     steady = None if scan.kind == "exhaustive" else steady_in_scan_shape(out.steady, scan)
     polarized = out.stats.variant.endswith("polarized")
-    metadata = {"spp": out.stats.spp, "variant": out.stats.variant, "seconds": out.stats.seconds}
+    seeds = out.stats.seeds
+    metadata = {
+        "spp": out.stats.spp, "seed": seeds[0] if len(seeds) == 1 else list(seeds), "seconds": out.stats.seconds,
+        "variant": out.stats.variant,
+    }  # fmt: skip
     return Capture(
         transient=shaped(transient), axis=out.axis, scan=scan, metadata=metadata, phasor=shaped(out.phasor),
         frequencies=out.frequencies, steady=steady, channels=tuple(out.channels), polarized=polarized,

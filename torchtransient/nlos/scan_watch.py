@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from torchtransient.nlos.scene_scan import reaches_before
 
+# What findings are about.
+SENSOR_RAYS, LASER_RAYS, HIDDEN = "sensor of a scan", "laser of a scan", "hidden things of a scan"
+
 
 @dataclass(frozen=True, eq=False)
 class ScanWatch:
@@ -47,7 +50,7 @@ class ScanWatch:
         found = {}
         for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
             if wrong.any():
-                found[f"{who} of a scan"] = (
+                found[SENSOR_RAYS if who == "sensor" else LASER_RAYS] = (
                     f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
                     f"values of a call: something stands between the wall and {who}_origin, or points and wall have "
                     "parted. What the rays meet is what is rendered there."
@@ -56,7 +59,7 @@ class ScanWatch:
         hidden = [shape for shape in scene.shapes() if shape.ptr != wall.ptr]
         upright = self.normals if self.normals is not None else np.array(normals).T
         if not reaches_before(hidden, np.array(points).T, upright):
-            found["hidden things of a scan"] = (
+            found[HIDDEN] = (
                 "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and "
                 "has no gradient that would bring it back."
             )

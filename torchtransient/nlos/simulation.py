@@ -101,9 +101,7 @@ def simulate(
             print(forecast, file=sys.stderr)
         whole = kept is None and work.count == 1
         capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
-        light = capture.steady if capture.steady is not None else capture.transient
-        if light is not None and not bool(light.any()):
-            say_black("simulate")
+        say_black("simulate", capture)
         if chain is not None:
             capture = replace(capture, transient=_through(capture.transient, capture.scan, chain, generator))
         if kept is not None and not keep_part:

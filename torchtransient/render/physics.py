@@ -54,7 +54,8 @@ class PhysicsWatch:
         """Whether anything is looked at."""
         return self.mode != "ignore"
 
-    def _tell(self, about: str, message: str) -> None:
+    def tell(self, about: str, message: str) -> None:
+        """Say a finding, in the way of the mode; those that are about the same once."""
         if self.mode == "error":
             raise PhysicsError(f"{message} With physics='warn' it is computed all the same.")
         if about not in self._told:
@@ -66,26 +67,26 @@ class PhysicsWatch:
         for number, (key, message) in enumerate(findings.items()):
             if number < _SAID_OF_A_SCENE:
                 more = len(findings) - _SAID_OF_A_SCENE if number == _SAID_OF_A_SCENE - 1 else 0
-                self._tell(key, message + (f" So {'is' if more == 1 else 'are'} {more} more." if more > 0 else ""))
+                self.tell(key, message + (f" So {'is' if more == 1 else 'are'} {more} more." if more > 0 else ""))
 
     def value(self, key: str, value: torch.Tensor, low: float, high: float) -> None:
         """A value of a call, with its smallest and largest number."""
         limits = self.ranges.get(key)
         if limits is not None:
             if limits.above(high):
-                self._tell(key, outside_message(key, limits, low, high))
+                self.tell(key, outside_message(key, limits, low, high))
             elif limits.below(low):
-                self._tell(f"{key} too small", outside_message(key, limits, low, high))
+                self.tell(f"{key} too small", outside_message(key, limits, low, high))
         elif key in self.transforms and (self.mode == "error" or key not in self._told):
             matrices = value.detach().cpu().numpy().reshape(-1, *value.shape[-2:])
             if any(is_singular(matrix) for matrix in matrices):
-                self._tell(key, singular_message(key))
+                self.tell(key, singular_message(key))
 
     def placed(self, scene: Any, sensor: int) -> None:
         """A built scene that holds the values of a call, before it is rendered."""
         if self.looks and self.installed is not None:
             for about, message in self.installed(scene, sensor).items():
-                self._tell(about, message)
+                self.tell(about, message)
 
     def window(self, steady: torch.Tensor, channels: int, before: float, after: float) -> None:
         """A render in the film's layout, whose first ``channels`` hold the light, and what its window missed."""
@@ -93,7 +94,7 @@ class PhysicsWatch:
             return
         total = float(steady[..., :channels].sum(dtype=torch.float64)) / channels
         if total > 0 and before + after > MISSED * total:
-            self._tell(
+            self.tell(
                 self.window_name,
                 f"the window misses {(before + after) / total:.1%} of the light: {before / total:.1%} arrives before "
                 f"it, {after / total:.1%} after it. tt.plan(scene) finds a window; a start_opl that is earlier, more "
