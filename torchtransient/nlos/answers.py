@@ -49,7 +49,7 @@ def black_message(who: str, within: str = "") -> str:
     return (
         f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
         "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
-        "'twosided' bsdf. Black albedos, energy 0, things behind the wall and bounces= that no light takes give nothing, "
+        "'twosided' bsdf. Black albedos, energy 0, things behind the wall and bounces= that no light takes give none "
         "either."
     )
 
