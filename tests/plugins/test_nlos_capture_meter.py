@@ -194,7 +194,8 @@ def test_a_field_of_view_and_spots():
 
 
 def test_no_light_is_light_of_nothing():
-    assert float(simulate(complete(laser={"energy": 0.0})).transient.abs().max()) == 0
+    with pytest.warns(PhysicsWarning, match="no light comes back"):
+        assert float(simulate(complete(laser={"energy": 0.0})).transient.abs().max()) == 0
 
 
 def test_energy_below_zero_as_a_value():
