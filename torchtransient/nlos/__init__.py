@@ -1,4 +1,18 @@
-"""Around the corner: scans of a relay wall, and captures of what cannot be seen from where laser and sensor stand."""
+"""Around the corner: scans of a relay wall, and captures of what cannot be seen from where laser and sensor stand.
+
+- `Wall`: the relay wall, `Wall.plane(...)`, `Wall.mesh(...)` or `Wall.of(...)` of a description
+- `Scan`: which of its points are lit and seen, `Scan.grid(...)` or `Scan.points(...)`
+- `Capture`: what was measured there, tensors with their scan and axis
+- `simulate`: the capture of hidden things by a scan, or of a complete scene; whole, or in parts that a file keeps
+- `forecast`: the memory and time that `simulate` would take, and how it finds which light
+- `CaptureRenderer`: captures as a differentiable layer
+- `capture_scene`: the scene dictionary of hidden things and a scan
+- `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
+- `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
+
+What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
+docs/nlos.md.
+"""
 
 from torchtransient.capture import Capture as Capture
 from torchtransient.capture import Scan as Scan
