@@ -242,3 +242,41 @@ def test_batches_and_phasors_are_refused():
     many = Capture(capture.transient.expand(5, -1, -1, -1), AXIS, capture.scan)
     with pytest.raises(ShapeError, match="one channel or three"):
         tt.vis.transients_grid(many)
+
+
+WRONG = (
+    "x", b"x", True, [], [1], (1, 2, 3, 4), {}, {"a": 1}, float("nan"), float("inf"), -1, 0, 1.5, 2**33, 1j,
+    np.zeros((2, 2)), torch.tensor([1.0, 2.0]), ["a", "b", "c"], object(), (1.0, "x"), (None, None),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("draw", "right", "arguments"),
+    [
+        (
+            tt.vis.transients_grid,
+            {"capture": confocal_plane(size=(2, 1))},
+            "capture style rows columns laser limits path",
+        ),
+        (tt.vis.transients_grid, {"capture": exhaustive()}, "laser"),
+        (tt.vis.peak_time_map, {"capture": confocal_plane(size=(2, 1))}, "capture laser limits path"),
+        (tt.vis.wall_frames, {"capture": confocal_plane(size=(2, 1))}, "capture laser every"),
+        (
+            tt.vis.wall_video,
+            {"capture": confocal_plane(size=(2, 1)).crop(1.5, 1.6), "path": "a.gif"},
+            "capture path fps",
+        ),
+        (tt.vis.scan_layout, {"scan": exhaustive().scan}, "scan path hidden"),
+    ],
+)
+def test_only_errors_of_this_library(tmp_path, monkeypatch, draw, right, arguments):
+    """Whatever is handed to a picture of a capture: it is drawn, or a typed error says why not."""
+    monkeypatch.chdir(tmp_path)
+    for argument in arguments.split():
+        refused = 0
+        for value in WRONG:
+            try:
+                draw(**right | {argument: value})
+            except TorchTransientError:
+                refused += 1
+        assert refused >= 10, argument

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import real_array, shown
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, picture_figure, save_figure, save_image, to_bytes
@@ -79,7 +80,7 @@ def rainbow(
     cube = torch.nan_to_num(cube, posinf=0.0, neginf=0.0)
     image = torch.nan_to_num(steady, nan=0.0, posinf=0.0, neginf=0.0)[None]
     level = tone_map(image, exposure_of(image, 0.95) if exposure is None else exposure)[..., 0].numpy()
-    low, high = _arrival_limits(cube, axis) if limits is None else _checked(limits)
+    low, high = _arrival_limits(cube, axis) if limits is None else checked_limits(limits)
     if style == "peak":
         shown = colour_maps.rainbow(_hue(peak_time(cube, axis).numpy(), low, high, period_opl), level)
     else:
@@ -126,7 +127,7 @@ def _to_linear(shown: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _limits(peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, float] | None) -> tuple[float, float]:
     if limits is not None:
-        return _checked(limits)
+        return checked_limits(limits)
     known = peaks[np.isfinite(peaks)]
     if not known.size:
         return axis.start_opl, axis.end_opl
@@ -143,10 +144,12 @@ def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
     return first, last + axis.bin_width_opl
 
 
-def _checked(limits: tuple[float, float]) -> tuple[float, float]:
-    if len(limits) != 2:
-        raise ShapeError(f"limits: expected two lengths in metres, got {limits!r}.")
-    low, high = (float(v) for v in limits)
-    if not low < high:
+def checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
+    """Two lengths in metres. Raises ShapeError for what is no pair of numbers, UnitError for those that do not rise."""
+    pair = real_array(limits)
+    if pair is None or pair.shape != (2,):
+        raise ShapeError(f"limits: expected two lengths in metres, got {shown(limits)}.")
+    low, high = pair.tolist()
+    if not (np.isfinite(pair).all() and low < high):
         raise UnitError(f"limits: expected two lengths in metres, the first below the second, got {limits!r}.")
     return low, high

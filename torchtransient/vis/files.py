@@ -29,7 +29,7 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
         raise _missing("pillow") from error
     try:
         Pillow.fromarray(image).save(path)
-    except (OSError, ValueError, KeyError) as error:  # an unknown ending is a ValueError
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # an unknown ending is a ValueError
         raise StorageError(f"{who}: cannot write '{path}': {error}. Choose a writable .png.") from error
     return image
 
@@ -40,7 +40,7 @@ def save_figure(figure: Any, path: str | Path | None, who: str, dpi: int = 120) 
         return figure
     try:
         figure.savefig(path, dpi=dpi)
-    except (OSError, ValueError) as error:  # matplotlib raises ValueError for an unknown ending
+    except (OSError, ValueError, TypeError, AttributeError) as error:  # an unknown ending is a ValueError
         raise StorageError(f"{who}: cannot write '{path}': {error}. Choose a writable .png.") from error
     return figure
 

@@ -12,11 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.quantities import shown
-from torchtransient.vis.arrival import peak_time_picture
+from torchtransient.vis.arrival import checked_limits, peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.hidden_shapes import SQUARE, hidden_polygons
 from torchtransient.vis.video import Frames, FrameSettings, frames
@@ -48,11 +49,11 @@ def transients_grid(
     """
     cube, axis, scan = _one_spot(capture, laser, "transients_grid")
     if limits is not None:
-        part = Capture(cube, axis, scan).crop(*limits)
+        part = Capture(cube, axis, scan).crop(*checked_limits(limits))
         cube, axis = _transient(part, "transients_grid")
-    style = style or ("curves" if cube.ndim == 4 else "image")
-    if style not in STYLES:
-        raise UnitError(f"transients_grid: expected style 'curves' or 'image', got {style!r}.")
+    style = ("curves" if cube.ndim == 4 else "image") if style is None else style
+    if not isinstance(style, str) or style not in STYLES:
+        raise UnitError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
     if style == "curves" and cube.ndim != 4:
         raise ShapeError(
             f"transients_grid: expected a grid of sensor points for curves, got a list of {scan.pairs}; style='image' "
@@ -61,8 +62,12 @@ def transients_grid(
     if style == "image":
         figure = _image(cube, axis)
     else:
-        if rows < 1 or columns < 1:
-            raise ShapeError(f"transients_grid: expected at least one row and column, got {rows} and {columns}.")
+        try:
+            rows, columns = quantities.count("rows", rows), quantities.count("columns", columns)
+        except SceneError:
+            raise ShapeError(
+                f"transients_grid: expected at least one row and column, got {shown(rows)} and {shown(columns)}."
+            ) from None
         figure = _curves(cube, axis, _chosen(cube.shape[2], rows), _chosen(cube.shape[3], columns))
     figure.suptitle(title or _title(capture, laser), fontsize=10)
     return save_figure(figure, path, "transients_grid")

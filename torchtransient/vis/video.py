@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient import quantities
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError
+from torchtransient.errors import SceneError, ShapeError
 from torchtransient.vis.files import Image, enlarge, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.stamps import moment, with_strip
@@ -73,8 +74,12 @@ def frames(
     ShapeError and UnitError.
     """
     cube, axis, word = images_of(source, axis, "frames")
-    if every < 1 or int(every) != every:
-        raise ShapeError(f"frames: expected every to be a whole number of at least 1, got {every!r}.")
+    try:
+        every = quantities.count("every", every)
+    except SceneError:
+        raise ShapeError(
+            f"frames: expected every to be a whole number of at least 1, got {quantities.shown(every)}."
+        ) from None
     bins, (height, width) = cube.shape[1], cube.shape[2:]
     count = -(-bins // every)
     if exposure is None:

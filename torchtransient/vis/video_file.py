@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.quantities import positive, shown
 from torchtransient.vis.files import Image
 from torchtransient.vis.stamps import DIM, GROUND, INK
 
@@ -24,7 +25,10 @@ _KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
 
 def check_video(path: str | Path) -> Path:
     """Return `path`, or raise StorageError when `write_video` could not write there. For before a long render."""
-    target = Path(path)
+    try:
+        target = Path(path)
+    except TypeError:
+        raise StorageError(f"video: expected the name of a file, got {shown(path)}.") from None
     if target.suffix.lower() not in ENDINGS:
         raise StorageError(f"video: expected a name that ends in .mp4 or .gif, got '{path}'.")
     if not target.parent.is_dir():
@@ -50,8 +54,10 @@ def write_video(
     imageio-ffmpeg is missing (extra `vis`).
     """
     target = check_video(path)
-    if not (math.isfinite(fps) and fps > 0):
-        raise UnitError(f"video: expected fps > 0, got {fps!r}.")
+    try:
+        fps = positive("fps", fps)
+    except UnitError:
+        raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
     if count < 1:
         raise ShapeError("video: expected at least one frame, got none.")
     try:
