@@ -131,8 +131,8 @@ class CaptureRenderer(nn.Module):
         return as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
 
     def _scan_of(self, given: Mapping[str, Any]) -> Scan:
-        """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or that
-        ``torch.vmap`` hides, leave it as it was made.
+        """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or
+        that ``torch.vmap`` hides, leave it as it was made.
         """
         now = {key: {**self.renderer.values, **given}.get(key) for key in _points_of(self.scan)}
         if all(value is None for value in now.values()):
