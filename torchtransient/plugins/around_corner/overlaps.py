@@ -21,7 +21,7 @@ from torchtransient.plugins.sampling.point_sets import plane_points
 from torchtransient.plugins.transport.strategy import Local
 
 # Points that are looked at from the wall, and as many from those that are seen.
-POINTS = 2**14
+POINTS = 2**13
 # So many of them have to lie in something else. Where surfaces cross, rounding finds one in a hundred thousand.
 FEWEST = 3
 # Heights over each other, in offsets, at which lines see both of two surfaces.
@@ -33,7 +33,7 @@ _SEEDS = (0x51ED270B, 0x7FEB352D)
 
 def overlaps(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> list[str]:
     """Names of the shapes that lie in others, or whose own triangles lie in each other, where light finds them: seen
-    from wall points ``(P, 3)``, or from what those see. Overlaps of less than one in five thousand of the density of
+    from wall points ``(P, 3)``, or from what those see. Overlaps of less than one in two thousand of the density of
     ``elements`` may stay unnoticed.
     """
     with dr.suspend_grad():

@@ -78,7 +78,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
         which costs less, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling`` and
         ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that can
-        be drawn on every hidden shape, no triangles in others, an ``nlos_capture_meter``, one flat wall that scan and
+        be drawn on every hidden shape, no surface in another, an ``nlos_capture_meter``, one flat wall that scan and
         laser meet, and a variant without wavelengths and polarization. Both have the same mean. Where a wall lights
         itself, points of it next to a scanned one weigh without bound, and ``auto`` takes paths. So do derivatives of
         exhaustive captures.
