@@ -8,7 +8,6 @@ import pytest
 
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, transform
 from torchtransient.plugins.around_corner.division import Division
-from torchtransient.plugins.sampling.doubled_faces import doubled_faces
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -120,24 +119,204 @@ def test_a_black_sheet_hides_what_is_just_behind_it(kind, way):
 
 TWICE = ((0, 2, 1), (1, 2, 3), (0, 2, 1), (2, 3, 1))
 BACK = ((0, 2, 1), (1, 2, 3), (0, 1, 2), (1, 3, 2))
-DOUBLED = {
-    "listed twice": (lambda: {"a": plate(1.0, faces=TWICE)}, 2),
-    "two plates": (lambda: {"a": plate(1.0), "b": plate(1.0, name="b")}, 2),
-    "both sides, one-sided": (lambda: {"a": plate(1.0, faces=BACK)}, 0),
-    "both sides, two-sided": (lambda: {"a": plate(1.0, faces=BACK, two_sided=True)}, 2),
-    "once": (lambda: {"a": plate(1.0)}, 0),
-    "just behind": (lambda: {"a": plate(1.0), "b": plate(1.0 + 1e-5, name="b")}, 0),
-}
+CROSS = ((0, 2, 3), (0, 3, 1))
+TWO_SIDED = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.7}}
 
 
-@pytest.mark.parametrize("name", DOUBLED)
-def test_triangles_in_triangles_count_once(name):
-    hidden, faces = DOUBLED[name]
-    assert sum(doubled_faces(list(hidden().values())).values()) == faces
+def square(z=1.0, size=0.5):
+    return {"type": "rectangle", "to_world": facing(z, size), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
+
+
+def disk(z=1.0, size=0.3):
+    return square(z, size) | {"type": "disk"}
+
+
+def facing(z, size):
+    return transform().translate([0, 0, z]).rotate([0, 1, 0], 180).scale(size)
+
+
+def sphere(x=0.0):
+    return {"type": "sphere", "center": [x, 0, 1.0], "radius": 0.3, "bsdf": TWO_SIDED}
+
+
+def cube(x=0.0, z=1.2, size=0.2):
+    return {"type": "cube", "to_world": transform().translate([x, 0, z]).scale(size), "bsdf": TWO_SIDED}
+
+
+def box_on_floor():
+    below = transform().translate([0, -0.5, 1]).rotate([1, 0, 0], -90).scale([0.6, 0.4, 1])
+    box = transform().translate([0, -0.3, 1]).scale(0.2)
+    return {
+        "floor": {"type": "rectangle", "to_world": below, "bsdf": TWO_SIDED},
+        "box": {"type": "cube", "to_world": box, "bsdf": TWO_SIDED},
+    }
+
+
+# What is hidden, what it looks like (the same where None), and whether some of it lies in other parts.
+OVERLAPS = {
+    "listed twice": (lambda: {"a": plate(1.0, faces=TWICE)}, lambda: {"a": plate(1.0)}, True),
+    "two plates": (lambda: {"a": plate(1.0), "b": plate(1.0, name="b")}, lambda: {"a": plate(1.0)}, True),
+    "other diagonal": (
+        lambda: {"a": plate(1.0), "b": plate(1.0, faces=CROSS, name="b")}, lambda: {"a": plate(1.0)}, True
+    ),
+    "both sides, two-sided": (
+        lambda: {"a": plate(1.0, faces=BACK, two_sided=True)}, lambda: {"a": plate(1.0)}, True
+    ),
+    "tile in a plate": (lambda: {"a": plate(1.0), "b": square(1.0, 0.2)}, lambda: {"a": plate(1.0)}, True),
+    "disk in a plate": (lambda: {"a": plate(1.0), "b": disk()}, lambda: {"a": plate(1.0)}, True),
+    "a millionth before": (lambda: {"a": plate(1.0), "b": disk(1 - 1e-6)}, lambda: {"a": plate(1.0)}, True),
+    "a millionth behind": (lambda: {"a": plate(1.0), "b": disk(1 + 1e-6)}, lambda: {"a": plate(1.0)}, True),
+    "spheres": (lambda: {"a": sphere(), "b": sphere()}, lambda: {"a": sphere()}, True),
+    "front of cubes": (lambda: {"a": cube(), "b": cube(0.05, 1.1, 0.1)}, lambda: {"a": cube()}, True),
+    "just behind": (lambda: {"a": plate(1.0), "b": plate(1.0 + 1e-5, name="b")}, lambda: {"a": plate(1.0)}, False),
+    "side by side": (lambda: {"a": cube(-0.2), "b": cube(0.2)}, None, False),
+    "box on a floor": (box_on_floor, None, False),
+    "balls that cross": (lambda: {"a": sphere(), "b": sphere(0.2)}, None, False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_surfaces_in_surfaces_count_once(name):
+    hidden, alone, overlap = OVERLAPS[name]
     found = division(scan_scene(hidden(), third_bounce="auto"))
-    assert bool(found.shared) == (not faces)
-    if faces:
-        assert "some triangles lie in others" in found.why_not
-    runs = captures(scan_scene(hidden(), third_bounce="auto"), 2**11, 8)
-    # Where two surfaces are at one place, half of what is drawn is not what rays find.
-    agree(runs, captures(scan_scene({"a": plate(1.0)}), 2**11, 8), 0.02)
+    assert bool(found.shared) == (not overlap)
+    if overlap:
+        assert "some surfaces lie in others" in found.why_not
+    if alone is None:
+        expected = captures(scan_scene(hidden(), nlos_hidden_geometry_sampling=False), 2**13, 8)
+    else:
+        expected = captures(scan_scene(alone()), 2**11, 8)
+    for way in ("auto", "paths"):
+        # Where two surfaces are at one place, half of what is drawn is not what rays find.
+        agree(captures(scan_scene(hidden(), **EVERY_WAY[way]), 2**11, 8), expected, 0.02)
+
+
+def test_fronts_in_backs_are_left_to_chance():
+    """Of two surfaces at one place a ray may meet the one that turns its back to it."""
+    assert not division(scan_scene({"a": plate(1.0, faces=BACK)})).shared
+    light = captures(scan_scene({"a": plate(1.0, faces=BACK)}), 2**9, 4).sum()
+    assert light < 1.02 * captures(scan_scene({"a": plate(1.0)}), 2**9, 4).sum()
+
+
+def test_overlaps_are_of_the_scene_as_it_is_now():
+    apart, together = ({"a": plate(1.0), "b": plate(z, name="b")} for z in (1.2, 1.0))
+    once = captures(scan_scene({"a": plate(1.0)}), 2**11, 4).sum() / 4
+    for first, z in ((apart, 1.0), (together, 1.2)):
+        scene = mi.load_dict(scan_scene(first), optimize=False)
+        scene.integrator().render(scene, spp=16, seed=0)
+        shown = mi.traverse(scene)
+        moved = np.array(shown["b.vertex_positions"]).reshape(-1, 3)
+        moved[:, 2] = z
+        shown["b.vertex_positions"] = mi.Float(moved.ravel())
+        shown.update()
+        # Without the first plate's shadow on the second, light would be half as much again.
+        assert np.array(scene.integrator().render(scene, spp=2**11, seed=1)[1]).sum() == pytest.approx(once, rel=0.02)
+
+
+# -------------------------------------------------------------------------------------------------- fronts and backs
+
+
+def turned(shape, albedo=0.7, two_sided=False):
+    bsdf = {"type": "diffuse", "reflectance": albedo}
+    return shape | {"bsdf": {"type": "twosided", "nested": bsdf} if two_sided else bsdf}
+
+
+def mirrored(x, y, z, flip=False):
+    def made(two_sided):
+        to_world = transform().translate([0.1, 0.05, 0.9]).rotate([0, 1, 0], 160).scale([0.3 * x, 0.3 * y, 0.3 * z])
+        return turned({"type": "rectangle", "to_world": to_world, "flip_normals": flip}, two_sided=two_sided)
+
+    return made
+
+
+def mirrored_cube(two_sided):
+    to_world = transform().translate([0.1, 0.05, 0.9]).rotate([0, 1, 0], 30).scale([-0.2, 0.2, 0.2])
+    return turned({"type": "cube", "to_world": to_world}, two_sided=two_sided)
+
+
+def normals_against_corners(two_sided, interpolated=False):
+    """A plate whose corners run clockwise as seen from where its normals point."""
+    v = np.array([[-0.3, -0.3, 0.9], [0.4, -0.3, 0.8], [-0.3, 0.3, 0.9], [0.4, 0.3, 0.8]])
+    made = mi.Mesh("a", 4, 2, has_vertex_normals=True, props=properties(0.7, two_sided))
+    shown = mi.traverse(made)
+    n = np.tile([-1 / 50**0.5, 0, -7 / 50**0.5], (4, 1))
+    if interpolated:
+        n[::2] = [-0.28, 0, -0.96]
+    shown["vertex_positions"] = mi.Float(v.ravel().astype(np.float32))
+    shown["faces"] = mi.UInt32([0, 1, 2, 2, 1, 3])
+    shown["vertex_normals"] = mi.Float(n.ravel().astype(np.float32))
+    shown.update()
+    return made
+
+
+# Faces the wall, or turns its back to it.
+SIDES = {
+    "as it is": (mirrored(1, 1, 1), True), "x": (mirrored(-1, 1, 1), True), "z": (mirrored(1, 1, -1), False),
+    "x, flipped": (mirrored(-1, 1, 1, True), False), "z, flipped": (mirrored(1, 1, -1, True), True),
+    "all": (mirrored(-1, -1, -1), False), "cube": (mirrored_cube, True),
+    "normals against corners": (normals_against_corners, True),
+    "interpolated against corners": (lambda two_sided: normals_against_corners(two_sided, True), True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("two_sided", [False, True], ids=["one-sided", "two-sided"])
+@pytest.mark.parametrize("name", SIDES)
+def test_fronts_are_where_shading_normals_point(name, two_sided):
+    made, faces = SIDES[name]
+    ways = {"brute": ({"nlos_hidden_geometry_sampling": False}, 2**14)}
+    ways |= {way: (EVERY_WAY[way], 2**11) for way in ("auto", "paths")}
+    runs = {
+        way: captures(scan_scene({"a": made(two_sided)}, "single", film(3, start=0.0, width=0.05), **given), spp, 8)
+        for way, (given, spp) in ways.items()
+    }
+    if not (faces or two_sided):
+        assert all(run.sum() == 0 for run in runs.values())
+        return
+    agree(runs["auto"], runs["brute"], 0.02)
+    agree(runs["paths"], runs["brute"], 0.02)
+
+
+@pytest.mark.parametrize("kind", ["single", "confocal"])
+@pytest.mark.parametrize(
+    ("scale", "flip", "two_sided"),
+    [
+        ([-0.5, 0.5, 1], False, False), ([-0.5, 0.5, 1], True, True),
+        ([0.5, 0.5, -1], True, False), ([0.5, 0.5, -1], False, True),
+    ],
+)  # fmt: skip
+def test_mirrored_walls(scale, flip, two_sided, kind):
+    wall = turned({"type": "rectangle", "to_world": transform().scale(scale), "flip_normals": flip}, 0.9, two_sided)
+    expected = captures(scan_scene({"a": plane()}, kind), 2**11, 8)
+    for given in EVERY_WAY.values():
+        agree(captures(scan_scene({"a": plane()}, kind, wall=wall, **given), 2**11, 8), expected, 0.02)
+
+
+def seen_on_the_plate(size=800):
+    """Mean over the picture of what the plate sends that the spot lights, without samples."""
+    at = (2 * (np.arange(size) + 0.5) / size - 1) * np.tan(np.radians(30))
+    x, y = (a.ravel() for a in np.meshgrid(at, at))
+    # Where lines from (0, 0, 1) along (x, y, -1) meet the plane x = 0.42.
+    t = 0.42 / np.where(x > 0, x, np.nan)
+    p = np.stack([0.42 + 0 * t, t * y, 1 - t], 1)
+    on = (np.abs(p[:, 1]) < 0.3) & (np.abs(p[:, 2] - 0.2) < 0.15)
+    to = p[on] - [-0.2, 0.1, 0.0]
+    r = np.linalg.norm(to, axis=1)
+    return (0.9 * 0.7 / np.pi**2 * to[:, 0] * to[:, 2] / r**4).sum() / size**2
+
+
+@pytest.mark.parametrize("size", [1, 2, 8])
+def test_cameras_whose_pixel_centres_lie_on_a_wall_see_more(size):
+    """Light of two bounces comes by way of a plate between the pixels' centres, or at their edges."""
+    look = transform().look_at([0, 0, 1.0], [0, 0, 0], [0, 1, 0])
+    upright = transform().translate([0.42, 0, 0.2]).rotate([0, 1, 0], -90).scale([0.15, 0.3, 1])
+    camera_film = film(size, start=0.0, width=0.1, bins=100)
+    description = scan_scene({"plate": turned({"type": "rectangle", "to_world": upright}, two_sided=True)}, "single")
+    description["wall"] = turned({"type": "rectangle", "to_world": transform().scale([2, 2, 1])}, 0.9)
+    description["camera"] = {
+        "type": "perspective", "fov": 60, "to_world": look, "film": camera_film, "sampler": {"type": "independent"}
+    }  # fmt: skip
+    description["integrator"] |= {"max_depth": 2}
+    mean = captures(description, 2**16 // size**2, 8).reshape(8, -1).sum(1) / size**2
+    error = mean.std(ddof=1) / 8**0.5
+    assert error < 0.02 * mean.mean()
+    assert abs(mean.mean() - seen_on_the_plate()) < SIGMAS * error

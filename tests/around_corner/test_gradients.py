@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from support.marks import long_pairs
 from support.moved_captures import MovedCapture, move, turn
-from support.nlos_scenes import film, plane, scan_scene, side
+from support.nlos_scenes import film, plane, scan_scene, side, transform
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.usefixtures("no_leftovers")
@@ -175,3 +176,75 @@ def test_second_backward_and_batches():
     capture = capture_of(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))
     first, again = capture.reverse(1, 4096), capture.reverse(1, 4096)
     assert first == pytest.approx(again, rel=1e-5)  # threads add in the order they come
+
+
+def bitmap(values=((0.2, 0.9, 0.3), (0.5, 0.4, 0.8))):
+    data = mi.Bitmap(np.array(values, dtype=np.float32)[..., None])
+    return {"type": "bitmap", "bitmap": data, "raw": True, "wrap_mode": "clamp"}
+
+
+FORWARD = {
+    "hidden bitmap": ("a.bsdf.reflectance.data", lambda start, θ: start * (1 + θ)),
+    "wall's bitmap": ("wall.bsdf.reflectance.data", lambda start, θ: start * (1 + θ)),
+    "pose": ("a.to_world", move(0, 0, 1)),
+}
+
+
+@pytest.mark.parametrize("third_bounce", ["auto", "paths"])
+@pytest.mark.parametrize("by_caller", [False, True], ids=["leaf", "propagated"])
+@pytest.mark.parametrize("name", FORWARD)
+def test_tangents_arrive_whoever_brings_them(name, by_caller, third_bounce):
+    """Set on a value of the scene itself or on what it comes from, propagated by the caller or not."""
+    key, change = FORWARD[name]
+    hidden = plate()
+    hidden["a"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap()}
+    wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": bitmap()}}
+    description = scan_scene(hidden, "single", film(3, **SMOOTH), wall=wall, third_bounce=third_bounce)
+    capture = MovedCapture(description, key, change)
+    expected = capture.reverse(0, 2**10)
+    θ = mi.Float(0)
+    dr.enable_grad(θ)
+    dr.set_grad(θ, 1.0)
+    capture.install(θ)
+    if by_caller:
+        dr.enqueue(dr.ADMode.Forward, θ)
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+    forward = capture.weighed(capture.scene.integrator().render_forward(capture.scene, capture.parameters, spp=2**10))
+    assert forward == pytest.approx(expected, rel=1e-4)
+    assert abs(forward) > 0
+
+
+@pytest.mark.parametrize("third_bounce", ["auto", "paths"])
+def test_a_leaf_of_the_scene_itself_carries_a_tangent(third_bounce):
+    hidden = plate()
+    hidden["a"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap()}
+    description = scan_scene(hidden, "single", film(3, **SMOOTH), third_bounce=third_bounce)
+    capture = MovedCapture(description, "a.bsdf.reflectance.data", lambda start, θ: start + θ)
+    expected = capture.reverse(0, 2**10)
+    value = mi.TensorXf(capture.start["a.bsdf.reflectance.data"])
+    dr.enable_grad(value)
+    dr.set_grad(value, 1.0)
+    capture.parameters["a.bsdf.reflectance.data"] = value
+    capture.parameters.update()
+    found = capture.scene.integrator().render_forward(capture.scene, capture.parameters, spp=2**10)
+    assert capture.weighed(found) == pytest.approx(expected, rel=1e-4)
+
+
+def mirrored():
+    return transform().translate([0.1, 0.05, 1.0]).rotate([0, 1, 0], 160).scale([-0.3, 0.3, 1])
+
+
+@pytest.mark.parametrize("third_bounce", ["auto", "paths"])
+def test_mirrored_shapes_move_as_others_do(third_bounce):
+    """Their geometric normals point behind."""
+    hidden = plate()
+    hidden["a"]["to_world"] = mirrored()
+    capture = capture_of(
+        scan_scene(hidden, "single", film(3, **SMOOTH), third_bounce=third_bounce), "a.to_world", turn((0.1, 0.05, 1.0))
+    )
+    reverse = np.array([capture.reverse(seed, 2**13) for seed in range(6)])
+    assert capture.forward(0, 2**13) == pytest.approx(reverse[0], rel=1e-3)
+    differences = np.array([capture.difference(8e-3, 10 + seed, 2**14) for seed in range(6)])
+    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / 6)
+    assert abs(reverse.mean() - differences.mean()) < 5 * error + 1e-3 * abs(reverse.mean())
+    assert error < 0.05 * abs(reverse.mean())

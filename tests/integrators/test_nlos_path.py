@@ -334,5 +334,5 @@ def test_two_lasers():
 
 
 def test_nothing_is_hidden():
-    with pytest.raises(SceneError, match="hidden shapes: expected a surface to draw points on"):
+    with pytest.raises(SceneError, match="expected a surface to draw points on"):
         captures(scan_scene({}), 4, 1)

@@ -63,14 +63,14 @@ class MovedCapture:
             self.parameters[key] = self.change(start, θ)
         self.parameters.update()
 
-    def _weighed(self, images):
+    def weighed(self, images):
         image = images[0 if self.steady else 1]
         return float((np.array(image, dtype=np.float64) * np.array(self.adjoint, dtype=np.float64)).sum())
 
     def loss(self, θ, seed, spp):
         self.install(mi.Float(θ))
         with dr.suspend_grad():
-            return self._weighed(self.scene.integrator().render(self.scene, seed=seed, spp=spp))
+            return self.weighed(self.scene.integrator().render(self.scene, seed=seed, spp=spp))
 
     def difference(self, h, seed, spp):
         return (self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
@@ -91,7 +91,7 @@ class MovedCapture:
         dr.enable_grad(θ)
         self.install(θ)
         dr.set_grad(θ, 1.0)
-        return self._weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp))
+        return self.weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp))
 
     def boundary(self, spp=64):
         """The boundary term that a job of derivatives has, None for none."""

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
-from torchtransient.plugins.around_corner.geometry import OFFSET, occluded
+from torchtransient.plugins.around_corner.geometry import OFFSET, front_normal, occluded
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 from torchtransient.plugins.sampling.shared_samples import samples_at
 from torchtransient.plugins.sampling.sobol import DIMENSIONS, sobol, unit_double, unit_float
@@ -132,7 +132,7 @@ def _step(scene: Any, plan: ChainPlan, start: Vertices, d: Any, active: Any) -> 
     turn = dr.select(si.wi.z < 0, mi.Float(-1), 1)
     albedo = dr.select(lit, mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, lit)), 0)
     n = mi.Vector3f(si.sh_frame.n)
-    geometric_n = mi.Vector3f(si.n) if plan.elements.smooth else n
+    geometric_n = mi.Vector3f(front_normal(si)) if plan.elements.smooth else n
     alive = lit & (dr.max(albedo) > 0)
     return Vertices(
         p=si.p, n=n * turn, geometric_n=geometric_n * turn, albedo=albedo, value=albedo * dr.inv_pi, alive=alive,

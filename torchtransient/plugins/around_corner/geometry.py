@@ -36,6 +36,24 @@ def span(sample: Any, p: Any, n: Any) -> Local:
     )
 
 
+def front_normal(si: Any) -> Any:
+    """The geometric normal (Normal3f) on the side that the shading normal points to, where a one-sided surface
+    scatters: with mirrored transforms, and normals against the order of the corners, Mitsuba's own points behind.
+    """
+    return dr.mulsign(mi.Normal3f(si.n), dr.detach(dr.dot(si.sh_frame.n, si.n)))
+
+
+def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
+    """Whether points ``start`` (``p``, ``geometric_n``) see the points ``end``, which face them with the side of
+    ``n``: points of one plane do not.
+    """
+    to = mi.Vector3f(end - start.p)
+    line = Local(geometric_cos=dr.dot(start.geometric_n, to), r=dr.norm(to))
+    least = OFFSET * (dr.max(dr.abs(end)) + line.r)
+    seen = active & (dr.abs(line.geometric_cos) > least) & (-dr.dot(n, to) > least)
+    return seen & ~occluded(scene, start, line, end, n, seen)
+
+
 def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) -> Any:
     """Whether something stands between samples and wall points.
 

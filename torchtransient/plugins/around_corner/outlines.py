@@ -11,6 +11,7 @@ import numpy as np
 
 from torchtransient.errors import GradientError, TorchTransientWarning
 from torchtransient.plugins.around_corner.edges import EdgeTable
+from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.around_corner.hiding import Part, hiding_pairs, parts_of
 from torchtransient.plugins.around_corner.occlusion import BOUNCES, MutualOcclusion
 from torchtransient.plugins.integrators.launch import passes_of, seed_array
@@ -66,7 +67,8 @@ class Viewpoints:
 def _visible(si: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places, normals towards the viewer and shapes of those interactions that hit something."""
     valid = np.array(si.is_valid())
-    n = dr.select(si.wi.z < 0, -si.n, si.n)
+    n = front_normal(si)
+    n = dr.select(si.wi.z < 0, -n, n)
     numbers = np.array(dr.reinterpret_array(mi.UInt32, si.shape))
     return np.array(si.p, dtype=np.float64).T[valid], np.array(n, dtype=np.float64).T[valid], numbers[valid]
 

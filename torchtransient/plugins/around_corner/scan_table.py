@@ -11,12 +11,15 @@ import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner.geometry import front_normal
+from torchtransient.plugins.around_corner.overlaps import overlaps
 from torchtransient.plugins.around_corner.wall_points import WallPoints, points_of
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.mitsuba_compat import is_flat_shape
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.pointer_table import registry_number
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
+from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
 # Wall points along each side of a scan that stand for all of it in densities.
 ACROSS = 5
@@ -44,6 +47,29 @@ class ScanTable:
             check_count(aims, sensor, capture)
             self.spots = LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
         self.wall = self._wall()
+        self._elements: dict[frozenset[Any], HiddenElements] = {}
+        self._overlaps: dict[bool, list[str]] = {}
+
+    @property
+    def looks_at_points(self) -> bool:
+        """Whether all samples of a pixel look at one point, which cameras do not."""
+        return hasattr(self.sensor, "scanned")
+
+    def elements(self, without: list[Any]) -> HiddenElements:
+        """The table of hidden elements, but for those of the shapes ``without``. The same each time: not to be changed.
+        """
+        left_out = frozenset(shape.ptr for shape in without)
+        if left_out not in self._elements:
+            shapes = [shape for shape in self.scene.shapes() if shape.ptr not in left_out]
+            self._elements[left_out] = HiddenElements(shapes, *self.reference_points())
+        return self._elements[left_out]
+
+    def overlaps(self, with_wall: bool) -> list[str]:
+        """Names of hidden shapes that lie in others; ``with_wall``: a flat wall is one of them."""
+        if with_wall not in self._overlaps:
+            elements = self.elements([] if with_wall or self.wall is None else self.wall)
+            self._overlaps[with_wall] = overlaps(self.scene, elements, *self.reference_points())
+        return self._overlaps[with_wall]
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
         """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with
@@ -68,7 +94,8 @@ class ScanTable:
         with dr.suspend_grad():
             found = dr.gather(mi.PreliminaryIntersection3f, self.found, index)
             si = found.compute_surface_interaction(dr.gather(mi.Ray3f, dr.detach(self.rays), index), mi.RayFlags.All)
-            n = dr.select(si.wi.z < 0, -si.n, si.n)
+            n = front_normal(si)
+            n = dr.select(si.wi.z < 0, -n, n)
             dr.eval(si.p, n, si.t)
         valid = np.isfinite(np.array(si.t))
         if not valid.any():

@@ -28,13 +28,14 @@ from torchtransient.plugins.sampling.scan_tiles import ScanTiles, distance_to
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
 
-def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
-    """What stands against shared samples in a scene, None for nothing."""
+def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
+    """What stands against shared samples in a scene, None for nothing. ``with_wall``: points are drawn on it, too."""
+    scene, sensor = table.scene, table.sensor
     if mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()} gives every path wavelengths or a polarization of its own"
     if sensor.film().exhaustive_scan and sensor.film().lanes_at_most(1) is not None:
         return f"the film of an exhaustive capture is a {sensor.film().plugin}, which lists events"
-    if not hasattr(sensor, "scanned"):
+    if not table.looks_at_points:
         return f"the sensor ({sensor.class_name()}) is no nlos_capture_meter, whose pixels are points"
     if contents.media is not None:
         return "there are participating media"
@@ -49,17 +50,10 @@ def why_not(scene: Any, sensor: Any, contents: Any) -> str | None:
     unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
     if unlisted:
         return f"points cannot be drawn on {', '.join(unlisted[:3])}"
-    if contents.doubled_faces:
-        faces = [f"{count} of {name}" for name, count in contents.doubled_faces.items()]
-        return f"some triangles lie in others, and areas would count twice ({', '.join(faces[:3])})"
+    overlapping = table.overlaps(with_wall)
+    if overlapping:
+        return f"some surfaces lie in others, and areas would count twice ({', '.join(overlapping[:3])})"
     return None
-
-
-def elements_of(table: ScanTable, without: list[Any] | None) -> HiddenElements:
-    """The table of hidden elements of a scan, but for those of the shapes ``without``."""
-    left_out = {shape.ptr for shape in without or []}
-    shapes = [shape for shape in table.scene.shapes() if shape.ptr not in left_out]
-    return HiddenElements(shapes, *table.reference_points())
 
 
 @dataclass

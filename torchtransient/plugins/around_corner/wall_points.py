@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import ShapeError
+from torchtransient.plugins.around_corner.geometry import front_normal
 from torchtransient.plugins.bsdfs.lambertian import scatters_behind
 
 
@@ -50,7 +51,8 @@ def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
     side = dr.select(si.wi.z > 0, 1, dr.select(scatters_behind(bsdf) & (si.wi.z < 0), -1, 0))
     albedo = mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(si, valid))
     value = dr.select(valid & (side != 0), albedo * factor, 0)
-    n = dr.select(valid, dr.select(side < 0, -si.n, si.n), mi.Normal3f(0, 0, 1))
+    front = front_normal(si)
+    n = dr.select(valid, dr.select(side < 0, -front, front), mi.Normal3f(0, 0, 1))
     return WallPoints(dr.select(valid, si.p, 0), n, value, dr.select(valid, length, 0))
 
 

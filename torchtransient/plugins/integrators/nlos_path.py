@@ -19,7 +19,6 @@ from torchtransient.plugins.around_corner.scan_table import ScanTable, laser_of,
 from torchtransient.plugins.around_corner.shared_light import (
     SharedThirdBounce,
     add_late_light,
-    elements_of,
     scan_light,
     why_not,
 )
@@ -79,7 +78,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         Light of three bounces from hidden samples that all scanned points share (:mod:`..around_corner.third_bounce`),
         which costs less, or from paths like all other light. ``auto`` shares where ``nlos_laser_sampling`` and
         ``nlos_hidden_geometry_sampling`` are on and the scene allows it: everything diffuse, no media, points that can
-        be drawn on every hidden shape, no triangles in others, an ``nlos_capture_meter``, one flat wall that scan and
+        be drawn on every hidden shape, no surface in another, an ``nlos_capture_meter``, one flat wall that scan and
         laser meet, and a variant without wavelengths and polarization. Both have the same mean. Where a wall lights
         itself, points of it next to a scanned one weigh without bound, and ``auto`` takes paths. So do derivatives of
         exhaustive captures.
@@ -229,7 +228,8 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not ranges:
             return from_paths
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
-            reason = why_not(scene, contents.sensor, contents)
+            table = table or self.scan_table(scene, contents.sensor)
+            reason = why_not(table, contents, self.samples_wall)
         else:
             reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
         for name, (choice, _) in ranges.items():
@@ -237,7 +237,7 @@ class TransientNLOSPath(base.TransientIntegrator):
                 raise SceneError(f"transient_nlos_path: {name} is {choice!r}, but {reason}. Set it to 'auto'.")
         if reason:
             return replace(from_paths, why_not=reason)
-        wall = (table or self.scan_table(scene, contents.sensor)).wall
+        wall = table.wall
         shared = [found for choice, found in ranges.values() if wall is not None or choice != "auto"]
         if not shared:
             return replace(from_paths, why_not=NOT_FLAT)
@@ -274,7 +274,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         in_media = contents.media is not None
         surface = Lambertian if Lambertian.fits(contents) else Surface
         scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
-        return self._segment(contents)(), scattering, self._connections(table)
+        segment = self._segment(contents)
+        made = segment(bool(table.overlaps(self.samples_wall))) if segment is FoundVacuum else segment()
+        return made, scattering, self._connections(table)
 
     def _segment(self, contents: Any) -> type:
         if contents.media is not None:
@@ -294,9 +296,9 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not self.hidden_sampling:
             return []
         wall = contents.sensor.get_shape()
-        without = None if self.samples_wall or wall is None else [wall]
+        without = [] if self.samples_wall or wall is None else [wall]
         shares = (0.5, 0.5) if self.equal_shares or contents.media is not None else (AT_WALL, BEYOND)
-        return [HiddenGeometry(elements_of(table, without), *shares)]
+        return [HiddenGeometry(table.elements(without), *shares)]
 
     # ----------------------------------------------------------------------------------- primary rays
 
@@ -351,13 +353,8 @@ class TransientNLOSPath(base.TransientIntegrator):
     def _elements(self, world: Any) -> HiddenElements:
         """Hidden points as shared samples draw them: on the wall, too, where it lights itself."""
         table = self._table(world)
-        guides = [guide for guide in world.scattering.guides if isinstance(guide, HiddenGeometry)]
-        wall = [] if self.samples_wall or table.wall is None else table.wall
-        of_guide = [] if self.samples_wall or table.sensor.get_shape() is None else [table.sensor.get_shape()]
-        if guides and {shape.ptr for shape in wall} == {shape.ptr for shape in of_guide}:
-            # The paths' own table; a copy, of which elements may be put in another order.
-            return copy(guides[0].elements)
-        return elements_of(table, wall)
+        # A copy, of which elements may be put in another order.
+        return copy(table.elements([] if self.samples_wall or table.wall is None else table.wall))
 
     def _shared(self, world: Any, film: Any, seed: Any, samples: int) -> SharedThirdBounce:
         light, elements = self._light(self._table(world)), self._elements(world)

@@ -34,6 +34,8 @@ TRIANGLE, DISK, SPHERE, CYLINDER = range(4)
 _KINDS = {"Disk": DISK, "Sphere": SPHERE, "Cylinder": CYLINDER}
 # Points that stand for an element that is not flat or not small.
 _ACROSS = 4
+# By how much angles and lengths of axes may differ in single precision.
+_SHEAR = 1e-4
 
 
 @dataclass
@@ -41,7 +43,8 @@ class AreaElements:
     """Elements of ``shapes`` in the order of shapes and primitives, float64; ``E`` of them.
 
     ``axes`` ``(E, 4, 3)``: origin and three axes; ``kind``, ``shape``, ``primitive``, ``area`` ``(E,)``; ``normal``
-    ``(E, 3)`` of flat ones, as Mitsuba's interactions have it, else ``(sign / radius, 0, 0)``; ``two_sided``: whether
+    ``(E, 3)`` of flat ones, of the side that shading normals take for the front, else ``(sign / radius, 0, 0)``;
+    ``two_sided``: whether
     light scatters on the back as well. ``left_out``: names of the shapes that have no rows: copies of groups, curves,
     signed distances, ellipsoids.
     """
@@ -137,10 +140,23 @@ def local_point(kind: Any, a: Any, y: Any, math_of: Any, kinds: tuple[int, ...] 
 
 
 def can_be_listed(shape: Any) -> bool:
-    """Whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids."""
+    """Whether points can be drawn on a shape. Not on copies of groups, curves, signed distances and ellipsoids, nor on
+    sheared disks, spheres and cylinders, of which Mitsuba's rays meet something else than what its matrix says.
+    """
     if not has_surface(shape) or shape.is_ellipsoids():
         return False
-    return bool(shape.is_mesh() or shape.class_name() in _KINDS)
+    return bool(shape.is_mesh() or (shape.class_name() in _KINDS and not _is_sheared(shape)))
+
+
+def _is_sheared(shape: Any) -> bool:
+    """Whether the axes of an analytic shape have lost their right angles, or those of a round one their length."""
+    axes = _matrix(shape)[:3, :3].T
+    length = np.linalg.norm(axes, axis=1)
+    same = {"Disk": [], "Sphere": [0, 1, 2], "Cylinder": [0, 1]}[shape.class_name()]
+    # A disk has no thickness to be sheared.
+    pairs = [(0, 1)] if shape.class_name() == "Disk" else [(0, 1), (0, 2), (1, 2)]
+    oblique = any(abs(axes[i] @ axes[k]) > _SHEAR * length[i] * length[k] for i, k in pairs)
+    return oblique or (bool(same) and float(np.ptp(length[same])) > _SHEAR * float(length[same].max()))
 
 
 def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | None:
@@ -157,26 +173,42 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
     n = np.cross(e1, e2)
     twice = np.linalg.norm(n, axis=1)
     n /= np.where(twice > 0, twice, 1)[:, None]
+    at_corners = _corner_normals(mesh, f)
+    if at_corners is not None:
+        # A mirrored transform turns the order of the corners around, and not what is the front.
+        n *= np.where((at_corners.sum(1) * n).sum(1) < 0, -1, 1)[:, None]
     if mesh.has_flipped_normals():
         n = -n
     uncut = np.broadcast_to([0.0, 0.0, 1.0], o.shape)
     return np.stack([o, e1, e2, uncut], 1), TRIANGLE, twice / 2, n
 
 
+def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
+    """The normals at the corners of the triangles (F, 3, 3), None where there are none but those of their planes."""
+    if mesh.has_face_normals() or not mesh.has_vertex_normals():
+        return None
+    return np.array(dr.detach(mesh.vertex_normals_buffer()), dtype=np.float64).reshape(-1, 3)[faces]
+
+
 def has_shading_normals(shape: Any) -> bool:
-    """Whether the normals at the corners of some triangle are not those of its plane."""
-    if not shape.is_mesh() or shape.has_face_normals() or not shape.has_vertex_normals():
+    """Whether the normals at the corners of some triangle are not those of one side of its plane."""
+    if not shape.is_mesh():
+        return False
+    at_corners = _corner_normals(shape, np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3))
+    if at_corners is None:
         return False
     _, _, area, n = _triangles(shape)
-    corners = np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    at_vertices = np.array(dr.detach(shape.vertex_normals_buffer()), dtype=np.float64).reshape(-1, 3)
-    cos = (at_vertices[corners] * n[:, None]).sum(-1)
-    return bool(np.any(np.abs(cos[area > 0]) < 1 - 1e-6))
+    cos = (at_corners * n[:, None]).sum(-1) * (-1 if shape.has_flipped_normals() else 1)
+    return bool(np.any(cos[area > 0] < 1 - 1e-6))
+
+
+def _matrix(shape: Any) -> np.ndarray:
+    shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
+    return np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
 
 
 def _analytic(shape: Any, kind: int) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
-    shown = next(v for v in shown_by(shape)[0] if v.key == "to_world")
-    m = np.array(dr.detach(shown.read(shape).matrix), dtype=np.float64).reshape(4, 4)
+    m = _matrix(shape)
     o, a, b, c = m[:3, 3], m[:3, 0], m[:3, 1], m[:3, 2]
     inside_out = -1.0 if shape.has_flipped_normals() else 1.0
     if kind == DISK:

@@ -58,7 +58,8 @@ class HiddenElements:
         if not np.any(every.area > 0):
             raise SceneError(
                 f"hidden shapes: expected a surface to draw points on, got none on {_named(shapes)}: triangles without "
-                "area, or shapes that have no surface. Give them an area."
+                "area, shapes without a surface, copies of groups, curves, sheared disks and cylinders. Give them an "
+                "area, or turn nlos_hidden_geometry_sampling off."
             )
         cuts = cuts_of(every, points.reshape(-1, 3))
         parts, uncut, cell = cut(every, cuts)
@@ -179,8 +180,7 @@ class HiddenElements:
         """Where Mitsuba's interactions place the point of two numbers on an element: barycentrics of triangles, the
         point of the unit disk (``Point2f``); meaningless for spheres and cylinders.
         """
-        row = self._row(element, 3, active)
-        kind = mi.UInt32(row.w)
+        row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])
         # Of a part of a triangle, those of the uncut one.
         return dr.select(kind == TRIANGLE, mi.Point2f(row.x, row.y) + row.z * x, x)
@@ -191,6 +191,10 @@ class HiddenElements:
         low = dr.gather(mi.Float64, self._cdf, row + element, active)
         high = dr.gather(mi.Float64, self._cdf, row + element + 1, active)
         return mi.Float(high - low) / dr.gather(mi.Float, self._area, element, active)
+
+    def kind(self, element: Any, active: Any = True) -> Any:
+        """Which row of the table of :mod:`.area_elements` an element is of, ``UInt32``."""
+        return mi.UInt32(self._row(element, 3, active).w)
 
     def surface(self, element: Any, active: Any = True) -> tuple[Any, Any]:
         """Shape (``ShapePtr``) and primitive (``UInt32``) of an element of the table."""

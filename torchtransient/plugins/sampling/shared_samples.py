@@ -92,6 +92,8 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
     si = _interaction(elements, element, p, n, a, y)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
+    if smooth:
+        n = dr.mulsign(n, dr.dot(si.sh_frame.n, n))
     return SharedSamples(
         count=count, p=p, n=mi.Normal3f(si.sh_frame.n) if smooth else n, geometric_n=n,
         front=_scattered(si, 1.0), back=_scattered(si, -1.0), weight=weight,
@@ -109,9 +111,10 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
     pi, ray = _preliminary(elements, samples.element, samples.p, samples.geometric_n, a, y)
     si, area = material_point(pi, ray, mi.Mask(True), meshes)
     weight = samples.weight * dr.relative_grad(area)
-    n = mi.Vector3f(si.sh_frame.n if samples.smooth else si.n)
+    geometric_n = dr.mulsign(mi.Vector3f(si.n), dr.dot(mi.Vector3f(samples.geometric_n), dr.detach(si.n)))
+    n = mi.Vector3f(si.sh_frame.n) if samples.smooth else geometric_n
     front, back = (_scattered(si, side) * weight for side in (1.0, -1.0))
-    return Local(p=mi.Point3f(si.p), n=n, geometric_n=mi.Vector3f(si.n), front=front, back=back)
+    return Local(p=mi.Point3f(si.p), n=n, geometric_n=geometric_n, front=front, back=back)
 
 
 def not_diffuse(shapes: list[Any]) -> list[str]:

@@ -16,7 +16,6 @@ from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
 from torchtransient.plugins.sampling.distant import DistantReference
-from torchtransient.plugins.sampling.doubled_faces import doubled_faces
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.hits import DetachedHits
@@ -76,15 +75,7 @@ class SceneContents:
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
         self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
-        self._shapes, self._doubled = scene.shapes(), None
         self._built = True
-
-    @property
-    def doubled_faces(self) -> dict[str, int]:
-        """Meshes with triangles that lie in others, and how many, as the scene was when somebody first asked."""
-        if self._doubled is None:
-            object.__setattr__(self, "_doubled", doubled_faces(self._shapes))
-        return self._doubled
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
         """For the time of a derivative: what is attached here instead of by Mitsuba."""

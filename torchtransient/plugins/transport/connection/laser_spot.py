@@ -38,8 +38,8 @@ class LaserSpot(Connection):
     def __init__(self, table, confocal, legs):
         self.table, self.spots, self.confocal, self.legs = table, table.spots, confocal, legs
         self.points, self.packed, self.index = None, None, None
-        # No point of a flat wall sees another.
-        self.dark_at_first = table.wall is not None
+        # No point of a flat wall sees another; pixels of cameras may look past the wall.
+        self.dark_at_first = table.wall is not None and table.looks_at_points
 
     def prepare(self, world):
         if not world.scattering.turns_freely:

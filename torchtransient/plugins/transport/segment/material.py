@@ -14,7 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.around_corner.geometry import OFFSET, occluded
+from torchtransient.plugins.around_corner.geometry import sees
 from torchtransient.plugins.transport.carry import slope_only
 from torchtransient.plugins.transport.scattering.geometry_terms import distance, material_point
 from torchtransient.plugins.transport.segment.triangles import AttachedTriangles
@@ -60,7 +60,7 @@ class MaterialVacuum(Vacuum):
         with dr.suspend_grad():
             si = v.pi.compute_surface_interaction(v.ray, flags, active)
         si.p, si.n = dr.replace_grad(si.p, carry.p), dr.replace_grad(si.n, carry.n)
-        si.sh_frame.n = dr.replace_grad(si.sh_frame.n, carry.n)
+        si.sh_frame.n = dr.replace_grad(si.sh_frame.n, dr.mulsign(carry.n, dr.dot(si.sh_frame.n, dr.detach(si.n))))
         return si
 
     def _place(self, world, pi, ray, n, active):
@@ -100,7 +100,12 @@ class MaterialVacuum(Vacuum):
 class FoundVacuum(MaterialVacuum):
     """The same for walks with guides, which look at the end of a segment before they weigh it: what was found there is
     carried to the next turn of the loop. A leg is ``pi`` and ``si``, of which the loop keeps what is used.
+
+    ``overlaps``: some of what guides draw lies in something else (:mod:`~..around_corner.overlaps`).
     """
+
+    def __init__(self, overlaps):
+        self.overlaps = overlaps
 
     def first(self, world, ray, sampler):
         return self.known(super().first(world, ray, sampler), ray)
@@ -115,24 +120,16 @@ class FoundVacuum(MaterialVacuum):
 
     def depart_guided(self, world, ray, vertex, step, sampler, active):
         target = step.target
-        # Of triangles in triangles, a ray meets one.
-        if target is None or world.contents.doubled_faces:
+        # Of surfaces in surfaces, a ray meets one.
+        if target is None or self.overlaps:
             return self.depart(world, ray, vertex, vertex.β, sampler, active)
         # What a guide has drawn is there: all that is asked is whether it is seen, which rays find faster than what
         # they meet.
         guided = active & step.guided
         pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active & ~guided)
-        at = vertex.at
-        start = Local(p=at.p, geometric_n=mi.Vector3f(at.n))
-        end, n = step.point, mi.Vector3f(target.n)
-        to = end - at.p
-        line = Local(geometric_cos=dr.dot(start.geometric_n, to), r=dr.norm(to))
-        height = dr.dot(n, to)
-        n = dr.mulsign(n, -height)
-        # Points of one plane do not see each other.
-        least = OFFSET * (dr.max(dr.abs(end)) + line.r)
-        seen = guided & (dr.abs(line.geometric_cos) > least) & (dr.abs(height) > least)
-        seen &= ~occluded(world.scene, start, line, end, n, seen)
+        start, end = Local(p=vertex.at.p, geometric_n=mi.Vector3f(vertex.at.n)), step.point
+        n = dr.mulsign(mi.Vector3f(target.n), dr.dot(target.n, start.p - end))
+        seen = sees(world.scene, start, end, n, guided)
         pi.t = dr.select(guided, dr.select(seen, dr.norm(end - ray.o), dr.inf), pi.t)
         pi.prim_uv = dr.select(guided, target.uv, pi.prim_uv)
         pi.prim_index = dr.select(guided, step.primitive, pi.prim_index)
