@@ -20,17 +20,13 @@ def propagate_tangents(parameters, tables):
     ``tables``: what has been computed of them.
     """
     attached = parameters.attached_values()
-    # The parameters first: calls of plugins, which tables come from, cannot reach behind them.
-    if attached:
-        dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
-    # On to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so already.
+    # To them, and on to what plugins derive from them, such as the vertices of a rectangle; a caller may have done so
+    # already. In one go: a call of a plugin that tables come from runs into edges that no traversal knows of.
+    for value in attached + [table for table in tables if dr.grad_enabled(table)]:
+        dr.enqueue(dr.ADMode.Backward, value)
     for value in attached:
         dr.enqueue(dr.ADMode.Forward, value)
     dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-    # What comes from there, where the caller has.
-    tables = [table for table in tables if dr.grad_enabled(table)]
-    if tables:
-        dr.forward_to(*tables, flags=dr.ADFlag.ClearEdges)
 
 
 def tangents_of(values):
