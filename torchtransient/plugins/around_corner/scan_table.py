@@ -48,7 +48,6 @@ class ScanTable:
             self.spots = LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
         self.wall = self._wall()
         self._elements: dict[frozenset[Any], HiddenElements] = {}
-        self._overlaps: dict[bool, list[str]] = {}
 
     @property
     def looks_at_points(self) -> bool:
@@ -64,12 +63,19 @@ class ScanTable:
             self._elements[left_out] = HiddenElements(shapes, *self.reference_points())
         return self._elements[left_out]
 
-    def overlaps(self, with_wall: bool) -> list[str]:
-        """Names of hidden shapes that lie in others; ``with_wall``: a flat wall is one of them."""
-        if with_wall not in self._overlaps:
-            elements = self.elements([] if with_wall or self.wall is None else self.wall)
-            self._overlaps[with_wall] = overlaps(self.scene, elements, *self.reference_points())
-        return self._overlaps[with_wall]
+    def overlaps(self, known: dict[bytes, list[str]], with_wall: bool) -> list[str]:
+        """Names of hidden shapes that lie in others; ``with_wall``: a flat wall is one of them. ``known``: what has
+        been found of the scene before, by what it was like.
+        """
+        elements = self.elements([] if with_wall or self.wall is None else self.wall)
+        seen_from = self.reference_points()
+        key = elements.digest(*seen_from)
+        if key not in known:
+            # Of a scene that moves, the last few.
+            for old in list(known)[: max(0, len(known) - 3)]:
+                del known[old]
+            known[key] = overlaps(self.scene, elements, *seen_from)
+        return known[key]
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
         """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with

@@ -50,7 +50,7 @@ def why_not(table: ScanTable, contents: Any, with_wall: bool) -> str | None:
     unlisted = [shape.id() or shape.class_name() for shape in scene.shapes() if not can_be_listed(shape)]
     if unlisted:
         return f"points cannot be drawn on {', '.join(unlisted[:3])}"
-    overlapping = table.overlaps(with_wall)
+    overlapping = table.overlaps(contents.overlaps, with_wall)
     if overlapping:
         return f"some surfaces lie in others, and areas would count twice ({', '.join(overlapping[:3])})"
     return None

@@ -275,8 +275,10 @@ class TransientNLOSPath(base.TransientIntegrator):
         surface = Lambertian if Lambertian.fits(contents) else Surface
         scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
         segment = self._segment(contents)
-        made = segment(bool(table.overlaps(self.samples_wall))) if segment is FoundVacuum else segment()
-        return made, scattering, self._connections(table)
+        if segment is not FoundVacuum:
+            return segment(), scattering, self._connections(table)
+        overlaps = table.overlaps(contents.overlaps, self.samples_wall)
+        return FoundVacuum(bool(overlaps)), scattering, self._connections(table)
 
     def _segment(self, contents: Any) -> type:
         if contents.media is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from copy import copy
 from typing import Any
 
@@ -79,6 +80,13 @@ class HiddenElements:
         other.tile_count = len(weights)
         other._lay_out_densities(np.array([self._mixed(w) for w in np.asarray(weights, dtype=np.float64)]))
         return other
+
+    def digest(self, *arrays: np.ndarray) -> bytes:
+        """A number that differs for elements in other places, and for other ``arrays``."""
+        found = hashlib.blake2b(digest_size=16)
+        for array in (self.elements.axes, self.elements.kind, self.elements.shape, self.elements.primitive, *arrays):
+            found.update(np.ascontiguousarray(array).data)
+        return found.digest()
 
     # ----------------------------------------------------------------------------------------- tables
 

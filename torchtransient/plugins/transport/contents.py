@@ -75,6 +75,8 @@ class SceneContents:
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
         self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
+        # What :mod:`..around_corner.overlaps` has found of the scene, as it was then.
+        self.overlaps: dict[bytes, list[str]] = {}
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:
