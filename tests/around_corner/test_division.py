@@ -172,6 +172,7 @@ OVERLAPS = {
     "disk in a plate": (lambda: {"a": plate(1.0), "b": disk()}, lambda: {"a": plate(1.0)}, True),
     "a millionth before": (lambda: {"a": plate(1.0), "b": disk(1 - 1e-6)}, lambda: {"a": plate(1.0)}, True),
     "a millionth behind": (lambda: {"a": plate(1.0), "b": disk(1 + 1e-6)}, lambda: {"a": plate(1.0)}, True),
+    "disk in a disk": (lambda: {"a": disk(), "b": disk(size=0.1)}, lambda: {"a": disk()}, True),
     "spheres": (lambda: {"a": sphere(), "b": sphere()}, lambda: {"a": sphere()}, True),
     "front of cubes": (lambda: {"a": cube(), "b": cube(0.05, 1.1, 0.1)}, lambda: {"a": cube()}, True),
     "just behind": (lambda: {"a": plate(1.0), "b": plate(1.0 + 1e-5, name="b")}, lambda: {"a": plate(1.0)}, False),
@@ -195,6 +196,18 @@ def test_surfaces_in_surfaces_count_once(name):
     for way in ("auto", "paths"):
         # Where two surfaces are at one place, half of what is drawn is not what rays find.
         agree(captures(scan_scene(hidden(), **EVERY_WAY[way]), 2**11, 8), expected, 0.02)
+
+
+def test_a_poster_in_the_plane_of_the_wall():
+    """Of the two, paths meet what other rays meet."""
+    poster = {"type": "rectangle", "to_world": transform().translate([0.1, 0.1, 0]).scale(0.25), "bsdf": TWO_SIDED}
+    poster["bsdf"] = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.0}}
+    given = {"min_bounces": 5, "max_depth": 5}
+    hidden = {"a": plane(0.7, 0.6), "poster": poster}
+    ways = [({"nlos_hidden_geometry_sampling": False}, 2**15), (EVERY_WAY["paths"], 2**13), ({}, 2**11)]
+    runs = [captures(scan_scene(hidden, "single", film(3, start=0.0, width=0.1), **given, **k), n, 8) for k, n in ways]
+    agree(runs[1], runs[0], 0.03)
+    agree(runs[2], runs[0], 0.03)
 
 
 def test_fronts_in_backs_are_left_to_chance():
