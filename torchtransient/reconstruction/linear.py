@@ -7,6 +7,7 @@ kept for it, so that memory does not grow with what lies between.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -30,19 +31,23 @@ class _Apply(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        found = _Apply.apply(grad, ctx.operator, not ctx.adjoint)
+        found = _apply(grad, ctx.operator, not ctx.adjoint)
         return (found.real if ctx.real and found.is_complex() else found), None, None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
-        result: Tensor = _Apply.apply(tangent, ctx.operator, ctx.adjoint)
-        return result
+        return _apply(tangent, ctx.operator, ctx.adjoint)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, operator: LinearOperator, adjoint: bool) -> Any:
         # Leading dimensions are a batch anyway.
         dim = in_dims[0]
-        return _Apply.apply(x if dim is None else x.movedim(dim, 0), operator, adjoint), None if dim is None else 0
+        return _apply(x if dim is None else x.movedim(dim, 0), operator, adjoint), None if dim is None else 0
+
+
+def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
+    result: Tensor = _Apply.apply(x, operator, adjoint)  # type: ignore[no-untyped-call]
+    return result
 
 
 class LinearOperator(nn.Module):
@@ -74,14 +79,12 @@ class LinearOperator(nn.Module):
     def forward(self, volume: Tensor) -> Tensor:
         """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
         volume = self._taken("volume", volume, self.volume_shape, real=self.real_volume)
-        result: Tensor = _Apply.apply(volume, self, False)
-        return result
+        return _apply(volume, self, False)
 
     def adjoint(self, data: Tensor) -> Tensor:
         """``A^H data``: (..., *data_shape) to (..., *volume_shape). Raises ShapeError, DeviceError."""
         data = self._taken("data", data, self.data_shape, real=self.real_data)
-        result: Tensor = _Apply.apply(data, self, True)
-        return result
+        return _apply(data, self, True)
 
     def _taken(self, name: str, x: Tensor, shape: tuple[int, ...], *, real: bool) -> Tensor:
         who = type(self).__name__
@@ -106,12 +109,11 @@ class LinearOperator(nn.Module):
         return None if table is None else table.device
 
 
-def each(function: Any, x: Tensor, dims: int) -> Tensor:
+def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     """``function`` of every item of the leading dimensions of ``x``, one at a time; ``dims``: those of an item."""
     lead = x.shape[: x.ndim - dims]
     if not lead:
-        result: Tensor = function(x)
-        return result
+        return function(x)
     items = x.reshape(-1, *x.shape[x.ndim - dims :])
     if len(items) == 0:
         raise ShapeError(f"expected at least one item in the leading dimensions, got {tuple(lead)}.")
