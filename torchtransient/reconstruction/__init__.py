@@ -2,6 +2,7 @@
 
 from torchtransient.reconstruction.capture_roots import StabilisedRoot as StabilisedRoot
 from torchtransient.reconstruction.capture_roots import stabilised_root as stabilised_root
+from torchtransient.reconstruction.diffusion import DiffusionDeconvolution as DiffusionDeconvolution
 from torchtransient.reconstruction.directional_lct import DirectionalLCT as DirectionalLCT
 from torchtransient.reconstruction.directional_lct import directional_lct as directional_lct
 from torchtransient.reconstruction.fk import FK as FK

@@ -55,7 +55,7 @@ class ConeOperator(ConfocalOperator):
         return FALL[self.target]
 
     def tables(self) -> dict[str, Tensor]:
-        """Entries of the resampling matrices (``*_v``, ``*_t``: places, ``volume``, ``data`` and their inverses: values)
+        """Entries of the resampling matrices (places ``*_v``, ``*_t``; values ``volume``, ``data`` and inverses),
         and the tables of the kernels along y and x.
         """
         cone, (rows, columns) = self.cone, self.grid.size
@@ -131,7 +131,7 @@ class ConeOperator(ConfocalOperator):
         volume: Tensor = self.inverse(self.transients(transient))
         return volume
 
-    # ----------------------------------------------------------------------------- resampling, (Z or T, ...) <-> (V, ...)
+    # --------------------------------------------------------------------------- resampling, (Z or T, ...) <-> (V, ...)
 
     def _resampled(self, x: Tensor, values: str, *, transposed: bool, to_v: bool) -> Tensor:
         """``x`` (n, Y, X) times the matrix ``values``, whose rows are bins of v, or its transpose."""
@@ -140,17 +140,17 @@ class ConeOperator(ConfocalOperator):
         out = matrix.apply(x.reshape(len(x), -1), self.v_bins if to_v else self.axis.num_bins, transposed=transposed)
         return out.reshape(len(out), *self.grid.size)
 
-    # -------------------------------------------------------------------------------------------- convolutions in (V, Y, X)
+    # ---------------------------------------------------------------------------------------- convolutions in (V, Y, X)
 
     def _spectrum(self, x: Tensor) -> Tensor:
         """The transform along v of (V, Y, X), as (V' / 2 + 1, Y, X)."""
         rows, columns = self.grid.size
-        flat = torch.fft.rfft(x.reshape(len(x), -1).T.contiguous(), n=self.cone.padded)
+        flat: Tensor = torch.fft.rfft(x.reshape(len(x), -1).T.contiguous(), n=self.cone.padded)
         return flat.T.reshape(-1, rows, columns)
 
     def _of_spectrum(self, spectrum: Tensor) -> Tensor:
         """The (V, Y, X) of a transform along v; to be divided by nothing: its inverse."""
-        flat = torch.fft.irfft(spectrum.reshape(len(spectrum), -1).T, n=self.cone.padded)
+        flat: Tensor = torch.fft.irfft(spectrum.reshape(len(spectrum), -1).T, n=self.cone.padded)
         return flat[:, : self.v_bins].T.reshape(-1, *self.grid.size)
 
     def _convolved(self, components: list[Tensor], *, regularised: bool) -> Tensor:
@@ -213,11 +213,13 @@ class ConeOperator(ConfocalOperator):
         return [(spectrum[i : i + step], i, min(i + step, len(spectrum))) for i in starts]
 
     def _plane_fft(self, x: Tensor) -> Tensor:
-        return torch.fft.fft(torch.fft.fft(x, n=2 * self.grid.size[1], dim=2), n=2 * self.grid.size[0], dim=1)
+        over_x: Tensor = torch.fft.fft(x, n=2 * self.grid.size[1], dim=2)
+        return torch.fft.fft(over_x, n=2 * self.grid.size[0], dim=1)
 
     def _plane_ifft(self, x: Tensor) -> Tensor:
         rows, columns = self.grid.size
-        return torch.fft.ifft(torch.fft.ifft(x, dim=1)[:, :rows], dim=2)[..., :columns]
+        over_y: Tensor = torch.fft.ifft(x, dim=1)[:, :rows]
+        return torch.fft.ifft(over_y, dim=2)[..., :columns]
 
 
 class ConeInverse(LinearOperator):

@@ -5,9 +5,9 @@ A hidden point of strength rho and normal n sends light by the cosine towards th
 
     H(tau) = int nu . w r^-p delta(tau - 2 r) dV,    nu = rho n,    w = (x' - x, y' - y, -z) / r .
 
-In v and u that is the sum of three convolutions of the components of nu, of which the third is multiplied by z, with
-the cone times (x' - x), (y' - y) and -1. The regularised inverse, 3 x 3 for each frequency, has a closed form, since the
-three kernels give one number: nu_i = conj(a_i) H / (sum |a|^2 + noise).
+In v and u that is the sum of three convolutions of the components of nu, the third multiplied by z, with the cone times
+(x' - x), (y' - y) and -1. The regularised inverse, 3 x 3 for each frequency, has a closed form, since three kernels make
+one number: nu_i = conj(a_i) H / (sum |a|^2 + noise).
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ class DirectionalLCT(ConeOperator):
 
     ``operator(volume)``: vectors (..., 3, Z, Y, X), strength per m^3 times unit normal in world coordinates, to the
     light in each bin (..., T, Y, X), falling with the cosine at the surface and r^-4 (``target="diffuse"``) or r^-2
-    ("retroreflective"); ``operator.adjoint``, ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`, from
-    transients to such vectors. Their lengths are the albedo, their directions the normals, which point towards the wall.
+    ("retroreflective"); ``operator.adjoint``, ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`,
+    from transients to such vectors. Their lengths are the albedo, their directions the normals, towards the wall.
 
     ``snr``, ``v_bins``: as of :class:`LCT`. The three components are regularised alike at the middle of the volume's
-    depth; where nothing is measured, normals are noise.
+    depth; where nothing is measured, normals are noise. Of all
+    vectors that explain the light these are the shortest, which lean towards the wall: a plate tilted by 17 degrees
+    comes out at 13, one by 34 at 21.
 
     Not supported: what :class:`LCT` does not; the squared cosine of confocal light, for which the linear one stands.
     Raises as :class:`LCT`.

@@ -1,8 +1,8 @@
 """The light cone in the coordinates v = r^2 and u = z^2, where it is one convolution (O'Toole, Lindell, Wetzstein,
 "Confocal non-line-of-sight imaging based on the light-cone transform", Nature 555, 2018).
 
-Light of hidden points of strength rho per m^3 arrives as H(tau) = int rho r^-p delta(tau - 2 r) dV, p = 4 of diffuse and
-2 of retroreflective points. With v = (tau / 2)^2,
+Light of hidden points of strength rho per m^3 arrives as H(tau) = int rho r^-p delta(tau - 2 r) dV, p = 4 of diffuse
+and 2 of retroreflective points. With v = (tau / 2)^2,
 
     H dtau = r^-p dv int rho / (2 sqrt u) delta(v - u - x^2 - y^2) du dx dy .
 
@@ -64,7 +64,7 @@ class ConeGrid:
         return float(self.edges[-1] - self.edges[0]) / (len(self.edges) - 1)
 
     def overlaps(self, of_depth: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """(index of v, index of time, overlap) of all pairs of bins that overlap; lengths in v, m^2, or in r, metres."""
+        """(index of v, index of time, overlap) of all bins that overlap; lengths in v, m^2, or in r, metres."""
         squares = self.radii**2
         # Both partitions together cut the axis into intervals, each of which lies in one bin of either.
         cuts = torch.cat([squares, self.edges[1:-1]]).sort().values
