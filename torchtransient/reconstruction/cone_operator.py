@@ -11,9 +11,9 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.quantities import count, positive, shown
-from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
+from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator, chunk_rows
 from torchtransient.reconstruction.light_cone import ConeGrid, Resampling
-from torchtransient.reconstruction.linear import LinearOperator, each
+from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
 
 FALL = {"diffuse": 4, "retroreflective": 2}
@@ -222,14 +222,10 @@ class ConeOperator(ConfocalOperator):
         return torch.fft.ifft(over_y, dim=2)[..., :columns]
 
 
-class ConeInverse(LinearOperator):
-    """The regularised inverse of a light-cone transform, as a linear operator from transients to volumes."""
+class ConeInverse(InverseOperator):
+    """The regularised inverse of a light-cone transform, from transients to volumes."""
 
-    def __init__(self, operator: ConeOperator) -> None:
-        super().__init__()
-        self.operator = operator
-        self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
-        self.dtype = operator.dtype
+    operator: ConeOperator
 
     def map_(self, x: Tensor) -> Tensor:
         return each(lambda data: self.operator._back(data, inverse=True), x, 3)

@@ -106,6 +106,21 @@ class ConfocalOperator(LinearOperator):
         return f"{rows} x {columns} points, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
 
 
+class InverseOperator(LinearOperator):
+    """A regularised inverse of an operator, itself a linear operator: from its data to its volume."""
+
+    def __init__(self, operator: ConfocalOperator) -> None:
+        super().__init__()
+        self.operator = operator
+        self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
+        self.dtype = operator.dtype
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.dtype = self.operator.dtype
+        return self
+
+
 def precision_of(capture: Capture) -> torch.dtype:
     """float64 for captures of float64, float32 for all others."""
     double = capture.transient is not None and capture.transient.dtype == torch.float64

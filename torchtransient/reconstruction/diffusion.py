@@ -18,8 +18,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import UnitError
 from torchtransient.quantities import finite, positive
-from torchtransient.reconstruction.confocal_operator import ConfocalOperator
-from torchtransient.reconstruction.linear import LinearOperator, each
+from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
 
 IMAGES = 20
@@ -153,14 +153,10 @@ class DiffusionDeconvolution(ConfocalOperator):
         return kernel.conj() / (kernel.abs().square() + 1 / self.snr)
 
 
-class SlabInverse(LinearOperator):
-    """The Wiener inverse of :class:`DiffusionDeconvolution`, as a linear operator."""
+class SlabInverse(InverseOperator):
+    """The Wiener inverse of :class:`DiffusionDeconvolution`."""
 
-    def __init__(self, operator: DiffusionDeconvolution) -> None:
-        super().__init__()
-        self.operator = operator
-        self.volume_shape = self.data_shape = operator.data_shape
-        self.dtype = operator.dtype
+    operator: DiffusionDeconvolution
 
     def map_(self, x: Tensor) -> Tensor:
         wiener = self.operator._wiener()
