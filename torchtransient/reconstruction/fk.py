@@ -47,7 +47,7 @@ class FK(ConfocalOperator):
 
     ``operator(field)``: complex (..., Z, Y, X) at time zero to the real wavefield (..., T, Y, X) on the wall, the
     exploding-reflector model; ``operator.adjoint(wavefield)``: the migration. They are each other's adjoints exactly,
-    and all but each other's inverses: migration times model is J, the cosine of the angle of each wave.
+    and nearly inverses: migration of the model is J / 2 times the field, J being the cosine of each wave's direction.
     ``operator.reconstruct(transient)``: from measured light to the squared field.
 
     ``target``: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
