@@ -1,7 +1,7 @@
 """Migrates with y-tal on demand, in an environment of its own; driven by one JSON object per line.
 
-  {"do": "capture", "file"}   .npz with H (T, X, Y), sensors (X, Y, 3), bin_width
-  {"do": "fk", "out"}         -> {"seconds"}, CPU seconds; the volume (Z, X, Y) as .npy
+{"do": "capture", "file"}   .npz with H (T, X, Y), sensors (X, Y, 3), bin_width
+{"do": "fk", "out"}         -> {"seconds"}, CPU seconds; the volume (Z, X, Y) as .npy
 """
 
 import json

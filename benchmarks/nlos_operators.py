@@ -1,9 +1,9 @@
 """f-k migration and light-cone transforms beside y-tal's f-k migration and the transforms that they consist of.
 
 Confocal captures of two points before a wall of one metre, 512 bins of 9.6 mm, 64 x 64 points: CPU seconds of one
-thread, ratios over y-tal's `fk` and over one padded `rfftn` and `ifftn`. How far one point comes out from where it is, at
-18 to 86 % of the record, by every method. Peak memory of f-k with 4 taps, forward and backward, two captures at once,
-beyond tables, captures, gradient and what training holds anyway.
+thread, ratios over y-tal's `fk` and over one padded `rfftn` and `ifftn`. How far one point comes out from where it is,
+at 18 to 86 % of the record, by every method. Peak memory of f-k with 4 taps, forward and backward, two captures at
+once, beyond tables, captures and their gradient.
 
 y-tal 0.20 runs in the environment of `--peer-python`, or of the variable TORCHTRANSIENT_TAL_PYTHON; without it our own
 rows are timed alone. Seconds are CPU seconds of processes with one thread: other load does not count.
@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _runner import HERE, ChildProcess, arguments, environment, interleave, ratio, report, summary
-
 import torch
+from _runner import HERE, ChildProcess, arguments, environment, interleave, ratio, report, summary
 from torch import Tensor
 
 import torchtransient as tt
@@ -39,7 +38,7 @@ class Tal(ChildProcess):
     """A `_tal_fk_worker.py` process with one thread."""
 
     def __init__(self, python: str) -> None:
-        alone = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        alone = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         place = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | alone
         super().__init__([python, str(HERE / "_tal_fk_worker.py")], env=place)
         self.folder = tempfile.TemporaryDirectory()

@@ -1,5 +1,6 @@
 """Captures through a diffusing slab: against the transmittance in closed form, and letters that were measured."""
 
+import itertools
 import math
 import string
 from pathlib import Path
@@ -7,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from support.grid_operators import SCAN as SMALL
 from support.grid_operators import confocal_points
-
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import UnitError
@@ -82,7 +83,7 @@ def test_what_it_cannot_take_is_refused():
             DiffusionDeconvolution(SMALL, time_axis=axis, **settings)
 
 
-# ------------------------------------------------------------------------------------------ letters behind measured foam
+# ---------------------------------------------------------------------------------------- letters behind measured foam
 
 
 def front_view(name):
@@ -150,6 +151,6 @@ def test_bars_behind_foam_are_told_apart():
         peaks = [k + 1 for k in range(30) if inner[k] > profile[k] and inner[k] >= profile[k + 2]]
         peaks = [k for k in peaks if profile[k] > 0.4 * profile.max()]
         assert len(peaks) == bars
-        for left, right in zip(peaks, peaks[1:], strict=False):
+        for left, right in itertools.pairwise(peaks):
             low, high = float(profile[left:right].min()), float(torch.minimum(profile[left], profile[right]))
             assert (high - low) / (high + low) >= 0.2

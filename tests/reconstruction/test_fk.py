@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from support.grid_operators import confocal_points
 
+from support.grid_operators import confocal_points
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import SceneError, ShapeError, UnitError
@@ -147,11 +147,11 @@ def test_what_it_cannot_take_is_refused():
     with pytest.raises(ShapeError, match="grid"):
         FK(Scan.points(SCAN.sensor_points.reshape(-1, 3), kind="confocal", sensor_origin=(0, 0, 1),
                        laser_origin=(0, 0, 1)), time_axis=AXIS)  # fmt: skip
-    with pytest.raises(ShapeError, match="tt.TimeAxis"):
+    with pytest.raises(ShapeError, match=r"tt\.TimeAxis"):
         FK(SCAN, time_axis=0.04)
     with pytest.raises(ShapeError, match="4 bins"):
         FK(SCAN, time_axis=TimeAxis(0, 0.1, 3))
-    with pytest.raises(ShapeError, match="tt.nlos.Scan or a PlanarScan"):
+    with pytest.raises(ShapeError, match=r"tt\.nlos\.Scan or a PlanarScan"):
         FK("scan", time_axis=AXIS)
     with pytest.raises(SceneError, match="target"):
         FK(SCAN, time_axis=AXIS, target="mirror")

@@ -5,8 +5,8 @@ import pickle
 
 import pytest
 import torch
-from support.grid_operators import operators
 
+from support.grid_operators import operators
 from torchtransient.errors import DeviceError, ShapeError, UnitError
 from torchtransient.reconstruction import confocal_operator
 
@@ -94,14 +94,16 @@ def test_back_in_double_precision_all_digits_are_there(name):
 
 
 def test_other_precisions_are_refused(name):
-    with pytest.raises(UnitError, match="float32 or torch.float64"):
+    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
         copy.deepcopy(OPERATORS[name]).half()
 
 
 def test_copies_and_pickles_are_the_same_operator(name):
     operator = OPERATORS[name]
     for other in (copy.deepcopy(operator), pickle.loads(pickle.dumps(operator))):
-        torch.testing.assert_close(other.adjoint(data_of(operator)), operator.adjoint(data_of(operator)), rtol=0, atol=0)
+        torch.testing.assert_close(
+            other.adjoint(data_of(operator)), operator.adjoint(data_of(operator)), rtol=0, atol=0
+        )
     assert not operator.state_dict()
 
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from support.grid_operators import confocal_points
 
+from support.grid_operators import confocal_points
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import SceneError, ShapeError, UnitError

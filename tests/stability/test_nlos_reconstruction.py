@@ -1,11 +1,11 @@
-"""Where reconstruction around a corner breaks: roots of empty bins, 0 / 0 at frequency zero, transforms that come round,
-single precision, half bins, and ratios of signal to noise that depend on units.
+"""Where reconstruction around a corner breaks: roots of empty bins, 0 / 0 at frequency zero, transforms that come
+round, single precision, half bins, and ratios of signal to noise that depend on units.
 """
 
 import pytest
 import torch
-from support.grid_operators import confocal_points
 
+from support.grid_operators import confocal_points
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.reconstruction import FK, LCT, DiffusionDeconvolution, DirectionalLCT, stabilised_root

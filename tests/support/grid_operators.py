@@ -6,11 +6,14 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
-from torchtransient.reconstruction import FK, LCT, DiffusionDeconvolution, DirectionalLCT
+from torchtransient.reconstruction import FK, LCT, DiffusionDeconvolution, DirectionalLCT, MidpointFK
 
 AXIS = TimeAxis(0.1, 0.04, 16)
 # Neither square nor of equal pitch.
-SCAN = Scan.grid(Wall.plane(0.15, 0.24), (5, 6), kind="confocal")
+WALL = Wall.plane(0.15, 0.24)
+SCAN = Scan.grid(WALL, (5, 6), kind="confocal")
+SINGLE = Scan.grid(WALL, (4, 3), kind="single", laser=(0.3, 0.6))
+EXHAUSTIVE = Scan.grid(WALL, (4, 3), kind="exhaustive", laser_grid=(2, 3))
 
 
 def operators(dtype=torch.float64):
@@ -26,6 +29,8 @@ def operators(dtype=torch.float64):
         "lct, finer": finer,
         "directional lct": directional,
         "slab": slab,
+        "midpoint fk, single": MidpointFK(SINGLE, **of),
+        "midpoint fk, exhaustive": MidpointFK(EXHAUSTIVE, **of),
         "inverse of lct": cone.inverse,
         "inverse of finer lct": finer.inverse,
         "inverse of directional lct": directional.inverse,

@@ -9,7 +9,9 @@
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
-- `FK`, ...: hidden volumes from captures, linear operators (all of them in `torchtransient.reconstruction`)
+- `FK`, `LCT`, `DirectionalLCT`, `MidpointFK`: hidden volumes from captures, linear operators; `fk`, `lct`,
+  `directional_lct`, `midpoint_fk` of a capture at once; `DiffusionDeconvolution` before them, where things lie behind
+  turbid matter (all of `torchtransient.reconstruction`)
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -26,4 +28,11 @@ from torchtransient.nlos.setup_files import read_setup as read_setup
 from torchtransient.nlos.simulation import forecast as forecast
 from torchtransient.nlos.simulation import simulate as simulate
 from torchtransient.reconstruction import FK as FK
+from torchtransient.reconstruction import LCT as LCT
+from torchtransient.reconstruction import DiffusionDeconvolution as DiffusionDeconvolution
+from torchtransient.reconstruction import DirectionalLCT as DirectionalLCT
+from torchtransient.reconstruction import MidpointFK as MidpointFK
+from torchtransient.reconstruction import directional_lct as directional_lct
 from torchtransient.reconstruction import fk as fk
+from torchtransient.reconstruction import lct as lct
+from torchtransient.reconstruction import midpoint_fk as midpoint_fk

@@ -10,4 +10,6 @@ from torchtransient.reconstruction.fk import fk as fk
 from torchtransient.reconstruction.lct import LCT as LCT
 from torchtransient.reconstruction.lct import lct as lct
 from torchtransient.reconstruction.linear import LinearOperator as LinearOperator
+from torchtransient.reconstruction.midpoint_fk import MidpointFK as MidpointFK
+from torchtransient.reconstruction.midpoint_fk import midpoint_fk as midpoint_fk
 from torchtransient.reconstruction.planar_scan import PlanarScan as PlanarScan

@@ -214,12 +214,14 @@ class ConeOperator(ConfocalOperator):
 
     def _plane_fft(self, x: Tensor) -> Tensor:
         over_x: Tensor = torch.fft.fft(x, n=2 * self.grid.size[1], dim=2)
-        return torch.fft.fft(over_x, n=2 * self.grid.size[0], dim=1)
+        plane: Tensor = torch.fft.fft(over_x, n=2 * self.grid.size[0], dim=1)
+        return plane
 
     def _plane_ifft(self, x: Tensor) -> Tensor:
         rows, columns = self.grid.size
         over_y: Tensor = torch.fft.ifft(x, dim=1)[:, :rows]
-        return torch.fft.ifft(over_y, dim=2)[..., :columns]
+        plane: Tensor = torch.fft.ifft(over_y, dim=2)
+        return plane[..., :columns]
 
 
 class ConeInverse(InverseOperator):

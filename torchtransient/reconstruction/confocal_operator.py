@@ -46,7 +46,7 @@ class ConfocalOperator(LinearOperator):
         if time_axis.num_bins < LEAST_BINS:
             raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {time_axis.num_bins}.")
         self.axis = time_axis
-        self.dtype = _precision(dtype, who)
+        self.dtype = checked_precision(dtype, who)
         self.data_shape = (time_axis.num_bins, *self.grid.size)
         self.volume_shape = self.data_shape
 
@@ -78,7 +78,7 @@ class ConfocalOperator(LinearOperator):
         if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
             device = self.device
             try:
-                self.dtype = _precision(dtype, type(self).__name__)
+                self.dtype = checked_precision(dtype, type(self).__name__)
             finally:
                 self._set_tables(device or "cpu")
         return self
@@ -152,7 +152,8 @@ def _confocal_grid(scan: Scan, who: str) -> PlanarScan:
     return PlanarScan.of_scan(scan, who)
 
 
-def _precision(dtype: torch.dtype, who: str) -> torch.dtype:
+def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
+    """A precision that tables are kept in. Raises UnitError for others."""
     if dtype not in PRECISIONS:
         raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {shown(dtype)}.")
     return dtype

@@ -1,5 +1,6 @@
 """Captures through a diffusing slab: what it does to them, and how that is undone (Lindell and Wetzstein,
-"Three-dimensional imaging through scattering media based on confocal diffuse tomography", Nature Communications 11, 2020).
+"Three-dimensional imaging through scattering media based on confocal diffuse tomography", Nature Communications 11,
+2020).
 
 Between wall and hidden things lies a slab of turbid matter. Light passes it on its way there and on its way back, each
 time spread by the slab's transmittance (Contini, Martelli, Zaccanti, "Photon migration through a turbid slab described
@@ -146,7 +147,8 @@ class DiffusionDeconvolution(ConfocalOperator):
         bins, rows, columns = self.data_shape
         padded = (2 * bins, 2 * rows, 2 * columns)
         of_frequency: Tensor = torch.fft.rfftn(x, s=padded).mul_(spectrum)
-        return torch.fft.irfftn(of_frequency, s=padded)[:bins, :rows, :columns]
+        found: Tensor = torch.fft.irfftn(of_frequency, s=padded)
+        return found[:bins, :rows, :columns]
 
     def _wiener(self) -> Tensor:
         kernel = torch.view_as_complex(self.kernel)

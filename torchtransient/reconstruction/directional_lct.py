@@ -5,9 +5,9 @@ A hidden point of strength rho and normal n sends light by the cosine towards th
 
     H(tau) = int nu . w r^-p delta(tau - 2 r) dV,    nu = rho n,    w = (x' - x, y' - y, -z) / r .
 
-In v and u that is the sum of three convolutions of the components of nu, the third multiplied by z, with the cone times
-(x' - x), (y' - y) and -1. The regularised inverse, 3 x 3 for each frequency, has a closed form, since three kernels make
-one number: nu_i = conj(a_i) H / (sum |a|^2 + noise).
+In v and u that is the sum of three convolutions of the components of nu, the third multiplied by z, with the cone
+times (x' - x), (y' - y) and -1. The regularised inverse, 3 x 3 for each frequency, has a closed form, since three
+kernels make one number: nu_i = conj(a_i) H / (sum |a|^2 + noise).
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class ConeGrid:
         return v[kept], t[kept], size[kept]
 
     def window(self) -> Tensor:
-        """What the frequencies of v are multiplied by, (V' / 2 + 1,): that of a mean of neighbours, (1, 4, 6, 4, 1) / 16.
+        """What the frequencies of v are multiplied by, (V' / 2 + 1,): a mean of neighbours, (1, 4, 6, 4, 1) / 16.
 
         A cone that is band-limited alone rings as far as the record is long, and the r^-4 of early bins makes more of
         that than there is light.
@@ -85,8 +85,8 @@ class ConeGrid:
         return ((1 + turn.cos()) / 2) ** 2
 
     def kernel_tables(self, count: int, pitch: float, moment: int = 0, *, windowed: bool = False) -> Tensor:
-        """Transform (V' / 2 + 1, 2 count, 2) along one side of the wall of q^moment exp(-i w q^2) for every frequency w
-        of v, real and imaginary; ``windowed``: times :meth:`window`.
+        """Transform (V' / 2 + 1, 2 count, 2) along one side of the wall of q^moment exp(-i w q^2) for every frequency
+        w of v, real and imaginary; ``windowed``: times :meth:`window`.
         """
         w = 2 * math.pi / (self.padded * self.width) * torch.arange(self.padded // 2 + 1, dtype=torch.float64)
         q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64) * pitch
