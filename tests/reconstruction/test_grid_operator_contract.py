@@ -126,3 +126,13 @@ def test_wrong_operands_are_refused(name):
         operator.adjoint(data_of(operator).to(torch.complex128))
     with pytest.raises(DeviceError, match="expected volume on cpu"):
         operator(volume_of(operator).to("meta"))
+
+
+def test_works_where_its_tables_are(name):
+    # The meta device refuses everything that stays on the CPU.
+    operator = copy.deepcopy(OPERATORS[name]).to("meta")
+    assert str(operator.device) == "meta" and operator.dtype == torch.float64
+    assert operator(volume_of(operator, 2).to("meta")).shape == (2, *operator.data_shape)
+    assert operator.adjoint(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
+    if hasattr(operator, "reconstruct"):
+        assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)

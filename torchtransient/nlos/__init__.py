@@ -11,7 +11,7 @@
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
 - `FK`, `LCT`, `DirectionalLCT`, `MidpointFK`: hidden volumes from captures, linear operators; `fk`, `lct`,
   `directional_lct`, `midpoint_fk` of a capture at once; `DiffusionDeconvolution` before them, where things lie behind
-  turbid matter (all of `torchtransient.reconstruction`)
+  turbid matter, and `subtract_legs` (all of `torchtransient.reconstruction`)
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -36,3 +36,4 @@ from torchtransient.reconstruction import directional_lct as directional_lct
 from torchtransient.reconstruction import fk as fk
 from torchtransient.reconstruction import lct as lct
 from torchtransient.reconstruction import midpoint_fk as midpoint_fk
+from torchtransient.reconstruction import subtract_legs as subtract_legs

@@ -9,6 +9,7 @@ from torchtransient.reconstruction.fk import FK as FK
 from torchtransient.reconstruction.fk import fk as fk
 from torchtransient.reconstruction.lct import LCT as LCT
 from torchtransient.reconstruction.lct import lct as lct
+from torchtransient.reconstruction.legs import subtract_legs as subtract_legs
 from torchtransient.reconstruction.linear import LinearOperator as LinearOperator
 from torchtransient.reconstruction.midpoint_fk import MidpointFK as MidpointFK
 from torchtransient.reconstruction.midpoint_fk import midpoint_fk as midpoint_fk

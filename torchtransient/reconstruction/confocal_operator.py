@@ -147,7 +147,7 @@ def _confocal_grid(scan: Scan, who: str) -> PlanarScan:
     if scan.first_and_last_leg:
         raise ShapeError(
             f"{who}: expected lengths from the spot to the sensor point, got a scan that counts the first and last leg "
-            "too. Subtract scan.legs from the arrivals of each point and build the scan with first_and_last_leg=False."
+            "too. Take the capture that subtract_legs(capture) gives, with its scan and axis."
         )
     return PlanarScan.of_scan(scan, who)
 

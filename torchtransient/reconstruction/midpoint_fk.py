@@ -230,7 +230,7 @@ def _checked(scan: Scan, time_axis: TimeAxis) -> PlanarScan:
     if scan.first_and_last_leg:
         raise ShapeError(
             "MidpointFK: expected lengths from the spot to the sensor point, got a scan that counts the first and last "
-            "leg too. Subtract scan.legs from the arrivals and build the scan with first_and_last_leg=False."
+            "leg too. Take the capture that subtract_legs(capture) gives, with its scan and axis."
         )
     if time_axis.start_opl < 0:
         raise UnitError(f"MidpointFK: expected a time axis from zero on, got {time_axis}. Crop the capture.")
