@@ -116,8 +116,11 @@ def peak_off(volume: Tensor, place: tuple[float, float, float], step: tuple[floa
     index = [int(i) for i in torch.unravel_index(volume.argmax(), volume.shape)]
     off = 0.0
     for dim, (k, h, true) in enumerate(zip(index, step, reversed(place), strict=True)):
-        around = [float(volume[(*index[:dim], k + i, *index[dim + 1 :])].clamp_min(1e-30).log()) for i in (-1, 0, 1)]
-        at = k + 0.5 * (around[0] - around[2]) / (around[0] - 2 * around[1] + around[2])
+        # At the border there is nothing to interpolate with.
+        near = [min(max(k + i, 0), volume.shape[dim] - 1) for i in (-1, 0, 1)]
+        around = [float(volume[(*index[:dim], n, *index[dim + 1 :])].clamp_min(1e-30).log()) for n in near]
+        bend = around[0] - 2 * around[1] + around[2]
+        at = k + 0.5 * (around[0] - around[2]) / bend if bend else float(k)
         first = z0 if dim == 0 else -(volume.shape[dim] - 1) / 2 * h
         off = max(off, abs(first + at * h - true))
     return 1e3 * off

@@ -9,9 +9,13 @@
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
-- `FK`, `LCT`, `DirectionalLCT`, `MidpointFK`: hidden volumes from captures, linear operators; `fk`, `lct`,
-  `directional_lct`, `midpoint_fk` of a capture at once; `DiffusionDeconvolution` before them, where things lie behind
-  turbid matter, and `subtract_legs` (all of `torchtransient.reconstruction`)
+- `FK`, `fk`: hidden volumes from confocal captures by f-k migration; all of these are linear operators, and functions of
+  a capture
+- `MidpointFK`, `midpoint_fk`: the same from single and exhaustive captures, approximately
+- `LCT`, `lct`: the light-cone transform with its Wiener inverse
+- `DirectionalLCT`, `directional_lct`: the same with normals
+- `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
+- `subtract_legs`: a capture without the first and the last leg of its light
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
