@@ -170,3 +170,19 @@ def test_what_it_cannot_take_is_refused():
         operator.reconstruct(stokes)
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
         fk(torch.zeros(8, SIDE, SIDE))
+
+
+def test_gradients_of_a_batch_by_torch_func():
+    operator = FK(SCAN, time_axis=TimeAxis(0.5, 0.1, 12), floor=0.25, dtype=F64)
+    light = torch.rand(3, *operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+
+    def objective(h):
+        return operator.reconstruct(h).square().sum()
+
+    together = torch.func.vmap(torch.func.grad(objective))(light)
+    for one, expected in zip(light, together, strict=True):
+        torch.testing.assert_close(torch.func.grad(objective)(one), expected)
+    _, tangent = torch.func.jvp(objective, (light[0],), (light[1],))
+    assert float(tangent) == pytest.approx(float((together[0] * light[1]).sum()), rel=1e-9)
+    curved = torch.func.jvp(torch.func.grad(objective), (light[0],), (light[1],))[1]
+    assert torch.isfinite(curved).all()

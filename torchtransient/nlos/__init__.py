@@ -9,8 +9,8 @@
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
-- `FK`, `fk`: hidden volumes from confocal captures by f-k migration; all of these are linear operators, and functions of
-  a capture
+- `FK`, `fk`: hidden volumes from confocal captures by f-k migration; this one and those below are linear operators,
+  and functions of a capture
 - `MidpointFK`, `midpoint_fk`: the same from single and exhaustive captures, approximately
 - `LCT`, `lct`: the light-cone transform with its Wiener inverse
 - `DirectionalLCT`, `directional_lct`: the same with normals
