@@ -78,6 +78,7 @@ def test_pairs_do_not_see_a_bias_and_a_reference_does():
     assert tally.result().squared == pytest.approx(0.09 + 1e-4, abs=5 * 2 * 0.3 * np.sqrt(0.005 / 5000))
 
 
+@pytest.mark.slow
 def test_gain_compares_error_at_equal_time():
     better = synthetic(0.2, salt=5)
     slow = {**synthetic(2.0, seconds_per_spp=1e-4)}

@@ -53,9 +53,9 @@ def test_a_plane_lies_as_it_is_told():
     wall = Wall.plane(2.0, 1.0, center=(1.0, 0.0, 0.0), normal=(-1.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), albedo=0.7)
     np.testing.assert_allclose(wall.at(0.5, 0.5)[0], [1, 0, 0])
     np.testing.assert_allclose(wall.normal, [-1, 0, 0])
-    np.testing.assert_allclose(wall.at(0.5, 1.0)[0], [1, 0, 0.5], atol=1e-15)
+    np.testing.assert_allclose(wall.at(0.5, 1.0)[0], [1, 0, 0.5], atol=4e-6)
     # u runs along up x normal
-    np.testing.assert_allclose(wall.at(1.0, 0.5)[0], [1, -1, 0], atol=1e-15)
+    np.testing.assert_allclose(wall.at(1.0, 0.5)[0], [1, -1, 0], atol=4e-6)
     assert (wall.width, wall.height) == (2.0, 1.0)
     assert wall.diagonal == pytest.approx(np.sqrt(5))
     assert wall.shape["bsdf"]["reflectance"] == 0.7
@@ -72,7 +72,8 @@ def test_all_points_of_a_grid_are_distinct_and_evenly_spaced(size, centers):
         places = points[0, :, 0] if axis == 0 else points[:, 0, 1]
         step = length / count if centers or count == 1 else length / (count - 1)
         expected = middle + (np.arange(count) - (count - 1) / 2) * step
-        np.testing.assert_allclose(places, expected, atol=1e-14)
+        # Points on the edges stand a millionth inside.
+        np.testing.assert_allclose(places, expected, atol=1e-14 if centers or count == 1 else 3e-6)
     # also in the single precision that a renderer works in
     assert len(np.unique(points.reshape(-1, 3).astype(np.float32), axis=0)) == nx * ny
 

@@ -22,6 +22,7 @@ def test_everything_is_fine_here():
     assert "problem" not in result.stdout
 
 
+@pytest.mark.slow
 def test_a_users_bad_choice_of_llvm(tmp_path):
     environment = {**os.environ, _llvm.VARIABLE: str(tmp_path / "libLLVM.so")}
     code = "from torchtransient.cli.main import main; main(['doctor'])"

@@ -84,6 +84,7 @@ FLOOR_SCENE = """<scene version="3.0.0">
 """
 
 
+@pytest.mark.slow
 def test_staircase_with_a_floor_in_place_of_the_house(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The archive of the staircase is not part of the project: this one has its layout, names and flight times."""
     mi.set_variant("llvm_ad_rgb")

@@ -4,6 +4,7 @@ fit, and captures without light.
 
 from __future__ import annotations
 
+import copy
 import json
 import warnings
 
@@ -274,3 +275,11 @@ def test_a_layer_after_another_variant(bounces):
     if bounces != "all":  # which has no derivatives
         after.sum().backward()
         assert float(layer.values["letter.bsdf.reflectance.value"].grad) > 0
+
+
+def test_a_detached_capture_has_points_without_gradients():
+    renderer = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan(), ["wall.sensor.points"], time_axis=AXIS, spp=4)
+    capture = renderer(seed=0)
+    assert capture.scan.sensor_points.requires_grad
+    assert not capture.detach().scan.sensor_points.requires_grad
+    assert copy.deepcopy(capture.detach()) == capture.detach()

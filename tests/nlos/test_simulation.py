@@ -389,3 +389,16 @@ def test_bounces_of_mitransient(settings, bounces):
 def test_bounces_of_mitransient_that_leave_nothing(settings):
     with pytest.raises(SceneError, match="leave no light"):
         tal_bounces(*settings)
+
+
+@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+def test_points_on_the_edges_of_the_wall(kind):
+    """They stand where rays in single precision meet it."""
+    for center in ((0.0, 0.0, 0.0), (30.0, -20.0, 5.0)):
+        wall = tt.nlos.Wall.plane(1.7, 0.83, center=center, normal=(0.3, 0.2, 1.0))
+        spot = {"laser": (0.0, 1.0)} if kind == "single" else {}
+        on_edges = tt.nlos.Scan.grid(wall, (3, 2), kind=kind, cell_centers=False, **spot)
+        before = [c + 0.6 * n for c, n in zip(center, wall.normal, strict=True)]
+        ball = {"type": "sphere", "center": before, "radius": 0.2}
+        capture = tt.nlos.simulate({"ball": ball}, on_edges, spp=256, progress=False)
+        assert bool((capture.total() > 0).all())

@@ -95,6 +95,7 @@ def test_callbacks_cleared_by_someone_else():
     assert isinstance(build("transient_path"), mi.Integrator)
 
 
+@pytest.mark.slow
 def test_no_variant_at_import_and_after():
     out = run("""
         import torchtransient, mitsuba as mi

@@ -48,6 +48,7 @@ def test_merged_shapes_have_names_and_transforms(merged_file):
         assert offset == pytest.approx(moved[shape], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_keys_and_states_are_those_of_another_process(merged_file):
     code = f"import torchtransient as tt; print(*tt.load({str(merged_file)!r}, variant={VARIANT!r}).parameters())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)

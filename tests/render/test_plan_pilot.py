@@ -238,6 +238,7 @@ def test_every_scene_of_the_library_is_listed():
     assert {name for name in functions if not name.startswith("nlos_")} - parts == {*SCENES, "milk_bottle"}
 
 
+@pytest.mark.slow
 def test_the_plan_of_the_bottle_sees_its_milk(tmp_path):
     description = tt.scenes.milk_bottle(tmp_path / "bottle.ply", resolution=(5, 8), spp=64)
     plan = tt.plan(description, max_depth="scene", time_axis="scene", pilot=False)
@@ -283,6 +284,7 @@ def test_an_effect_that_is_not_there_changes_nothing(extra):
 # ------------------------------------------------------------------------------------------------------- other films
 
 
+@pytest.mark.slow
 def test_steady_outputs():
     plan = tt.plan(tt.scenes.cornell_box(8), ("steady",), max_depth="scene", parameters=["red-wall.to_world"])
     assert (plan.film, plan.temporal_filter) == ("steady", "tent")

@@ -38,6 +38,7 @@ def test_import_and_load_need_no_variant():
     assert printed == "True llvm_ad_rgb llvm_ad_rgb"
 
 
+@pytest.mark.slow
 def test_differentiable_active_variant_is_taken_and_scalar_one_is_not():
     printed = run("""
         import mitsuba as mi
@@ -127,6 +128,7 @@ def test_fork_before_rendering_is_fine_and_after_it_is_refused():
     assert printed == "0 7"
 
 
+@pytest.mark.slow
 def test_many_switches_are_mentioned_once(monkeypatch):
     import mitsuba as mi
 

@@ -250,6 +250,7 @@ WRONG = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("draw", "right", "arguments"),
     [

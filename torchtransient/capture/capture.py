@@ -41,8 +41,9 @@ class Capture(TensorRecord):
     Two captures are equal when all but ``metadata`` is.
 
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in results of renders: they concern the measured
-    tensors; the scan stays where it is, as the axes do (``capture.scan.to(device)`` moves it). Raises ShapeError where
-    tensors, scan and axis do not fit or nothing was measured, StorageError for metadata that is not plain.
+    tensors, and ``detach`` the scan's points too; the scan stays where it is, as the axes do
+    (``capture.scan.to(device)`` moves it). Raises ShapeError where tensors, scan and axis do not fit or nothing was
+    measured, StorageError for metadata that is not plain.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
@@ -107,6 +108,10 @@ class Capture(TensorRecord):
         if not fits or math.prod(shape) == 0:
             words = ", ".join(map(str, expected))
             raise ShapeError(f"Capture: expected {name} ({words}) as its {self.scan!r} and axis say, got {shape}.")
+
+    def detach(self) -> Capture:
+        """Without gradients, in the scan's points neither."""
+        return replace(super().detach(), scan=self.scan.detach())
 
     @classmethod
     def merged_notes(cls, records: Sequence[Capture]) -> dict[str, Any]:
@@ -207,6 +212,8 @@ def _measured(name: str, values: Any) -> Tensor | None:
         return values
     try:
         if hasattr(values, "__array__"):
+            if np.ma.isMaskedArray(values):
+                raise TypeError("its mask would be lost; fill it in, or give a NaN for what is missing")
             array = np.asarray(values)
             # Torch knows neither other byte orders, nor negative strides, nor memory that is not to be written to.
             return torch.from_numpy(np.require(array, array.dtype.newbyteorder("="), ["C", "W"]))

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 # A point counts as lying on the wall up to this part of the wall's diagonal: coordinates of files have five digits.
 ON_WALL = 1e-4
+# From the edges of a wall, in parts of its size and its distance from the origin.
+_EDGE = 2.0**-20
 # Squares of areas are numbers of single precision in kernels.
 _FAR = 1e9
 # Indices of points have 32 bits in kernels.
@@ -167,7 +169,8 @@ class Wall:
         return self.vertices is None
 
     def at(self, u: Any, v: Any) -> tuple[Array, Array]:
-        """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. Raises SceneError for coordinates
+        """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. On the edges they stand a
+        millionth of the wall's size inside, where rays in single precision meet it. Raises SceneError for coordinates
         outside of [0, 1] and where a curved wall has a hole.
         """
         places = [real_array(u), real_array(v)]
@@ -180,7 +183,8 @@ class Wall:
             raise ShapeError(f"Wall.at: expected coordinates (u, v) that broadcast, got shapes {shapes}.") from None
         if not (np.all((u >= 0) & (u <= 1)) and np.all((v >= 0) & (v <= 1))):
             raise SceneError("Wall.at: expected coordinates (u, v) between 0 and 1, got some outside of the wall.")
-        flat = self.center + (2 * u[..., None] - 1) * self.half_u + (2 * v[..., None] - 1) * self.half_v
+        u, v = (self._inside(x, half)[..., None] for x, half in ((u, self.half_u), (v, self.half_v)))
+        flat = self.center + (2 * u - 1) * self.half_u + (2 * v - 1) * self.half_v
         if self.vertices is None:
             return flat, np.broadcast_to(self.normal, flat.shape).copy()
         points, normals, hit = self._from_front(flat.reshape(-1, 3))
@@ -192,6 +196,11 @@ class Wall:
                 "holes: extent=(u0, v0, u1, v1)."
             )
         return points.reshape(flat.shape), normals.reshape(flat.shape)
+
+    def _inside(self, share: Array, half: Array) -> Array:
+        """Coordinates that are not nearer to the edges than single precision can tell."""
+        margin = _EDGE * (self.diagonal + np.abs(self.center).max()) / (2 * np.linalg.norm(half))
+        return np.clip(share, margin, 1 - margin)
 
     def grid(
         self, size: int | Sequence[int], extent: Sequence[float] | None = None, *, cell_centers: bool = True

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from torchtransient.plugins.remembered import Remembered, digest
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 from torchtransient.plugins.transport.strategy import Local
@@ -19,22 +20,39 @@ _SEED = 0x70696C6F
 _BEFORE = 0.4
 
 
-def late_density(scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray) -> HiddenElements:
+def late_density(
+    scene: Any, elements: HiddenElements, points: np.ndarray, normals: np.ndarray, memory: Remembered | None = None
+) -> HiddenElements:
     """The elements drawn by the root mean square, over wall points ``(P, 3)`` and directions of scattering, of what a
     point sends by way of one further hidden point.
 
     A body's creases weigh more than what stands free, where no light is scattered twice. Neighbours have one weight
-    per area, the mean of some samples. What the weights leave out is drawn by its share of plain area.
+    per area, the mean of some samples. What the weights leave out is drawn by its share of plain area. ``memory``: of
+    densities that were made for the same ``elements`` (with a ``key``), seen from the same points.
     """
     s = draw_samples(elements, _POINTS, _SEED)
-    numbers = np.random.default_rng(_SEED).random((2, _POINTS)).astype(np.float32)
+    # The side that faces the scan: of two-sided surfaces it counts most.
     center = mi.Point3f(*np.mean(points, axis=0).tolist())
     dr.make_opaque(center)
-    # The side that faces the scan: of two-sided surfaces it counts most.
     n = mi.Vector3f(s.geometric_n)
     n = dr.mulsign(n, dr.dot(n, center - s.p))
     lit = dr.dot(n, mi.Vector3f(s.geometric_n)) > 0
     lit = dr.select(lit, dr.max(s.front), dr.max(s.back)) > 0
+
+    def made() -> HiddenElements:
+        return _density(scene, elements, (points, normals), s, (center, n, lit))
+
+    if memory is None or not elements.key:
+        return made()
+    # Of what surfaces scatter it matters whether they do.
+    return memory.of("late density", elements.key + digest(np.array(lit)), made)
+
+
+def _density(scene: Any, elements: HiddenElements, wall: tuple[np.ndarray, np.ndarray], s: Any, side: Any) -> Any:
+    """``side``: the middle of the scan, normals towards it, and whether something is scattered there."""
+    points, normals = wall
+    center, n, lit = side
+    numbers = np.random.default_rng(_SEED).random((2, _POINTS)).astype(np.float32)
     d = mi.Frame3f(mi.Normal3f(n)).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(numbers)))
     reach = dr.max(dr.abs(s.p)) + dr.norm(center - s.p)
     ray = mi.Ray3f(mi.Point3f(s.p + n * (mi.math.RayEpsilon * reach)), d)

@@ -36,8 +36,9 @@ class ScanTable:
     gradients enabled, outside of traced code.
     """
 
-    def __init__(self, scene: Any, sensor: Any, capture: CaptureType, fov: float | None, laser: bool) -> None:
-        self.scene, self.sensor = scene, sensor
+    def __init__(self, scene: Any, contents: Any, capture: CaptureType, fov: float | None, laser: bool) -> None:
+        sensor = contents.sensor
+        self.scene, self.sensor, self.memory = scene, sensor, contents.memory
         self.rays, self.spots = scan_rays(sensor), None
         with dr.suspend_grad():
             self.found = scene.ray_intersect_preliminary(dr.detach(self.rays), coherent=True)
@@ -48,7 +49,6 @@ class ScanTable:
             self.spots = LaserSpots(scene, laser_of(scene), aims, origin_of(scene, sensor))
         self.wall = self._wall()
         self._elements: dict[frozenset[Any], HiddenElements] = {}
-        self._overlaps: dict[bool, list[str]] = {}
 
     @property
     def looks_at_points(self) -> bool:
@@ -60,16 +60,20 @@ class ScanTable:
         """
         left_out = frozenset(shape.ptr for shape in without)
         if left_out not in self._elements:
-            shapes = [shape for shape in self.scene.shapes() if shape.ptr not in left_out]
-            self._elements[left_out] = HiddenElements(shapes, *self.reference_points())
+            every = self.scene.shapes()
+            shapes, beside = ([s for s in every if (s.ptr in left_out) == other] for other in (False, True))
+            made = HiddenElements.remembered(self.memory, shapes, *self.reference_points(), beside)
+            self._elements[left_out] = made
         return self._elements[left_out]
 
     def overlaps(self, with_wall: bool) -> list[str]:
         """Names of hidden shapes that lie in others; ``with_wall``: a flat wall is one of them."""
-        if with_wall not in self._overlaps:
-            elements = self.elements([] if with_wall or self.wall is None else self.wall)
-            self._overlaps[with_wall] = overlaps(self.scene, elements, *self.reference_points())
-        return self._overlaps[with_wall]
+        elements = self.elements([] if with_wall or self.wall is None else self.wall)
+
+        def found() -> list[str]:
+            return overlaps(self.scene, elements, *self.reference_points())
+
+        return self.memory.of("overlaps", elements.key, found) if elements.key else found()
 
     def lambertian_spots(self, legs: bool) -> WallPoints | None:
         """The spots as points of a flat diffuse wall, None where they are more than that: on curved walls, with

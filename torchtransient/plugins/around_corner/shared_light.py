@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,7 +112,7 @@ def add_late_light(table: ScanTable, film: Any, job: Any, bounces: range, run: A
     """Add the light of these numbers of bounces to a film; ``job``: ``light`` (:class:`ScanLight`), ``elements`` and
     ``capture``, ``run``: ``seed``, ``samples`` and ``progress``.
     """
-    elements = late_density(table.scene, job.elements, *table.reference_points())
+    elements = late_density(table.scene, job.elements, *table.reference_points(), table.memory)
     film_job = ScanJob(table.scene, film, job.light.sensors, job.light.energy, run.progress)
     ends = bounces[0], bounces[-1]
     LateLight(film_job, elements, job.light.spots, job.capture, ends).add(run.samples, run.seed)
@@ -163,7 +164,8 @@ class SharedThirdBounce:
         if tiles.count == 1:
             return elements
         self.tile = tiles.of_points()
-        return HiddenElements(elements.shapes, tiles.points, tiles.normals)
+        memory = self.world.contents.memory
+        return copy(HiddenElements.remembered(memory, elements.shapes, tiles.points, tiles.normals))
 
     def _spare_rays(self, elements: HiddenElements, samples: int) -> None:
         """Leave out rays to what nothing hides, where that is found faster than they are traced."""

@@ -343,8 +343,11 @@ class TransientIntegrator(mi.CppADIntegrator):
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
 
-        One pass over the samples for one tangent. ``params`` is not used; with ``develop=False`` the
-        result stays in the film. Errors as in :meth:`render_backward`.
+        One pass over the samples for one tangent. Tangents are set on values of the scene or on what they come from,
+        and are carried on from there; a caller who does so before clears the edges (``ADFlag.ClearEdges``) and keeps
+        what lies between: with Dr.Jit's default flags it is gone, which a warning says, and without any flag it is
+        counted twice. ``params`` is not used; with ``develop=False`` the result stays in the film. Errors as in
+        :meth:`render_backward`.
         """
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)

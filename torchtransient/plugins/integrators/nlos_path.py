@@ -204,11 +204,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         most = None if settings.max_depth == UNLIMITED else settings.max_depth - light
         return max(settings.min_depth - light, 0), most
 
-    def scan_table(self, scene: Any, sensor: Any) -> ScanTable:
+    def scan_table(self, scene: Any, contents: Any) -> ScanTable:
         """What the scan of a job looks at and where its laser falls."""
         fov = None if self.equal_grids or self.capture is not CaptureType.EXHAUSTIVE else self.laser_fov
         with dr.resume_grad():
-            return ScanTable(scene, sensor, self.capture, fov, self.laser_sampling)
+            return ScanTable(scene, contents, self.capture, fov, self.laser_sampling)
 
     def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
         """Who finds which light. ``table``: the :class:`ScanTable` of the job, where it is known. Raises SceneError
@@ -228,7 +228,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if not ranges:
             return from_paths
         if self.laser_sampling and self.hidden_sampling and not self.equal_shares:
-            table = table or self.scan_table(scene, contents.sensor)
+            table = table or self.scan_table(scene, contents)
             reason = why_not(table, contents, self.samples_wall)
         else:
             reason = "nlos_laser_sampling and nlos_hidden_geometry_sampling are not on alone"
@@ -246,7 +246,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         return division if wall is not None else replace(division, why_not=NOT_FLAT)
 
     def world(self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None) -> Any:
-        table = self.scan_table(scene, contents.sensor)
+        table = self.scan_table(scene, contents)
         if settings is None:
             settings = self.settings()
             division = self.division(scene, contents, wanted, table)
@@ -275,8 +275,10 @@ class TransientNLOSPath(base.TransientIntegrator):
         surface = Lambertian if Lambertian.fits(contents) else Surface
         scattering = SurfaceOrMedium(guides) if in_media else surface(guides)
         segment = self._segment(contents)
-        made = segment(bool(table.overlaps(self.samples_wall))) if segment is FoundVacuum else segment()
-        return made, scattering, self._connections(table)
+        if segment is not FoundVacuum:
+            return segment(), scattering, self._connections(table)
+        overlaps = table.overlaps(self.samples_wall)
+        return FoundVacuum(bool(overlaps)), scattering, self._connections(table)
 
     def _segment(self, contents: Any) -> type:
         if contents.media is not None:

@@ -91,8 +91,11 @@ class AreaElements:
 
     def take(self, order: np.ndarray) -> AreaElements:
         """The elements of these numbers, in this order."""
-        columns = (self.axes, self.kind, self.shape, self.primitive, self.area, self.normal, self.two_sided)
-        return AreaElements(*(column[order] for column in columns), self.left_out)
+        return AreaElements(*(column[order] for column in self.columns()), self.left_out)
+
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """The arrays, without the names of what is left out."""
+        return self.axes, self.kind, self.shape, self.primitive, self.area, self.normal, self.two_sided
 
     def centers(self) -> np.ndarray:
         """A point of (or in) each element, ``(E, 3)``."""

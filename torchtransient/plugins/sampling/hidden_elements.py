@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.plugins.pointer_table import registry_number
+from torchtransient.plugins.remembered import Remembered, digest
 from torchtransient.plugins.sampling.area_elements import (
     CYLINDER,
     TRIANGLE,
@@ -45,7 +47,15 @@ class HiddenElements:
     shapes as they are when it is built. Raises SceneError where nothing has an area, ShapeError, UnitError.
     """
 
-    def __init__(self, shapes: list[Any], points: Any, normals: Any, defensive: float = DEFENSIVE) -> None:
+    def __init__(
+        self,
+        shapes: list[Any],
+        points: Any,
+        normals: Any,
+        defensive: float = DEFENSIVE,
+        *,
+        every: AreaElements | None = None,
+    ) -> None:
         if not 0 < defensive <= 1:
             raise UnitError(f"HiddenElements: defensive is a share in (0, 1], got {defensive!r}.")
         points, normals = _tiles_of(points, "points"), _tiles_of(normals, "normals")
@@ -53,8 +63,8 @@ class HiddenElements:
             raise ShapeError(
                 f"HiddenElements: points and normals of the wall have to match, got {points.shape} and {normals.shape}."
             )
-        every = AreaElements.of(shapes)
-        self.left_out = every.left_out
+        every = AreaElements.of(shapes) if every is None else every
+        self.left_out, self.key = every.left_out, b""
         if not np.any(every.area > 0):
             raise SceneError(
                 f"hidden shapes: expected a surface to draw points on, got none on {_named(shapes)}: triangles without "
@@ -67,9 +77,29 @@ class HiddenElements:
         order = order[morton_order(parts.centers()[order])]
         self.shapes, self.elements = list(shapes), parts.take(order)
         self.tile_count, self.region = len(points), None
-        self.smooth = any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
+        self.smooth = _is_smooth(shapes, every)
         self._cutting, self._defensive = (every, cuts, uncut[order], cell[order]), defensive
         self._lay_out_densities(self._probabilities(points, normals))
+
+    @staticmethod
+    def remembered(
+        memory: Remembered, shapes: list[Any], points: Any, normals: Any, beside: Sequence[Any] = ()
+    ) -> HiddenElements:
+        """Those of shapes that are where they were before are the same: not to be changed. ``beside``: the other shapes
+        of the scene. ``key`` holds where all of them are, and is empty where some do not say.
+        """
+        every, others = AreaElements.of(shapes), AreaElements.of(list(beside))
+        parts = [array for each in (every, others) for array in each.columns()]
+        numbers = np.array([registry_number(shape) for shape in (*shapes, *beside)])
+        seen_from = (np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64))
+        key = digest(*parts, numbers, *seen_from, np.array(_is_smooth(shapes, every)))
+
+        def made() -> HiddenElements:
+            elements = HiddenElements(shapes, *seen_from, every=every)
+            elements.key = b"" if every.left_out or others.left_out else key
+            return elements
+
+        return memory.of("hidden elements", key, made)
 
     def reweighted(self, weights: np.ndarray) -> HiddenElements:
         """The same elements drawn by other weights ``(tiles, E)``, finite and not negative, in the order of
@@ -244,6 +274,10 @@ def _tiles_of(values: Any, name: str) -> np.ndarray:
             f"HiddenElements: expected finite {name} of the wall, (P, 3) or (tiles, P, 3), got {array.shape}."
         )
     return array
+
+
+def _is_smooth(shapes: list[Any], every: AreaElements) -> bool:
+    return any(has_shading_normals(shapes[s]) for s in np.unique(every.shape).astype(int))
 
 
 def _named(shapes: list[Any]) -> str:

@@ -15,6 +15,7 @@ from torchtransient.plugins.mitsuba_compat import has_smooth_shape, has_vertices
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
 from torchtransient.plugins.pointer_table import PointerTable
+from torchtransient.plugins.remembered import Remembered
 from torchtransient.plugins.sampling.distant import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
@@ -75,6 +76,8 @@ class SceneContents:
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
         self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
+        # What was computed of the scene as it was: renders of one that stays as it is begin sooner.
+        self.memory = Remembered()
         self._built = True
 
     def hidden_from_mitsuba(self) -> AbstractContextManager[None]:

@@ -6,9 +6,12 @@ agree to rounding for one seed.
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import TorchTransientWarning
 from torchtransient.plugins.polarized import light_type
 from torchtransient.plugins.transport.carry import Carry, with_fields
 from torchtransient.plugins.transport.derivative.vertex import attached_carry, vertex_terms
@@ -27,6 +30,23 @@ def propagate_tangents(parameters, tables):
     for value in attached:
         dr.enqueue(dr.ADMode.Forward, value)
     dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+    if attached and all(_is_untouched(value) for value in attached):
+        warnings.warn(
+            "render_forward: no tangent has come to any attached parameter, and derivatives are zero. Set one on them, "
+            "or on what they come from, with dr.set_grad, and traverse with ADFlag.ClearEdges or not at all: Dr.Jit's "
+            "default flags clear what lies between.",
+            TorchTransientWarning,
+            stacklevel=3,
+        )
+
+
+def _is_untouched(value):
+    """Whether nobody has given a tangent: one that is zero is stored as an array."""
+    tangent = dr.grad(value)
+    tangent = getattr(tangent, "matrix", tangent) if "Transform" in type(tangent).__name__ else tangent
+    tangent = tangent.array if dr.is_tensor_v(tangent) else tangent
+    tangent = dr.ravel(tangent) if dr.depth_v(tangent) > 1 else tangent
+    return tangent.state == dr.VarState.Literal and not bool(dr.any(tangent != 0))
 
 
 def tangents_of(values):

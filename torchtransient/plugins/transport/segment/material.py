@@ -114,8 +114,8 @@ class FoundVacuum(MaterialVacuum):
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All)}
 
     def depart(self, world, ray, vertex, β, sampler, active):
-        # Most lanes follow guides, which send those beside each other to places beside each other.
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        # One by one: of surfaces at one place, what a packet of rays meets depends on where the others go.
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         return {"pi": pi, "si": pi.compute_surface_interaction(ray, mi.RayFlags.All, active)}
 
     def depart_guided(self, world, ray, vertex, step, sampler, active):
@@ -126,7 +126,7 @@ class FoundVacuum(MaterialVacuum):
         # What a guide has drawn is there: all that is asked is whether it is seen, which rays find faster than what
         # they meet.
         guided = active & step.guided
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=True, active=active & ~guided)
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active & ~guided)
         start, end = Local(p=vertex.at.p, geometric_n=mi.Vector3f(vertex.at.n)), step.point
         n = dr.mulsign(mi.Vector3f(target.n), dr.dot(target.n, start.p - end))
         seen = sees(world.scene, start, end, n, guided)
