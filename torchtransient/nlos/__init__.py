@@ -9,6 +9,7 @@
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
+- `FK`, ...: hidden volumes from captures, linear operators (all of them in `torchtransient.reconstruction`)
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -24,3 +25,5 @@ from torchtransient.nlos.scene import capture_scene as capture_scene
 from torchtransient.nlos.setup_files import read_setup as read_setup
 from torchtransient.nlos.simulation import forecast as forecast
 from torchtransient.nlos.simulation import simulate as simulate
+from torchtransient.reconstruction import FK as FK
+from torchtransient.reconstruction import fk as fk
