@@ -1,4 +1,4 @@
-"""What a hidden volume would have measured, against what was measured: losses that hold a reconstruction to its data."""
+"""What a hidden volume would have measured against what was measured: what holds a reconstruction to its data."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ class PairLoss(Protocol):
     def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
 
 
-def squared_loss(
-    input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean"
-) -> Tensor:
+def squared_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
     """`|input - target|^2` of each element, real or complex, any shape. Symmetric. Raises ShapeError, UnitError."""
     input, target = check_pair(input, target, "squared_loss", complex_too=True)
     mask = check_mask(mask, input.shape, "squared_loss")
@@ -77,7 +75,7 @@ def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, item_dims
     power = _power(seen).sum(dims, keepdim=True)
     along = _product(seen, counted(measured, mask)).sum(dims, keepdim=True)
     scale = torch.where(dark, torch.ones_like(along), along / torch.where(dark, torch.ones_like(power), power))
-    return prediction / peak * scale
+    return seen * scale
 
 
 def _power(x: Tensor) -> Tensor:

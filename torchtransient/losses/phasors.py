@@ -24,6 +24,7 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
+from torchtransient.quantities import positive
 from torchtransient.sensing.layout import without_autocast
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
@@ -82,20 +83,21 @@ def phasor_loss(
     mask = check_mask(mask, input.shape, where)
     input, target = counted(input, mask), counted(target, mask)
     if phase_only:
-        floors = (floor, floor)
-        if floor is None:
-            floors = (
-                _PHASE_FLOOR * item_scale(input, target, mask),
-                _PHASE_FLOOR * item_scale(target, input, mask),
-            )
-        input, target = _phase(input, floors[0]), _phase(target, floors[1])
+        ours = _PHASE_FLOOR * item_scale(input, target, mask) if floor is None else _floor(floor, input)
+        theirs = _PHASE_FLOOR * item_scale(target, input, mask) if floor is None else ours
+        input, target = _phase(input, ours), _phase(target, theirs)
     difference = input - target
     return reduce(difference.real.square() + difference.imag.square(), reduction, where, mask)
 
 
-def _phase(phasor: Tensor, floor: Tensor | float) -> Tensor:
+def _floor(floor: Tensor | float, phasor: Tensor) -> Tensor:
+    value = floor if isinstance(floor, Tensor) else torch.tensor(positive("phasor_loss: floor", floor))
+    return value.to(phasor.device, phasor.real.dtype)
+
+
+def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
     """`P / sqrt(|P|^2 + floor^2)`, by numbers near one: squares of bright phasors exceed single precision."""
-    size = torch.maximum(phasor.detach().abs(), torch.as_tensor(floor, dtype=phasor.real.dtype, device=phasor.device))
+    size = torch.maximum(phasor.detach().abs(), floor)
     scaled = phasor / size
     return scaled / (scaled.real.square() + scaled.imag.square() + (floor / size) ** 2).sqrt()
 

@@ -56,6 +56,8 @@ def wasserstein_loss(
     where = "wasserstein_loss"
     width = positive(f"{where}: bin_width_opl", bin_width_opl)
     check_reduction(reduction, where)
+    if floor is not None and not isinstance(floor, Tensor):
+        positive(f"{where}: floor", floor)
     input, target = check_pair(input, target, where)
     if not -input.ndim <= dim < input.ndim:
         raise ShapeError(f"{where}: expected transients with time as their dimension {dim}, got {tuple(input.shape)}.")
@@ -69,7 +71,8 @@ def wasserstein_loss(
     kept = None if pixels is None else pixels.unsqueeze(dim)
     floor_a = _MASS_FLOOR * item_scale(mass_a, mass_b, kept) if floor is None else floor
     floor_b = _MASS_FLOOR * item_scale(mass_b, mass_a, kept) if floor is None else floor
-    even = torch.full_like(a, 1 / a.shape[dim]) if mask is None else mask / mask.sum(dim, keepdim=True).clamp_min(1)
+    counts = torch.ones_like(a) if mask is None else mask.to(a.dtype)
+    even = counts / counts.sum(dim, keepdim=True).clamp_min(1)
     difference = _normalised(a, mass_a, even, floor_a) - _normalised(b, mass_b, even, floor_b)
     return reduce(width * _moved(difference, dim), reduction, where, pixels)
 
@@ -78,7 +81,7 @@ def _normalised(x: Tensor, mass: Tensor, even: Tensor, floor: Tensor | float) ->
     """Records of mass one: those below the floor are filled up to it evenly."""
     least = torch.as_tensor(floor, dtype=x.dtype, device=x.device).clamp_min(torch.finfo(x.dtype).tiny)
     lacking = (least - mass).clamp_min(0)
-    return (x + lacking * even.to(x.dtype)) / torch.maximum(mass, least)
+    return (x + lacking * even) / torch.maximum(mass, least)
 
 
 def _moved(difference: Tensor, dim: int) -> Tensor:
