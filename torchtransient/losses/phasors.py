@@ -91,8 +91,9 @@ def phasor_loss(
 
 
 def _floor(floor: Tensor | float, phasor: Tensor) -> Tensor:
-    value = floor if isinstance(floor, Tensor) else torch.tensor(positive("phasor_loss: floor", floor))
-    return value.to(phasor.device, phasor.real.dtype)
+    if not isinstance(floor, Tensor):
+        floor = torch.tensor(positive("phasor_loss: floor", floor), dtype=torch.float64)
+    return floor.to(phasor.device, phasor.real.dtype)
 
 
 def _phase(phasor: Tensor, floor: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
     """`2 sqrt(n + 3/8 + read_noise^2)`: photon counts on a scale where their noise has variance one. Any shape.
 
     Anscombe 1948; with read noise, in counts, the generalised transform of Starck, Murtagh and Bijaoui 1998 for gain
-    one. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.78 at m = 1, and vanishes with the light. Counts below
+    one. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below
     zero, of a record less its background, continue the tangent at zero, so that values and gradients are finite.
     Raises UnitError for a read noise below zero.
     """
@@ -81,7 +81,7 @@ def log_ratio_loss(
             raise UnitError(f"{where}: expected a background above zero, got some that is not.")
         level = background.to(input)
     else:
-        level = torch.tensor(positive(f"{where}: background", background)).to(input)
+        level = torch.tensor(positive(f"{where}: background", background), dtype=torch.float64).to(input)
     return reduce((_log(input, level) - _log(target, level)).square(), reduction, where, mask)
 
 

@@ -27,7 +27,8 @@ def ssim_loss(
     reflected at the borders; Y and X are larger than half of it. `value_range`: of the values, whose first and third
     percent stabilise dark and flat places; None: the highest modulus of each target (its C, Y, X; 1 for a dark one),
     without gradient, which is not symmetric. `mask`: pixels that count; the others are 0 in both for the windows that
-    reach them, so a mask is not quite a smaller picture. Raises ShapeError, UnitError.
+    reach them, so a mask is not quite a smaller picture. Single precision holds values up to 1e9 times the range.
+    Raises ShapeError, UnitError.
     """
     from kornia.metrics import ssim
 
@@ -48,7 +49,7 @@ def ssim_loss(
         peak = b.detach().abs().amax((-3, -2, -1), keepdim=True)
         scale = torch.where(peak > 0, peak, torch.ones_like(peak))
     else:
-        scale = torch.full((), positive(f"{where}: value_range", value_range)).to(a)
+        scale = torch.tensor(positive(f"{where}: value_range", value_range), dtype=torch.float64).to(a)
     shape = (-1, *a.shape[-3:])
     # No further number in the denominator: with a range of 1 its own constants keep it from zero.
     similarity = ssim((a / scale).reshape(shape), (b / scale).reshape(shape), window, max_val=1.0, eps=0.0)

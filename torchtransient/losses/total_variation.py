@@ -49,7 +49,7 @@ def total_variation(
     if smoothing is None:
         smooth = _SMOOTHING / min(steps) * item_scale(seen, seen, mask)
     else:
-        smooth = torch.full((), check_number(smoothing, "smoothing", where)).to(seen.real)
+        smooth = torch.tensor(check_number(smoothing, "smoothing", where), dtype=torch.float64).to(seen.real)
     squares = [_squared_difference(seen, mask, dim, step) for dim, step in zip(_DIMS, steps, strict=True)]
     if isotropic:
         squares = [torch.stack(squares).sum(0)]
