@@ -17,14 +17,14 @@ COUNTS_FLOOR = 0.25
 
 
 def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
-    """``H / sqrt(|H| + floor)`` of every value, odd in H: what a subtracted background leaves below zero keeps its sign.
+    """``H / sqrt(|H| + floor)`` of every value, odd in H: what background leaves below zero keeps its sign.
 
     ``floor``: in the unit of the transient, 1/4 for photon counts; a small part of the brightest bin for radiance. With
     0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero there.
     Differentiable any number of times, in both modes. Whole numbers become float32. Raises UnitError for a floor below
     zero.
     """
-    floor = _floor(floor)
+    floor = checked_floor(floor)
     h = transient if transient.is_floating_point() else transient.to(torch.float32)
     if floor:
         return h * torch.rsqrt(h.abs() + floor)
@@ -39,7 +39,7 @@ class StabilisedRoot(nn.Module):
 
     def __init__(self, floor: float = COUNTS_FLOOR) -> None:
         super().__init__()
-        self.floor = _floor(floor)
+        self.floor = checked_floor(floor)
 
     def forward(self, transient: Tensor) -> Tensor:
         return stabilised_root(transient, self.floor)
@@ -48,7 +48,8 @@ class StabilisedRoot(nn.Module):
         return f"floor={self.floor:g}"
 
 
-def _floor(value: float) -> float:
+def checked_floor(value: float) -> float:
+    """A floor of :func:`stabilised_root`. Raises UnitError."""
     floor = finite("stabilised_root: floor", value)
     if floor < 0:
         raise UnitError(f"stabilised_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")

@@ -73,7 +73,7 @@ class ConfocalOperator(LinearOperator):
         """Moves and conversions of a module. Another precision makes new tables, since converted ones have the digits
         of the old.
         """
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point()}
         if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
             device = self.device
@@ -104,6 +104,21 @@ class ConfocalOperator(LinearOperator):
     def extra_repr(self) -> str:
         rows, columns = self.grid.size
         return f"{rows} x {columns} points, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
+
+
+class InverseOperator(LinearOperator):
+    """A regularised inverse of an operator, itself a linear operator: from its data to its volume."""
+
+    def __init__(self, operator: ConfocalOperator) -> None:
+        super().__init__()
+        self.operator = operator
+        self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
+        self.dtype = operator.dtype
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.dtype = self.operator.dtype
+        return self
 
 
 def precision_of(capture: Capture) -> torch.dtype:

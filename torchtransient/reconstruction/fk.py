@@ -11,8 +11,8 @@ with k per metre of optical path over 2, that is, along the record. In bins of t
     jt^2 = jz^2 + (T dt / (2 Y dy))^2 jy^2 + (T dt / (2 X dx))^2 jx^2 .
 
 U is interpolated along jt. Three things make that exact to 1e-3 of the field: the record's middle is moved to t = 0,
-where its transform varies least; taps of a Kaiser-Bessel window, whose transform the data are divided by beforehand; and
-the place of the samples in the phase: bin k is at start + (k + 1/2) dt, plane k at half of that. J is 0 at k = 0.
+where its transform varies least; the taps are those of a Kaiser-Bessel window, whose transform the data are divided by
+beforehand; the place of the samples is in the phase: bin k at start + (k + 1/2) dt, plane k at half of that.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.quantities import shown
-from torchtransient.reconstruction.capture_roots import _floor, stabilised_root
+from torchtransient.reconstruction.capture_roots import checked_floor, stabilised_root
 from torchtransient.reconstruction.confocal_operator import (
     ConfocalOperator,
     check_capture,
@@ -47,14 +47,14 @@ class FK(ConfocalOperator):
 
     ``operator(field)``: complex (..., Z, Y, X) at time zero to the real wavefield (..., T, Y, X) on the wall, the
     exploding-reflector model; ``operator.adjoint(wavefield)``: the migration. They are each other's adjoints exactly,
-    and all but each other's inverses: migration times model is J, the cosine of the angle of each wave.
+    and nearly inverses: migration of the model is J / 2 times the field, J being the cosine of each wave's direction.
     ``operator.reconstruct(transient)``: from measured light to the squared field.
 
     ``target``: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
     with the second and psi = sqrt(H), where z is half the optical path length. ``floor``: of the root, see
-    :func:`stabilised_root`, in the unit of the transient; 0, the default, is the root itself with no derivative at empty
-    bins. Take 1/4 for photon counts and wherever gradients go through. ``taps``: 4 interpolate to 3e-4 of the field, 2
-    linearly to some percent.
+    :func:`stabilised_root`, in the unit of the transient; 0, the default, is the root itself, with no derivative at
+    empty bins. Take 1/4 for photon counts and wherever gradients go through. ``taps``: 4 interpolate to 3e-4 of the
+    field, 2 linearly to some percent.
 
     Wall, time and depth are padded to twice their length. Memory: two complex cubes of the wavefield for each call, and
     tables of 4 + 8 taps bytes (float32) for each quarter of a voxel of the padded spectrum. Not supported: scans that
@@ -82,13 +82,13 @@ class FK(ConfocalOperator):
             raise SceneError(f"FK: expected target to be one of {', '.join(TARGETS)}, got {shown(target)}.")
         if taps not in TAPS:
             raise SceneError(f"FK: expected 2 or 4 taps, got {shown(taps)}.")
-        self.target, self.taps, self.floor = target, int(taps), _floor(floor)
+        self.target, self.taps, self.floor = target, int(taps), checked_floor(floor)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
-        """``place`` (X + 1, Y + 1, T): the first bin to interpolate from; ``weights`` (X + 1, taps, Y + 1, T, 2): of the
-        bins from there on, real and imaginary; ``taper`` (T,): what the data are multiplied by. Frequencies below zero
-        are mirrors of these.
+        """``place`` (X + 1, Y + 1, T): the first bin to interpolate from; ``weights`` (X + 1, taps, Y + 1, T, 2): of
+        the bins from there on, real and imaginary; ``taper`` (T,): what the data are multiplied by. Frequencies below
+        zero are mirrors of these.
         """
         bins, rows, columns = self.data_shape
         width = self.axis.bin_width_opl
@@ -219,7 +219,8 @@ def fk(capture: Capture, **options: Any) -> Tensor:
     """
     transient, axis = check_capture(capture, "fk")
     options.setdefault("dtype", precision_of(capture))
-    return FK(capture.scan, time_axis=axis, **options).to(transient.device).reconstruct(capture)
+    operator: FK = FK(capture.scan, time_axis=axis, **options).to(transient.device)
+    return operator.reconstruct(capture)
 
 
 # ------------------------------------------------------------------------------------------------ interpolation windows
@@ -230,7 +231,8 @@ def _window(distance: Tensor, taps: int) -> Tensor:
     if taps == 2:
         return (1 - distance.abs()).clamp_min(0)
     inside = (1 - (2 * distance / taps) ** 2).clamp_min(0)
-    return torch.special.i0(_beta(taps) * torch.sqrt(inside)) * (distance.abs() < taps / 2)
+    window: Tensor = torch.special.i0(_beta(taps) * torch.sqrt(inside))
+    return window * (distance.abs() < taps / 2)
 
 
 def _window_transform(time: Tensor, taps: int) -> Tensor:
