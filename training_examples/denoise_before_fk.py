@@ -4,7 +4,7 @@ Bars of points hang before a scanned wall, at random places and tilts. A SPAD se
 point of the scan, and two thirds as many of background: f-k migration makes a fog of that. `tt.nlos.FK` is a linear
 operator whose backward pass is its adjoint, so the error of the *volume* trains the network in front of it: it learns
 to keep what becomes a surface. The same network, trained for as many steps to give back the transient without noise,
-is compared, and the plain remedy, a Gaussian blur of the capture (kornia).
+is compared (given sixteen times as many it comes near), and the plain remedy, a Gaussian blur of the capture (kornia).
 
     python training_examples/denoise_before_fk.py --output demo_output
 
