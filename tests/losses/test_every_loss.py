@@ -235,6 +235,27 @@ def test_transforms_of_functions(case):
         torch.testing.assert_close(tangent, gradient(case, x, y).sum())
 
 
+@over(lambda case: case.mapped and "SSIM" not in case.name)  # kornia turns autocast off, which this device has not
+def test_no_tensor_stays_on_the_cpu(case):
+    """Tensors without memory are on another device, too: one of the CPU among them is an error."""
+    x, y = (t.to("meta") for t in case.tensors())
+    x.requires_grad_()
+    value = case(x, y, mask_of(torch.empty(y.shape)).to("meta"))
+    value.backward()
+    assert value.device.type == x.grad.device.type == "meta"
+
+
+@over(lambda case: real(case.tensors()[0]) and case.pair)
+def test_whole_numbers_as_targets(case):
+    """Counts as detectors give them, beside a network's half precision: 70,000 is no number of float16."""
+    x, y = case.tensors(dtype=torch.float32)
+    whole = (70_000 * y if case.draw_target is None else y).to(torch.int64)
+    torch.testing.assert_close(case(x, whole), case(x, whole.float()), rtol=0, atol=0)
+    # an operator of half precision has its rounding, 2^-11, in the residual
+    rtol = 2**-10 if case.function is losses.measurement_consistency else 0
+    torch.testing.assert_close(case(x.half(), whole), case(x.half().float(), whole.float()), rtol=rtol, atol=0)
+
+
 @pytest.mark.gpu
 @every
 def test_on_the_device_of_the_tensors(case):
