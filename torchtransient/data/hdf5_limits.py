@@ -1,0 +1,93 @@
+"""Datasets of HDF5 files that anyone may have written: numbers and texts of the file itself, no more than it can hold.
+
+A file may declare terabytes that nobody stored, point to other files of the machine, or be damaged where the library
+that reads it does not look. What is declared is compared with what is stored before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import StorageError
+from torchtransient.render.memory import available_bytes
+
+# Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
+MOST_BYTES_OF_ONE = 1032
+# Never written, and small enough to be made of fill values.
+_FREE_BYTES = 2**20
+# Chunks hold a header, and their last ones more than the array.
+_SLACK = 2
+
+
+def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
+    """A dataset of an open file or group, or ``part`` of it; None for one that is empty. Texts are `str`.
+
+    Raises StorageError for links to other files, for objects and records, and for more numbers than the file, or the
+    memory that is left, can hold.
+    """
+    dataset = dataset_of(parent, name, what)
+    if dataset.shape is None:
+        return None
+    if is_text(dataset):
+        return _text(dataset, what)
+    if dataset.dtype.kind not in "biufc":
+        raise StorageError(f"{what}: '{name}' holds {dataset.dtype}; expected numbers.")
+    left = [n for axis, n in enumerate(dataset.shape) if axis >= len(part) or not isinstance(part[axis], int)]
+    wanted = math.prod(left) * dataset.dtype.itemsize
+    check_size(wanted, dataset.id.get_storage_size(), f"{what}: '{name}' {dataset.shape}")
+    if part == () and dataset.shape:
+        # Into memory of its own: h5py would fill what it allocates with zeros first.
+        array: NDArray[Any] = np.empty(dataset.shape, dataset.dtype)
+        if array.size:
+            dataset.read_direct(array)
+        return array
+    return np.asarray(dataset[part])
+
+
+def dataset_of(parent: Any, name: str, what: str) -> Any:
+    """The dataset at a path of the file itself. Raises StorageError for groups, and for links to elsewhere."""
+    import h5py
+
+    found = parent
+    for step in name.split("/"):
+        if not isinstance(found, h5py.Group) or step not in found:
+            raise StorageError(f"{what}: '{name}' is missing.")
+        if not isinstance(found.get(step, getlink=True), h5py.HardLink):
+            raise StorageError(f"{what}: '{name}' is a link to elsewhere, which is not followed.")
+        found = found[step]
+    if not isinstance(found, h5py.Dataset):
+        raise StorageError(f"{what}: expected '{name}' to be a dataset, got a {type(found).__name__.lower()}.")
+    if found.is_virtual or found.external:
+        raise StorageError(f"{what}: '{name}' lies in other files, which are not read.")
+    return found
+
+
+def is_text(dataset: Any) -> bool:
+    """Whether a dataset holds one text."""
+    import h5py
+
+    return h5py.check_string_dtype(dataset.dtype) is not None and math.prod(dataset.shape or ()) == 1
+
+
+def check_size(declared: int, stored: int, what: str) -> None:
+    """Raise StorageError where an array of ``declared`` bytes cannot come from ``stored`` ones, or does not fit."""
+    if declared > max(_FREE_BYTES, _SLACK * MOST_BYTES_OF_ONE * stored):
+        raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: the file is damaged.")
+    available = available_bytes("scalar_rgb")
+    if available is not None and declared > available:
+        raise StorageError(
+            f"{what} takes {declared / 1e9:.3g} GB, and {available / 1e9:.3g} GB of memory are left. Free some memory, "
+            "or cut the file into parts with h5py."
+        )
+
+
+def _text(dataset: Any, what: str) -> str:
+    try:
+        value = dataset.asstr()[()]
+    except UnicodeDecodeError as error:
+        raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
+    return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)
