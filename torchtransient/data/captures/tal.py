@@ -105,17 +105,17 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     else:
         settings |= {"transient": tensor, "axis": time_axis(gaps, start, width, len(measured))}
     if own is not None:
-        return Capture(**settings, **_of_ours(own, scan, settings))
+        return Capture(**(settings | _of_ours(own, scan)))
     kept |= {"scene_info_text": text, "volume_format": _volume(contents, gaps)}
     left = sorted(set(contents.shapes) - _KNOWN)
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
-def _of_ours(own: Mapping[str, Any], scan: Scan, settings: dict[str, Any]) -> dict[str, Any]:
+def _of_ours(own: Mapping[str, Any], scan: Scan) -> dict[str, Any]:
     """What this library has written beside, into ``scene_info``."""
-    settings["scan"] = replace(scan, wall=own["wall"])
     return {
-        "metadata": own.get("metadata") or {}, "channels": tuple(own.get("channels") or ()), "steady": own["steady"],
+        "scan": replace(scan, wall=own["wall"]), "metadata": own.get("metadata") or {}, "steady": own["steady"],
+        "channels": tuple(own.get("channels") or ()),
     }  # fmt: skip
 
 
