@@ -67,6 +67,7 @@ def holdable():
         yield "zaragoza", kind, made(with_legs[kind])
     whole = made(replace(with_legs["confocal"], wall=dict(WALL.shape)), channels=("y",), metadata={"a": [1, 0.1]})
     yield "tal", "all of it", replace(whole, steady=torch.rand(1, 3, 4))
+    yield "zaragoza", "confocal square", made(grids(wall=SQUARE, size=(4, 4))["confocal"])
     yield "dirac", "confocal from wall to wall", made(without["confocal"])
     yield "dirac", "confocal", made(with_legs["confocal"])
     yield "phasor_field", "single", made(listed("single"))

@@ -19,6 +19,8 @@ from torchtransient.render.memory import available_bytes
 MOST_BYTES_OF_ONE = 1032
 # Never written, and small enough to be made of fill values.
 _FREE_BYTES = 2**20
+# Below, memory is not asked about: files are read in a moment.
+_LARGE_BYTES = 2**26
 # Chunks hold a header, and their last ones more than the array.
 _SLACK = 2
 
@@ -77,6 +79,8 @@ def check_size(declared: int, stored: int, what: str) -> None:
     """Raise StorageError where an array of ``declared`` bytes cannot come from ``stored`` ones, or does not fit."""
     if declared > max(_FREE_BYTES, _SLACK * MOST_BYTES_OF_ONE * stored):
         raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: the file is damaged.")
+    if declared < _LARGE_BYTES:
+        return
     available = available_bytes("scalar_rgb")
     if available is not None and declared > available:
         raise StorageError(
@@ -86,8 +90,30 @@ def check_size(declared: int, stored: int, what: str) -> None:
 
 
 def _text(dataset: Any, what: str) -> str:
+    import h5py
+
+    if h5py.check_string_dtype(dataset.dtype).length is None:
+        _check_length(dataset, what)
+    else:
+        check_size(dataset.nbytes, dataset.id.get_storage_size(), f"{what}: the text '{dataset.name}'")
     try:
         value = dataset.asstr()[()]
     except UnicodeDecodeError as error:
         raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
     return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)
+
+
+def _check_length(dataset: Any, what: str) -> None:
+    """HDF5 fills as much memory as a text says it is long, up to 4 GB, before it looks for it."""
+    offset = dataset.id.get_offset()
+    if offset is None:
+        raise StorageError(
+            f"{what}: expected the text '{dataset.name}' in one piece, got one that is stored otherwise."
+        )
+    with open(dataset.file.filename, "rb") as file:
+        size = file.seek(0, 2)
+        file.seek(offset)
+        # The length comes before the place of the text in the heap.
+        length = int.from_bytes(file.read(4), "little")
+    if length > size:
+        raise StorageError(f"{what}: the text '{dataset.name}' says it has {length:,} bytes, the file {size:,}.")

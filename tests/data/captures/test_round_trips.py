@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from support.capture_files import AXIS, FROM_ZERO, WALL, grids, holdable, listed, made
 
 import torchtransient as tt
+from support.capture_files import AXIS, FROM_ZERO, WALL, grids, holdable, listed, made
 from torchtransient.capture import Capture, files
 from torchtransient.data.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
 from torchtransient.errors import StorageError
@@ -129,7 +129,7 @@ def test_names_of_formats(tmp_path):
         read_capture(tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["something"] = 1.0
-    with pytest.raises(StorageError, match="no known layout.*it holds something"):
+    with pytest.raises(StorageError, match=r"no known layout.*it holds something"):
         read_capture(tmp_path / "a.h5")
     with pytest.raises(StorageError, match="H_format"):
         read_capture(tmp_path / "a.h5", "tal")

@@ -110,7 +110,8 @@ class MatContents:
         self.source = source
         self._io = _scipy_io()
         self._size = source.stat().st_size
-        found = self._io.whosmat(str(source))
+        with _errors_said(source):
+            found = self._io.whosmat(str(source))
         shapes = {name: None if kind == "struct" else tuple(reversed(shape)) for name, shape, kind in found}
         self.shapes: Mapping[str, tuple[int, ...] | None] = shapes
         self._kept: dict[str, Any] = {}
@@ -145,7 +146,8 @@ class MatContents:
         if name not in self._kept:
             declared = math.prod(self.shapes[name] or ()) * _BYTES_PER_VALUE
             check_size(declared, self._size, f"{WHAT}: '{name}' {self.shapes[name]}")
-            self._kept[name] = self._io.loadmat(str(self.source), variable_names=[name])[name]
+            with _errors_said(self.source):
+                self._kept[name] = self._io.loadmat(str(self.source), variable_names=[name])[name]
         return self._kept[name]
 
 
@@ -154,6 +156,17 @@ def _is_old_mat(source: Path) -> bool:
         start = file.read(_HEADER_BYTES)
     # Version 0x0100, whose bytes tell their order; 7.3 has 0x0200 and is HDF5.
     return len(start) == _HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")
+
+
+@contextmanager
+def _errors_said(source: Path) -> Iterator[None]:
+    """What scipy has errors of its own for, as StorageError."""
+    from scipy.io.matlab import MatReadError
+
+    try:
+        yield
+    except MatReadError as error:
+        raise StorageError(f"{WHAT}: '{source}' is no MATLAB file, or is damaged: {error}.") from None
 
 
 def _scipy_io() -> Any:

@@ -39,9 +39,12 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
             f"expected data_t (T, X, Y), xg and yg (X, Y), da (T,) with T of 2 or more, got {data.shape}, {x.shape}, "
             f"{y.shape}, {da.shape}."
         )
-    steps = np.diff(da.astype(np.float64))
-    width = float(da[-1] - da[0]) / (len(da) - 1)
-    if not np.all(np.abs(steps - width) <= _UNEVEN * abs(width)):
+    starts = da.astype(np.float64)
+    with np.errstate(all="ignore"):
+        steps = np.diff(starts)
+        width = float(starts[-1] - starts[0]) / (len(da) - 1)
+        even = np.all(np.abs(steps - width) <= _UNEVEN * abs(width))
+    if not even:
         raise gaps.error(f"expected equal steps in da, got {steps.min():.6g} to {steps.max():.6g} m.")
     points = np.stack(np.broadcast_arrays(x.T, y.T, 0.0), -1).astype(np.float64)
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)

@@ -104,10 +104,12 @@ def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
     """A place a diagonal, or a metre, before the middle of points, on the side of their normals."""
     flat = np.asarray(points, np.float64).reshape(-1, 3)
     towards = np.array([0.0, 0.0, 1.0])
-    if normals is not None:
-        towards = np.asarray(normals, np.float64).reshape(-1, 3).mean(0)
-    size = float(np.linalg.norm(flat.max(0) - flat.min(0))) or 1.0
-    place: NDArray[Any] = flat.mean(0) + size * towards / max(float(np.linalg.norm(towards)), 1e-300)
+    # Numbers of damaged files overflow; a scan refuses what comes out.
+    with np.errstate(all="ignore"):
+        if normals is not None:
+            towards = np.asarray(normals, np.float64).reshape(-1, 3).mean(0)
+        size = float(np.linalg.norm(flat.max(0) - flat.min(0))) or 1.0
+        place: NDArray[Any] = flat.mean(0) + size * towards / max(float(np.linalg.norm(towards)), 1e-300)
     return place
 
 

@@ -12,12 +12,12 @@ from torchtransient.errors import StorageError
 
 # Ground truth of 1024 x 1024 points with normals takes 43 MB as text.
 MOST_CHARACTERS = 2**27
-MOST_NODES = 2**20
+MOST_NODES = 2**16
 MOST_LEVELS = 100
 
 
 def read_plain_yaml(text: str, what: str) -> Any:
-    """The data of a YAML text. Raises StorageError for what is no YAML, for more than 2^20 nodes once aliases are
+    """The data of a YAML text. Raises StorageError for what is no YAML, for more than 2^16 nodes once aliases are
     written out, for more than 100 levels, and for a missing PyYAML.
     """
     yaml = _package(what)
