@@ -32,7 +32,15 @@ def made(fields):
     # What a render of y-tal writes there: texts, numbers, arrays that its own loader makes of tags of Python.
     capture.scene_info = {
         "tal_version": tal.__version__,
-        "config": {"name": "ä", "bins": 7, "width": 1e-05, "missing": None, "flag": True, "size": (3, 4)},
+        "config": {
+            "name": "ä",
+            "mitsuba_variant": "llvm_mono",
+            "bins": 7,
+            "width": 1e-05,
+            "missing": None,
+            "flag": True,
+            "size": (3, 4),
+        },
         "ground_truth": {"depth": np.arange(6.0).reshape(2, 3)},
     }
     return capture
@@ -42,7 +50,8 @@ def read(source):
     """The fields of a file. `read_capture` of 0.20 raises for other layouts: it takes their `scene_info` for a text."""
     stored = read_hdf5(source)
     if detect_dict_format(stored) == FileFormat.HDF5_TAL:
-        return read_capture(source).as_dict()
+        capture = read_capture(source)
+        return capture.as_dict() | {"is_polarized": capture.is_polarized()}
     return convert_dict(stored, format_to=FileFormat.HDF5_TAL)
 
 

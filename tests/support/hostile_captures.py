@@ -21,7 +21,7 @@ TEXTS = (
     BOMB, "!!python/object/apply:os.system ['touch {executed}']", "!!python/object/new:os.system ['touch {executed}']",
     "[" * 100_000, "{" * 100_000, "a: *b", "&a [*a]", "a: !!int 9e999", "\0", "- " * 5_000, "!!binary '%'",
     "torchtransient: '[]'", "torchtransient: '{\"wall\": 3}'", "torchtransient: '{'",
-    "config: {histogram_mode: frequency, wl_mean: 1.0e-300, wl_sigma: .nan, num_bins: 99999999999, bin_width_opl: .inf}",
+    "config: {histogram_mode: frequency, wl_mean: 1.0e-300, wl_sigma: .nan, num_bins: 9999999999, bin_width_opl: .inf}",
     "? [a]\n: b", "1: 2", "~",
     "torchtransient: '" + "[" * 3_000 + "'", "!!timestamp 2020-01-01", "a: " + "9" * 10_000, "[" + "1, " * 2**17 + "]",
 )  # fmt: skip

@@ -41,7 +41,8 @@ def test_a_scan_through_foam():
 
 
 @pytest.mark.parametrize(
-    ("size", "error"), [((0.6, 0.7), None), (0.0, "metres"), (float("nan"), "metres"), ("0.6", "metres"), ((1, 2, 3), "metres")]
+    ("size", "error"),
+    [((0.6, 0.7), None), (0.0, "metres"), (float("nan"), "metres"), ("0.6", "metres"), ((1, 2, 3), "metres")],
 )  # fmt: skip
 def test_sizes_of_a_wall(size, error):
     if error is None:

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.capture_files import AXIS, FROM_ZERO, WALL, grids, holdable, listed, made
+from support.capture_files import AXIS, FROM_ZERO, SQUARE, WALL, grids, holdable, listed, made
 from torchtransient.capture import Capture, files
 from torchtransient.data.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
+from torchtransient.data.captures.mat_file import write_mat
 from torchtransient.errors import StorageError
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
@@ -172,3 +173,135 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="No space left"):
         capture.write(path, "tal")
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_bounces_are_summed_without_overflow(tmp_path):
+    capture = made(grids()["confocal"])
+    path = capture.write(tmp_path / "a.h5", "zaragoza")
+    with h5py.File(path, "r+") as file:
+        shape = file["data"].shape
+        del file["data"]
+        file["data"] = np.full(shape, 60_000, np.uint16)
+    back = Capture.read(path)
+    assert back.metadata["bounces"] == 6 and back.transient.dtype == torch.int64
+    assert bool((back.transient == 6 * 60_000).all())
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_zaragoza_files_of_both_orders(tmp_path, kind):
+    """`data order`: row-major turns all axes round, of data and of positions."""
+    capture = made(grids()[kind])
+    path = capture.write(tmp_path / "a.h5", "zaragoza")
+    with h5py.File(path, "r+") as file:
+        for name in ("data", *(f"{who}Grid{what}" for who in ("camera", "laser") for what in ("Positions", "Normals"))):
+            array = file[name][()]
+            del file[name]
+            file[name] = array.T
+        file.attrs["data order"] = "row-major"
+    back = Capture.read(path)
+    assert torch.equal(back.transient, capture.transient)
+    assert torch.equal(back.scan.sensor_points, capture.scan.sensor_points)
+    assert torch.equal(back.scan.laser_points, capture.scan.laser_points)
+    with h5py.File(path, "r+") as file:  # files without colours
+        array = file["data"][()][..., 0]
+        del file["data"]
+        file["data"] = array
+    assert torch.equal(Capture.read(path).transient, capture.transient)
+
+
+def test_old_matlab_files_are_as_the_new_ones(tmp_path):
+    import scipy.io
+
+    capture = made(listed("single"))
+    path = capture.write(tmp_path / "new.mat", "phasor_field")
+    with h5py.File(path) as file:
+        dataset = {name: file["dataset"][name][()].T for name in file["dataset"]}
+        others = {name: file[name][()].T for name in file if name != "dataset"}
+    for compressed in (False, True):
+        scipy.io.savemat(tmp_path / "old.mat", {"dataset": dataset, **others}, do_compression=compressed)
+        old, new = Capture.read(tmp_path / "old.mat"), Capture.read(path)
+        assert old == new and old.metadata["reciprocal"] is new.metadata["reciprocal"] is True
+
+
+def test_a_file_of_matlab_is_one_for_matlab(tmp_path):
+    """The header that MATLAB looks for, and the class of each array."""
+    square = grids(legs=False, wall=SQUARE, size=(4, 4))["confocal"]
+    path = made(square, FROM_ZERO).write(tmp_path / "a.mat", "rect_data")
+    start = path.read_bytes()[:128]
+    assert start.startswith(b"MATLAB 7.3 MAT-file") and start[124:] == b"\x00\x02IM"
+    with h5py.File(path) as file:
+        assert file["rect_data"].attrs["MATLAB_class"] == b"single" and file["width"].attrs["MATLAB_class"] == b"double"
+        assert file["rect_data"].shape == (7, 4, 4) and file["width"].shape == (1, 1) and file["width"][0, 0] == 1.0
+
+
+def test_rectified_data_say_little(tmp_path):
+    """Files of the light-cone transform have half a width and no bins, those of f-k migration neither."""
+    data = np.random.default_rng(0).random((9, 4, 4)).astype(np.float32)
+    lct, fk = tmp_path / "lct.mat", tmp_path / "fk.mat"
+    write_mat(lct, {"rect_data": data, "width": 0.5})
+    write_mat(fk, {"meas": data})
+    with pytest.raises(StorageError, match="does not say bin_width_s"):
+        Capture.read(lct)
+    capture = Capture.read(lct, bin_width_s=4e-12)
+    assert capture.axis.bin_width_s == pytest.approx(4e-12, rel=1e-15)
+    np.testing.assert_allclose(capture.scan.sensor_points[0, :, 0], [-0.375, -0.125, 0.125, 0.375])
+    np.testing.assert_array_equal(capture.transient[0], data.swapaxes(1, 2))
+    with pytest.raises(StorageError, match="says wall_size itself"):
+        Capture.read(lct, bin_width_s=4e-12, wall_size=1.0)
+    assert torch.equal(Capture.read(fk, bin_width_s=32e-12, wall_size=2.0).transient, capture.transient)
+    cube = tmp_path / "cube.mat"
+    write_mat(cube, {"meas": data[:4]})
+    with pytest.raises(StorageError, match="no known layout"):
+        Capture.read(cube)
+    for layout, axes in (("rect_data", (0, 2, 1)), ("cdt", (2, 1, 0))):
+        said = {"bin_width_s": 16e-12, "wall_size": 2.0}
+        found = Capture.read(cube, layout, **said)
+        assert found.metadata["format"] == layout
+        np.testing.assert_array_equal(found.transient[0], data[:4].transpose(axes))
+
+
+def test_what_tal_leaves_open(tmp_path):
+    """Origins whose distance does not count are assumed, and left out again; those that count are needed."""
+    path = made(grids(legs=False)["single"]).write(tmp_path / "a.h5", "tal")
+    with h5py.File(path, "r+") as file:
+        for name in ("sensor_xyz", "laser_xyz", "t_start", "scene_info", "sensor_grid_normals"):
+            del file[name]
+            file[name] = h5py.Empty(float)
+    capture = Capture.read(path)
+    assert set(capture.metadata["assumed"]) == {"sensor_origin", "laser_origin", "start_s"}
+    assert capture.axis.start_opl == 0 and capture.scan.sensor_normals is None
+    again = capture.write(tmp_path / "b.h5", "tal")
+    with h5py.File(path) as a, h5py.File(again) as b:
+        assert set(a) == set(b)
+        for name in a:
+            assert a[name].shape == b[name].shape and a[name].dtype == b[name].dtype
+            assert a[name].shape is None or np.array_equal(a[name][()], b[name][()])
+    filled = Capture.read(path, sensor_origin=(0.1, 0.2, 0.9), laser_origin=(-0.3, 0, 1.1), start_s=1e-9)
+    assert "assumed" not in filled.metadata and filled.scan.sensor_origin.tolist() == [0.1, 0.2, 0.9]
+    with h5py.File(path, "r+") as file:
+        file["t_accounts_first_and_last_bounces"][...] = True
+    with pytest.raises(StorageError, match="does not say sensor_origin"):
+        Capture.read(path)
+
+
+def test_frequencies_of_a_render_of_tal(tmp_path):
+    """Where only the settings of the render are known, the frequencies follow from them; else they are to be given."""
+    capture = made(grids()["confocal"], phasor=True)
+    path = capture.write(tmp_path / "a.h5", "tal")
+    # Lines are 1 / (2 m) apart, of 4 - 1 to 4 + 1 with sigma 1 m; more with half of it, where H has three.
+    config = "config: {histogram_mode: frequency, wl_mean: 0.5, wl_sigma: %g, num_bins: 100, bin_width_opl: 0.02}"
+
+    def replaced(text):
+        with h5py.File(path, "r+") as file:
+            del file["scene_info"]
+            file["scene_info"] = text
+
+    replaced(config % 1.0)
+    assert Capture.read(path).frequencies.frequencies == (1.5, 2.0, 2.5)
+    for text in (config % 0.5, "config: {}"):
+        replaced(text)
+        with pytest.raises(StorageError, match="does not say frequencies"):
+            Capture.read(path)
+        back = Capture.read(path, frequencies=capture.frequencies)
+        assert torch.equal(back.phasor, capture.phasor) and back.frequencies == capture.frequencies
+        assert Capture.read(back.write(tmp_path / "b.h5", "tal")).frequencies == capture.frequencies

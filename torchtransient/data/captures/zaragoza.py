@@ -82,9 +82,11 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
         if part.dtype.kind not in "iuf":
             raise gaps.error(f"expected real numbers in data, got {part.dtype}.")
         if total is None:
-            total = part
+            # Counts of a few bits would overflow.
+            total = part if part.dtype.kind == "f" else part.astype(np.int64)
         else:
-            total += part
+            with np.errstate(all="ignore"):
+                total += part
     if total is None:
         raise gaps.error("data is empty.")
     tensor = tensor_of(total)
