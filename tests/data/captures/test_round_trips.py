@@ -305,3 +305,17 @@ def test_frequencies_of_a_render_of_tal(tmp_path):
         back = Capture.read(path, frequencies=capture.frequencies)
         assert torch.equal(back.phasor, capture.phasor) and back.frequencies == capture.frequencies
         assert Capture.read(back.write(tmp_path / "b.h5", "tal")).frequencies == capture.frequencies
+
+
+def test_a_steady_image_of_points_that_are_gone(tmp_path):
+    """Another program leaves every second column, and `scene_info` as it is."""
+    capture = replace(made(grids()["confocal"]), steady=torch.rand(1, 3, 4), metadata={"a": 1})
+    path = capture.write(tmp_path / "a.h5", "tal")
+    with h5py.File(path, "r+") as file:
+        for name in ("H", *(f"{who}_grid_{what}" for who in ("sensor", "laser") for what in ("xyz", "normals"))):
+            array = file[name][()]
+            del file[name]
+            file[name] = array[:, ::2] if name == "H" else array[::2]
+    back = Capture.read(path)
+    assert back.steady is None and back.metadata == {"a": 1, "not_read": ["steady"]}
+    assert torch.equal(back.transient, capture.transient[..., ::2])

@@ -113,8 +113,12 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 def _of_ours(own: Mapping[str, Any], scan: Scan) -> dict[str, Any]:
     """What this library has written beside, into ``scene_info``."""
+    metadata, steady = own.get("metadata") or {}, own["steady"]
+    if steady is not None and np.shape(steady)[-len(scan.shape) :] != scan.shape:
+        # Another program has cut or thinned the points out since.
+        metadata, steady = {**metadata, "not_read": ["steady"]}, None
     return {
-        "scan": replace(scan, wall=own["wall"]), "metadata": own.get("metadata") or {}, "steady": own["steady"],
+        "scan": replace(scan, wall=own["wall"]), "metadata": metadata, "steady": steady,
         "channels": tuple(own.get("channels") or ()),
     }  # fmt: skip
 
