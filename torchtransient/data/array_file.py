@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.data.hdf5_limits import read_dataset
+from torchtransient.data.hdf5_limits import read_attributes, read_dataset
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
@@ -31,7 +31,7 @@ _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
     OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, RuntimeError, AttributeError, IndexError,
-    OverflowError, zlib.error, struct.error, tokenize.TokenError, SyntaxError,
+    ArithmeticError, zlib.error, struct.error, tokenize.TokenError, SyntaxError,
 )  # fmt: skip
 
 
@@ -160,7 +160,7 @@ def _parts(array: NDArray[Any]) -> Iterator[Any]:
 
 def _read_hdf5(path: Path, what: str) -> dict[str, Any]:
     with hdf5_package(what).File(path, "r") as file:
-        return {**{name: read_dataset(file, name, what) for name in file}, **dict(file.attrs)}
+        return {**{name: read_dataset(file, name, what) for name in file}, **read_attributes(file, what)}
 
 
 def _read_npz(path: Path) -> dict[str, Any]:

@@ -7,6 +7,10 @@ that reads it does not look. What is declared is compared with what is stored be
 from __future__ import annotations
 
 import math
+import mmap
+import re
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +27,10 @@ _FREE_BYTES = 2**20
 _LARGE_BYTES = 2**26
 # Chunks hold a header, and their last ones more than the array.
 _SLACK = 2
+# What HDF5 writes of a text before the type of its letters: of the encoding, of the text, and the letters' version.
+_KIND_HEAD = 2 + 8 + 1
+# An attribute's parts may be filled up to eight bytes; then a shape of version 1 or 2, and the length.
+_NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{4})", re.DOTALL)
 
 
 def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
@@ -101,6 +109,45 @@ def _text(dataset: Any, what: str) -> str:
     except UnicodeDecodeError as error:
         raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
     return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)
+
+
+def read_attributes(file: Any, what: str, names: Iterable[str] | None = None) -> dict[str, Any]:
+    """The attributes of an open file, or those of ``names`` that are there: numbers, and texts as `str`.
+
+    Raises StorageError for others, and for texts that say they are longer than the file.
+    """
+    import h5py
+
+    found: dict[str, Any] = {}
+    for name in file.attrs if names is None else [name for name in names if name in file.attrs]:
+        attribute = h5py.h5a.open(file.id, name.encode("utf-8"))
+        text = h5py.check_string_dtype(attribute.dtype)
+        if text is not None and text.length is None:
+            _check_attribute(attribute, file.filename, f"{what}: the attribute '{name}'")
+        elif attribute.dtype.kind not in "biufcS":
+            raise StorageError(f"{what}: the attribute '{name}' holds {attribute.dtype}; expected numbers or a text.")
+        value = file.attrs[name]
+        found[name] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    return found
+
+
+def _check_attribute(attribute: Any, path: str, what: str) -> None:
+    """Find the lengths of texts in the raw file by what stands before them: the kind of text, and no shape."""
+    # The letters' type behind its version, as HDF5 writes it in all of them: one byte, 8 bits.
+    letters = attribute.get_type().encode()[_KIND_HEAD:]
+    size, found = Path(path).stat().st_size, False
+    if attribute.shape == () and letters:
+        with open(path, "rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            place = data.find(letters)
+            while place >= 0:
+                match = _NO_SHAPE_AND_LENGTH.match(data[place + len(letters) : place + len(letters) + 20])
+                if match:
+                    length, found = int.from_bytes(match[1], "little"), True
+                    if length > size:
+                        raise StorageError(f"{what} says it has {length:,} bytes, the file {size:,}.")
+                place = data.find(letters, place + 1)
+    if not found:
+        raise StorageError(f"{what} is a text that is stored in an unknown way.")
 
 
 def _check_length(dataset: Any, what: str) -> None:

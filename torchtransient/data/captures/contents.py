@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.array_file import damage_said, hdf5_package, path_of
-from torchtransient.data.hdf5_limits import check_size, dataset_of, read_dataset
+from torchtransient.data.hdf5_limits import check_size, dataset_of, read_attributes, read_dataset
 from torchtransient.errors import StorageError
 
 WHAT = "capture file"
@@ -63,9 +63,8 @@ class Hdf5Contents:
             name: self._shape(name) for name in file if name != "#refs#"
         }
         self.attributes: Mapping[str, str] = {
-            name: value if isinstance(value, str) else value.decode("utf-8", "replace")
-            for name, value in file.attrs.items() if isinstance(value, str | bytes)
-        }  # fmt: skip
+            name: str(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
+        }
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
         import h5py
@@ -79,7 +78,7 @@ class Hdf5Contents:
         value = self._read(name, part)
         if isinstance(value, str):
             raise StorageError(f"{WHAT}: expected numbers in '{name}', got a text.")
-        return value
+        return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
         value = self._read(name)

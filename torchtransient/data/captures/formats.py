@@ -17,6 +17,7 @@ from torchtransient.data.array_file import HDF5, check_folder, damage_said, hdf5
 from torchtransient.data.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.data.captures.contents import WHAT, Contents, opened
 from torchtransient.data.captures.gaps import Gaps
+from torchtransient.data.hdf5_limits import read_attributes
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
@@ -137,7 +138,7 @@ def _is_own(source: Path) -> bool:
         if file.read(8) != b"\x89HDF\r\n\x1a\n":
             return False
     with damage_said(source, WHAT), hdf5_package(WHAT).File(source, "r") as file:
-        return str(file.attrs.get("format", "")).startswith(OWN)
+        return str(read_attributes(file, WHAT, ["format"]).get("format", "")).startswith(OWN)
 
 
 def _found(contents: Contents) -> Layout:
