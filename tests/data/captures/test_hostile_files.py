@@ -118,6 +118,35 @@ def test_terabytes_that_nobody_stored(tmp_path, layout, settings):
         tt.nlos.read_capture(path)
 
 
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("layout", ["tal", "torchtransient"])
+def test_texts_that_say_they_are_gigabytes(tmp_path, layout, libver):
+    """HDF5 would fill that much memory before it looks for the text."""
+    path = made(grids()["confocal"]).write(tmp_path / "a.h5", layout)
+    with h5py.File(path) as file:
+        text = file["scene_info"].asstr()[()] if layout == "tal" else file.attrs["metadata"]
+    text += " " * (0x1A2B - len(text.encode()))  # a length that stands nowhere else in the file
+    again = tmp_path / "b.h5"
+    with h5py.File(path) as old, h5py.File(again, "w", libver=libver) as new:
+        for name in old:
+            old.copy(name, new)
+        for name, value in old.attrs.items():
+            new.attrs[name] = value
+        if layout == "tal":
+            del new["scene_info"]
+            new["scene_info"] = text
+        else:
+            new.attrs["metadata"] = text
+    assert read(again)
+    data, length = again.read_bytes(), (0x1A2B).to_bytes(4, "little")
+    before, place, changed = _memory(), data.find(length), 0
+    while place >= 0:
+        again.write_bytes(data[:place] + (0xF0000000).to_bytes(4, "little") + data[place + 4 :])
+        changed += not read(again)
+        place = data.find(length, place + 1)
+    assert changed and _memory() - before < 50e6
+
+
 @pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link"])
 @pytest.mark.parametrize("layout", ["tal", "torchtransient"])
 def test_other_files_are_not_read(tmp_path, layout, kind):
