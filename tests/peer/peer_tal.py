@@ -50,8 +50,7 @@ def read(source):
     """The fields of a file. `read_capture` of 0.20 raises for other layouts: it takes their `scene_info` for a text."""
     stored = read_hdf5(source)
     if detect_dict_format(stored) == FileFormat.HDF5_TAL:
-        capture = read_capture(source)
-        return capture.as_dict() | {"is_polarized": capture.is_polarized()}
+        return read_capture(source).as_dict()
     return convert_dict(stored, format_to=FileFormat.HDF5_TAL)
 
 

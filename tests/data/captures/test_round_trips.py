@@ -245,15 +245,16 @@ def test_rectified_data_say_little(tmp_path):
     capture = Capture.read(lct, bin_width_s=4e-12)
     assert capture.axis.bin_width_s == pytest.approx(4e-12, rel=1e-15)
     np.testing.assert_allclose(capture.scan.sensor_points[0, :, 0], [-0.375, -0.125, 0.125, 0.375])
-    np.testing.assert_array_equal(capture.transient[0], data.swapaxes(1, 2))
+    np.testing.assert_array_equal(capture.transient[0], data)  # MATLAB's (x, y, t)
     with pytest.raises(StorageError, match="says wall_size itself"):
         Capture.read(lct, bin_width_s=4e-12, wall_size=1.0)
-    assert torch.equal(Capture.read(fk, bin_width_s=32e-12, wall_size=2.0).transient, capture.transient)
+    capture = Capture.read(fk, bin_width_s=32e-12, wall_size=2.0)
+    np.testing.assert_array_equal(capture.transient[0], data.swapaxes(1, 2))  # MATLAB's (y, x, t)
     cube = tmp_path / "cube.mat"
     write_mat(cube, {"meas": data[:4]})
     with pytest.raises(StorageError, match="no known layout"):
         Capture.read(cube)
-    for layout, axes in (("rect_data", (0, 2, 1)), ("cdt", (2, 1, 0))):
+    for layout, axes in (("rect_data", (0, 2, 1)), ("cdt", (2, 1, 0))):  # both are `meas`
         said = {"bin_width_s": 16e-12, "wall_size": 2.0}
         found = Capture.read(cube, layout, **said)
         assert found.metadata["format"] == layout

@@ -1,9 +1,10 @@
 """Rectified grids in MATLAB files: ``rect_data`` of the light-cone transform (O'Toole et al. 2018) and of phasor-field
 diffraction (Liu et al. 2020), ``meas`` of f-k migration (Lindell et al. 2019).
 
-MATLAB's axes are (y, x, t), which come from HDF5 as (t, x, y). Lengths count from wall to wall, the direct light is in
-the first bin. ``width`` is half the side of a confocal scan in metres. Files with ``SPAD_index`` have one fixed point,
-(x, y) counted from 0 as y-tal does, ``ts`` seconds for a bin and ``sampling_spacing`` metres between points.
+As MATLAB has them, axes are (x, y, t) in the data of the light-cone transform, as their reconstruction shows them, and
+(y, x, t) in the others; from HDF5 they come the other way round. Lengths count from wall to wall, the direct light is
+in the first bin. ``width`` is half the side of a confocal scan in metres. Files with ``SPAD_index`` have one fixed
+point, (x, y) counted from 0 as y-tal does, ``ts`` seconds for a bin and ``sampling_spacing`` metres between points.
 """
 
 from __future__ import annotations
@@ -50,10 +51,13 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     name = "rect_data" if "rect_data" in contents.shapes else "meas"
     data = contents.array(name)
     if data is None or data.ndim != 3 or data.dtype.kind not in "iuf":
-        raise gaps.error(f"expected {name} (t, x, y) of real numbers, got {None if data is None else data.shape}.")
-    size = data.shape[2], data.shape[1]
+        raise gaps.error(f"expected {name} of real numbers on three axes, got {None if data is None else data.shape}.")
+    spad = contents.array("SPAD_index")
+    tensor = tensor_of(data)
+    tensor = tensor if name == "rect_data" and spad is None else tensor.transpose(1, 2)
+    size = tensor.shape[1], tensor.shape[2]
     width, ts = _number(contents, "width", gaps), _number(contents, "ts", gaps)
-    spacing, spad = _number(contents, "sampling_spacing", gaps), contents.array("SPAD_index")
+    spacing = _number(contents, "sampling_spacing", gaps)
     side = (size[1] * spacing, size[0] * spacing) if spacing is not None else None
     side = side if width is None else (2 * width, 2 * width)
     points = grid_points(size, gaps.extent(side))
@@ -62,7 +66,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     axis = time_axis(gaps, None, None if ts is None else seconds_to_opl(ts), len(data))
     left = sorted(set(contents.shapes) - {name, "width", "ts", "sampling_spacing", "SPAD_index"})
     metadata = gaps.metadata(not_read=left or None)
-    return Capture(tensor_of(data).transpose(1, 2)[None], axis, scan, metadata=metadata)
+    return Capture(tensor[None], axis, scan, metadata=metadata)
 
 
 def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
@@ -98,7 +102,8 @@ def write(target: Path, capture: Capture) -> None:
     if capture.axis.start_opl != 0:
         raise cannot(NAME, "lengths from 0", f"an axis that starts at {capture.axis.start_opl:g} m")
     dx, dy = _pitches(points)
-    data = array_of(transient, WHAT).swapaxes(1, 2)
+    data = array_of(transient, WHAT)
+    data = data if scan.kind == "confocal" else data.swapaxes(1, 2)
     variables: dict[str, Any] = {"rect_data": data, "ts": opl_to_seconds(capture.axis.bin_width_opl)}
     height, width = dy * points.shape[0], dx * points.shape[1]
     if scan.kind == "confocal":

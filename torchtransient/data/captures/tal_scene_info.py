@@ -76,8 +76,8 @@ def written(capture: Capture, kept: Mapping[str, Any], what: str) -> str | None:
             "frequencies_per_metre": capture.frequencies.frequencies, "phasor_start_opl": capture.frequencies.start_opl,
         }  # fmt: skip
     if capture.polarized:
-        # Two places in which y-tal has looked for it.
-        info |= {"is_polarized": True, "config": {"mitsuba_variant": "llvm_ad_mono_polarized"}}
+        # Not the variant, which 0.21 looks at: its `read_capture` raises for polarized ones.
+        info["is_polarized"] = True
     info |= given if isinstance(given, Mapping) else {}
     return write_plain_yaml(_as_json(info) | {_OWN: json.dumps(own)}, what)
 
