@@ -3,8 +3,9 @@ diffraction (Liu et al. 2020), ``meas`` of f-k migration (Lindell et al. 2019).
 
 As MATLAB has them, axes are (x, y, t) in the data of the light-cone transform, as their reconstruction shows them, and
 (y, x, t) in the others; from HDF5 they come the other way round. Lengths count from wall to wall, the direct light is
-in the first bin. ``width`` is half the side of a confocal scan in metres. Files with ``SPAD_index`` have one fixed
-point, (x, y) counted from 0 as y-tal does, ``ts`` seconds for a bin and ``sampling_spacing`` metres between points.
+in the first bin, but in ``meas``, where the ``tofgrid`` of another file says when each point is lit. ``width`` is half
+the side of a confocal scan in metres. Files with ``SPAD_index`` have one fixed point, (x, y) counted from 0 as y-tal
+does, ``ts`` seconds for a bin and ``sampling_spacing`` metres between points.
 """
 
 from __future__ import annotations
