@@ -320,3 +320,23 @@ def test_a_steady_image_of_points_that_are_gone(tmp_path):
     back = Capture.read(path)
     assert back.steady is None and back.metadata == {"a": 1, "not_read": ["steady"]}
     assert torch.equal(back.transient, capture.transient[..., ::2])
+
+
+def test_metadata_of_anyone(tmp_path):
+    """What is added to a capture that was read is written; what makes no sense for writing does no harm."""
+    path = made(grids()["confocal"]).write(tmp_path / "a.h5", "tal")
+    with h5py.File(path, "r+") as file:
+        del file["scene_info"]
+        file["scene_info"] = "config: {a: 1}  # theirs"
+    capture = Capture.read(path)
+    again = Capture.read(capture.write(tmp_path / "b.h5", "tal"))
+    assert again.metadata == capture.metadata and again.metadata["tal"]["scene_info_text"].endswith("theirs")
+    noted = replace(capture, metadata={**capture.metadata, "note": "mine"})
+    back = Capture.read(noted.write(tmp_path / "c.h5", "tal"))
+    assert back == noted and back.metadata == noted.metadata
+    with h5py.File(tmp_path / "c.h5") as file:
+        assert "config" in file["scene_info"].asstr()[()]
+    nonsense = {"dtypes": {"H": "O", "sensor_xyz": 3, "laser_xyz": "<b8"}, "volume_format": "x", "scene_info_text": 3}
+    for tal in (nonsense, 3, [], {"dtypes": []}):
+        other = replace(capture, metadata={"format": "tal", "tal": tal})
+        assert torch.equal(Capture.read(other.write(tmp_path / "d.h5", "tal")).transient, capture.transient)

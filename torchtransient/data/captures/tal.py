@@ -260,18 +260,17 @@ def write(target: Path, capture: Capture) -> None:
     """
     form_name, h = _h(capture)
     form = _FORMATS[form_name]
-    kept = capture.metadata.get("tal")
-    kept = kept if isinstance(kept, Mapping) else {}
+    kept = tal_scene_info.kept_of(capture)
     arrays = _arrays(capture, kept, form)
     text = tal_scene_info.written(capture, kept, WHAT)
     formats = {"H_format": (_NUMBERS, form.number)}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
-    if kept.get("volume_format") is not None:
-        formats["volume_format"] = (_VOLUMES, int(kept["volume_format"]))
+    if "volume_format" in kept:
+        formats["volume_format"] = (_VOLUMES, kept["volume_format"])
     h5py = hdf5_package(WHAT)
     with replacing(target, WHAT) as unfinished, h5py.File(unfinished, "w") as file:
-        dtype = np.dtype(kept.get("dtypes", {}).get("H", h.dtype))
+        dtype = np.dtype(kept["dtypes"].get("H", h.dtype))
         write_parts(file.create_dataset("H", h.shape, dtype if _holds(h, dtype) else h.dtype), h)
         for name, (numbers, number) in formats.items():
             file.create_dataset(name, data=np.array([number]), dtype=h5py.enum_dtype(numbers, basetype="i"))
@@ -299,7 +298,7 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
 
 
 def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[str, NDArray[Any]]:
-    scan, dtypes = capture.scan, kept.get("dtypes", {})
+    scan, dtypes = capture.scan, kept["dtypes"]
     legs = scan.first_and_last_leg
     arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS) and not legs else {_LEGS: np.bool_(legs)}
     axis = capture.axis

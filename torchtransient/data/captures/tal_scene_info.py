@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,10 @@ from torchtransient.plugins.films.phasor_grid import transform_bins
 
 # Our part of the information: a JSON text, in which numbers keep every digit.
 _OWN = "torchtransient"
+# What metadata hold after reading; other entries were added since.
+_READ = {"format", "assumed", "scene_info", "tal", "not_read"}
+# Kinds of numbers as NumPy writes them.
+_DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
 def parsed(text: str, what: str) -> Any:
@@ -57,10 +62,25 @@ def frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl:
     return FrequencyAxis(tuple(found.tolist()), start_opl or 0.0) if len(found) == count else None
 
 
+def kept_of(capture: Capture) -> dict[str, Any]:
+    """What the metadata of a capture that was read keeps for writing it again: ``dtypes`` by name, and where they are
+    there ``scene_info_text``, ``volume_format``, ``delta_t``, ``t_start``. Whatever else stands there is left out:
+    metadata are anyone's.
+    """
+    given = capture.metadata.get("tal")
+    given = given if isinstance(given, Mapping) else {}
+    dtypes = given.get("dtypes")
+    names = dtypes.items() if isinstance(dtypes, Mapping) else ()
+    kept: dict[str, Any] = {"dtypes": {name: kind for name, kind in names if _DTYPE.fullmatch(str(kind))}}
+    kinds = {"scene_info_text": str | None, "volume_format": int, "delta_t": float, "t_start": float}
+    return kept | {name: given[name] for name, kind in kinds.items() if name in given and isinstance(given[name], kind)}
+
+
 def written(capture: Capture, kept: Mapping[str, Any], what: str) -> str | None:
     """The text for a capture: as it was read where nothing about it has changed, None where there was none."""
     text = kept.get("scene_info_text")
-    added = capture.channels or capture.scan.wall is not None or capture.steady is not None
+    added = bool(capture.channels or set(capture.metadata) - _READ)
+    added = added or capture.scan.wall is not None or capture.steady is not None
     if "scene_info_text" in kept and not added and capture.frequencies == _kept_frequencies(capture, kept, what):
         before = None if text is None else parsed(text, what)
         if capture.metadata.get("scene_info") == before:
