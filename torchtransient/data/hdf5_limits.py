@@ -34,13 +34,14 @@ _NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{4})"
 
 
 def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
-    """A dataset of an open file or group, or ``part`` of it; None for one that is empty. Texts are `str`.
+    """A dataset of an open file or group, or ``part`` of it; None for one that is missing or empty. Texts are `str`.
 
     Raises StorageError for links to other files, for objects and records, and for more numbers than the file, or the
     memory that is left, can hold.
     """
     dataset = dataset_of(parent, name, what)
-    if dataset.shape is None:
+    # MATLAB writes the size of an empty array in its place.
+    if dataset is None or dataset.shape is None or "MATLAB_empty" in dataset.attrs:
         return None
     if is_text(dataset):
         return _text(dataset, what)
@@ -59,14 +60,17 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
 
 
 def dataset_of(parent: Any, name: str, what: str) -> Any:
-    """The dataset at a path of the file itself. Raises StorageError for groups, and for links to elsewhere."""
+    """The dataset at a path of the file itself, None where there is nothing. Raises StorageError for groups, and for
+    links to elsewhere, which are not looked at.
+    """
     import h5py
 
     found = parent
     for step in name.split("/"):
-        if not isinstance(found, h5py.Group) or step not in found:
-            raise StorageError(f"{what}: '{name}' is missing.")
-        if not isinstance(found.get(step, getlink=True), h5py.HardLink):
+        link = found.get(step, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
             raise StorageError(f"{what}: '{name}' is a link to elsewhere, which is not followed.")
         found = found[step]
     if not isinstance(found, h5py.Dataset):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.array_file import damage_said, hdf5_package, path_of
-from torchtransient.data.hdf5_limits import check_size, dataset_of, read_attributes, read_dataset
+from torchtransient.data.hdf5_limits import check_size, read_attributes, read_dataset
 from torchtransient.errors import StorageError
 
 WHAT = "capture file"
@@ -90,15 +90,12 @@ class Hdf5Contents:
         """The names in a structure; empty for what is none."""
         import h5py
 
-        found = self._file[name] if self._file.get(name, getclass=True) is h5py.Group else ()
-        return frozenset(found)
+        if not isinstance(self._file.get(name, getlink=True), h5py.HardLink):
+            return frozenset()
+        found = self._file[name]
+        return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
 
     def _read(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
-        if name not in self._file:
-            return None
-        # MATLAB writes the size of an empty array in its place.
-        if "MATLAB_empty" in dataset_of(self._file, name, WHAT).attrs:
-            return None
         return read_dataset(self._file, name, WHAT, part)
 
 
