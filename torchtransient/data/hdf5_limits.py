@@ -10,7 +10,6 @@ import math
 import mmap
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +28,9 @@ _LARGE_BYTES = 2**26
 _SLACK = 2
 # What HDF5 writes of a text before the type of its letters: of the encoding, of the text, and the letters' version.
 _KIND_HEAD = 2 + 8 + 1
+_HEAP_HEADER = 16
 # An attribute's parts may be filled up to eight bytes; then a shape of version 1 or 2, and the length.
-_NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{4})", re.DOTALL)
+_NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{16})", re.DOTALL)
 
 
 def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
@@ -139,32 +139,49 @@ def _check_attribute(attribute: Any, path: str, what: str) -> None:
     """Find the lengths of texts in the raw file by what stands before them: the kind of text, and no shape."""
     # The letters' type behind its version, as HDF5 writes it in all of them: one byte, 8 bits.
     letters = attribute.get_type().encode()[_KIND_HEAD:]
-    size, found = Path(path).stat().st_size, False
+    found = False
     if attribute.shape == () and letters:
         with open(path, "rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
             place = data.find(letters)
             while place >= 0:
-                match = _NO_SHAPE_AND_LENGTH.match(data[place + len(letters) : place + len(letters) + 20])
+                match = _NO_SHAPE_AND_LENGTH.match(data[place + len(letters) : place + len(letters) + 40])
                 if match:
-                    length, found = int.from_bytes(match[1], "little"), True
-                    if length > size:
-                        raise StorageError(f"{what} says it has {length:,} bytes, the file {size:,}.")
+                    found = True
+                    _check_heap(data, match[1], what)
                 place = data.find(letters, place + 1)
     if not found:
         raise StorageError(f"{what} is a text that is stored in an unknown way.")
 
 
 def _check_length(dataset: Any, what: str) -> None:
-    """HDF5 fills as much memory as a text says it is long, up to 4 GB, before it looks for it."""
+    """As :func:`_check_attribute`, of a dataset, which says where it lies."""
     offset = dataset.id.get_offset()
-    if offset is None:
+    if offset is None or dataset.file.userblock_size:
         raise StorageError(
             f"{what}: expected the text '{dataset.name}' in one piece, got one that is stored otherwise."
         )
-    with open(dataset.file.filename, "rb") as file:
-        size = file.seek(0, 2)
-        file.seek(offset)
-        # The length comes before the place of the text in the heap.
-        length = int.from_bytes(file.read(4), "little")
-    if length > size:
-        raise StorageError(f"{what}: the text '{dataset.name}' says it has {length:,} bytes, the file {size:,}.")
+    with open(dataset.file.filename, "rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        _check_heap(data, data[offset : offset + 16], f"{what}: the text '{dataset.name}'")
+
+
+def _check_heap(data: mmap.mmap, reference: bytes, what: str) -> None:
+    """Walk through the heap that a text refers to by its length, the heap's place and its number there.
+
+    HDF5 fills as much memory as a text says it is long, up to 4 GB, before it looks for it, and does not come to an end
+    in some damaged heaps.
+    """
+    length, place = int.from_bytes(reference[:4], "little"), int.from_bytes(reference[4:12], "little")
+    if length == 0:
+        return
+    end = place + int.from_bytes(data[place + 8 : place + 16], "little")
+    if length > len(data) or data[place : place + 5] != b"GCOL\x01" or end > len(data):
+        raise StorageError(f"{what} says it has {length:,} bytes, the file {len(data):,}, or its place is damaged.")
+    place += 16
+    while end - place >= _HEAP_HEADER:
+        number, size = int.from_bytes(data[place : place + 2], "little"), data[place + 8 : place + 16]
+        count = int.from_bytes(size, "little")
+        # What is free counts with its header, the others without, filled up to eight bytes.
+        step = count if number == 0 else _HEAP_HEADER + -(-count // 8) * 8
+        if step < _HEAP_HEADER or place + step > end:
+            raise StorageError(f"{what} lies in a heap that is damaged.")
+        place += step
