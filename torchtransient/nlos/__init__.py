@@ -8,7 +8,7 @@
 - `CaptureRenderer`: captures as a differentiable layer
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
-- `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
+- `read_capture`, `write_capture`, or `Capture.read` and `capture.write`: on disk, of any known layout
 - `FK`, `fk`: hidden volumes from confocal captures by f-k migration; this one and those below are linear operators,
   and functions of a capture
 - `MidpointFK`, `midpoint_fk`: the same from single and exhaustive captures, approximately
@@ -24,8 +24,8 @@ docs/nlos.md.
 from torchtransient.capture import Capture as Capture
 from torchtransient.capture import Scan as Scan
 from torchtransient.capture import Wall as Wall
-from torchtransient.data.capture_file import read_capture as read_capture
-from torchtransient.data.capture_file import write_capture as write_capture
+from torchtransient.data.captures.formats import read_capture as read_capture
+from torchtransient.data.captures.formats import write_capture as write_capture
 from torchtransient.nlos.renderer import CaptureRenderer as CaptureRenderer
 from torchtransient.nlos.scene import capture_scene as capture_scene
 from torchtransient.nlos.setup_files import read_setup as read_setup
