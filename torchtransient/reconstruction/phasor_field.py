@@ -23,7 +23,7 @@ from torchtransient.reconstruction.voxels import VoxelGrid
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25
 # Standard deviations of the pulse's spectrum that are kept to both sides.
-BAND = 3.0
+BAND = 4.0
 
 
 def phasor_image(
@@ -56,7 +56,7 @@ class PhasorField(ScanOperator):
     ``size`` and ``extent`` of the same pitch too. The convolution is linear: nothing wraps around, neither in space nor
     in time.
 
-    Frequencies within 3 standard deviations of the pulse's spectrum are kept, which changes the field by 0.3 % at most.
+    Frequencies within 4 standard deviations of the pulse's spectrum are kept, all but 2e-8 of its energy.
     Time grows with planes times frequencies (times laser spots) times sensor points; spectra are made a chunk of
     frequencies and spots at a time. Raises ShapeError for other scans and grids, SceneError for a transient camera
     without one laser spot, UnitError for what is out of range.
