@@ -13,4 +13,9 @@ from torchtransient.reconstruction.linear import LinearOperator as LinearOperato
 from torchtransient.reconstruction.phasor_field import PhasorField as PhasorField
 from torchtransient.reconstruction.phasor_field import phasor_image as phasor_image
 from torchtransient.reconstruction.planar_scan import PlanarScan as PlanarScan
+from torchtransient.reconstruction.surfaces import DepthMap as DepthMap
+from torchtransient.reconstruction.surfaces import depth_map as depth_map
+from torchtransient.reconstruction.surfaces import normals_from_depth as normals_from_depth
+from torchtransient.reconstruction.surfaces import normals_from_volume as normals_from_volume
+from torchtransient.reconstruction.surfaces import soft_depth as soft_depth
 from torchtransient.reconstruction.voxels import VoxelGrid as VoxelGrid
