@@ -61,7 +61,7 @@ def operators(dtype=torch.float64):
         found |= {
             f"backprojection, {name}": Backprojection(scan, grid, falloff=1.0, **of),
             f"filtered backprojection, {name}": FilteredBackprojection(scan, grid, filter=PULSE, **of),
-            f"phasor field, {name}": PhasorField(scan, grid, pulse=PULSE, **of),
+            f"phasor field, {name}": PhasorField(scan, grid, pulse=PULSE, falloff=1.0, **of),
         }
     single, confocal = SCANS["single"], SCANS["confocal"]
     grid = VoxelGrid.before(confocal, DEPTHS)
@@ -75,7 +75,7 @@ def operators(dtype=torch.float64):
         "filtered backprojection, lists": FilteredBackprojection(
             listed_scan(), points_anywhere(), filter=PULSE, falloff=1.0, **of
         ),
-        "phasor field, larger planes": PhasorField(single, larger, pulse=PULSE, falloff=0.0, **of),
+        "phasor field, larger planes": PhasorField(single, larger, pulse=PULSE, falloff=0.5, **of),
         "confocal camera": PhasorField(confocal, grid, pulse=PULSE, camera=ConfocalCamera(moments - 0.1), **of),
         "confocal camera, single": PhasorField(single, grid, pulse=PULSE, camera=ConfocalCamera(moments - 0.1), **of),
         "transient camera": PhasorField(single, grid, pulse=PULSE, camera=TransientCamera(moments), **of),

@@ -25,7 +25,7 @@ CPU_BLOCK, GPU_BLOCK = 1 << 17, 1 << 24
 # Voxels of a tile on a CPU, so that a block holds a few rows.
 CPU_TILE = 1 << 14
 # Numbers in the rows of a group, which are brought into order together.
-GROUP_NUMBERS = 1 << 21
+GROUP_NUMBERS = 1 << 19
 # Laser spots of a group, whose distances to a tile are kept while sensor points take turns.
 MOST_SPOTS = 64
 # Zeros around each row: one before, two behind, so that interpolation beyond an end reads them.

@@ -27,7 +27,7 @@ BAND = 4.0
 
 
 def phasor_image(
-    capture: Capture, grid: VoxelGrid, *, pulse: PhasorFilter, camera: Camera | None = None, falloff: float = 1.0
+    capture: Capture, grid: VoxelGrid, *, pulse: PhasorFilter, camera: Camera | None = None, falloff: float = 0.0
 ) -> Tensor:
     """:meth:`PhasorField.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the device of its
     transient. Raises as the class.
@@ -46,7 +46,7 @@ class PhasorField(ScanOperator):
     ``adjoint`` takes a transient (..., T, *scan.shape) to the complex field (..., Z, Y, X) at the moment of focus: the
     transient convolved with the ``pulse`` of a virtual illumination, at the length laser spot - voxel - sensor point,
     times (r_laser r_sensor)^-falloff, summed over all pairs. With ``falloff=1`` that is the Rayleigh-Sommerfeld
-    integral; with 0 it is :class:`FilteredBackprojection` with the same filter. ``forward`` is its adjoint, a real
+    integral; with 0 its phases alone, which is :class:`FilteredBackprojection` with the same filter. ``forward`` is its adjoint, a real
     transient. ``camera``: :class:`DirectLight` (None), or :class:`ConfocalCamera`, :class:`TransientCamera`, whose
     fields are videos (..., N, Z, Y, X).
 
@@ -70,7 +70,7 @@ class PhasorField(ScanOperator):
         time_axis: TimeAxis,
         pulse: PhasorFilter,
         camera: Camera | None = None,
-        falloff: float = 1.0,
+        falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not isinstance(grid, VoxelGrid):
