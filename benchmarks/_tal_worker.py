@@ -1,7 +1,7 @@
 """Reconstructs with y-tal on demand, in an environment of its own; driven by one JSON object per line.
 
-  {"do": "capture", "file"}   .npz with H (T, X, Y) or (T, Lx, Ly, X, Y), sensors (X, Y, 3), lasers (X, Y, 3), bin_width
-  {"do": "solve", "method", "planes", "out", ...options}   -> {"seconds"}, CPU seconds; the volume (X, Y, Z) as .npy
+{"do": "capture", "file"}   .npz with H (T, X, Y) or (T, Lx, Ly, X, Y), sensors (X, Y, 3), lasers (X, Y, 3), bin_width
+{"do": "solve", "method", "planes", "out", ...options}   -> {"seconds"}, CPU seconds; the volume (X, Y, Z) as .npy
 """
 
 import json

@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _runner import HERE, ChildProcess, arguments, environment, ratio, report, summary
-
 import torch
+from _runner import HERE, ChildProcess, arguments, environment, ratio, report, summary
 
 import torchtransient as tt
 from torchtransient.reconstruction import (
@@ -48,7 +47,7 @@ class Tal(ChildProcess):
     """A `_tal_worker.py` process with one thread."""
 
     def __init__(self, python: str, downscale: int) -> None:
-        alone = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+        alone = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         place = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | alone
         super().__init__([python, str(HERE / "_tal_worker.py"), str(downscale)], env=place)
         self.folder = tempfile.TemporaryDirectory()
@@ -137,9 +136,7 @@ def cameras(peer: Tal, planes: list[float]) -> dict[str, float]:
     moments, wavelength = [20, 24, 28, 32], 0.3
     camera = TransientCamera([4 * WIDTH * k for k in moments])
     grid = VoxelGrid.before(capture.scan, planes)
-    operator = PhasorField(
-        capture.scan, grid, time_axis=capture.axis, pulse=PhasorFilter(wavelength), camera=camera
-    )
+    operator = PhasorField(capture.scan, grid, time_axis=capture.axis, pulse=PhasorFilter(wavelength), camera=camera)
     peer.load(capture)
     options = {"wl_mean": wavelength, "wl_sigma": PhasorFilter(wavelength).sigma}
     video, _ = peer.solve("fbp", planes, camera="TRANSIENT", **options)

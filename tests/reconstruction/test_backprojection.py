@@ -1,11 +1,12 @@
 """Backprojection against sums that are written out, and where light of known points comes out."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
 
+from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError, UnitError
@@ -181,7 +182,7 @@ def test_captures_go_in_as_they_are():
     for other, words in (
         (Capture(light, TimeAxis(0.2, 0.02, 24), scan), "expected a capture with"),
         (Capture(light, AXIS, Scan.grid(WALL, (3, 2), kind="exhaustive", laser_grid=2, cell_centers=False)), "own"),
-        (Capture(light, AXIS, Scan.grid(WALL, (3, 2), kind="exhaustive", laser_grid=2, first_and_last_leg=True)), "own"),
+        (Capture(light, AXIS, replace(scan, first_and_last_leg=True)), "own"),
         (Capture(light.reshape(3, 1, 2, *light.shape[2:]).expand(3, 4, 2, *light.shape[2:]), AXIS, scan,
                  polarized=True), "Stokes"),
     ):  # fmt: skip

@@ -5,8 +5,8 @@ import pickle
 
 import pytest
 import torch
-from support.scan_operators import operators
 
+from support.scan_operators import operators
 from torchtransient.errors import DeviceError, ShapeError
 
 OPERATORS = operators()
@@ -71,9 +71,7 @@ def test_batches_and_channels_are_items_on_their_own(name):
         assert together.shape[:2] == (2, 3)
         torch.testing.assert_close(function(x[1, 2]), together[1, 2], rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(torch.vmap(function)(x), together, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(
-            torch.vmap(function, in_dims=1, out_dims=1)(x), together, rtol=1e-12, atol=1e-12
-        )
+        torch.testing.assert_close(torch.vmap(function, in_dims=1, out_dims=1)(x), together, rtol=1e-12, atol=1e-12)
 
 
 def test_linear(name):

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
 
+from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import SceneError, ShapeError, UnitError
@@ -79,9 +79,7 @@ def test_planes_of_other_sizes_elsewhere():
 def test_transient_camera_is_the_sum_that_is_written_out():
     scan, moments = SCANS["single"], torch.tensor([0.1, 0.2, 0.35], dtype=F64)
     grid = VoxelGrid.before(scan, DEPTHS)
-    operator = PhasorField(
-        scan, grid, time_axis=AXIS, pulse=PULSE, camera=TransientCamera(moments), dtype=F64
-    )
+    operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, camera=TransientCamera(moments), dtype=F64)
     light = noise(*operator.data_shape)
     expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, 0.0, moments).reshape(3, *grid.shape)
     torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))

@@ -71,7 +71,9 @@ def test_derivatives_of_depth():
     grid = grid_of(UNEVEN, 3)
     surface = slanted(grid, 0.05, -0.02, 0.05)[0].requires_grad_()
     assert torch.autograd.gradcheck(lambda v: normals_from_volume(v, grid), surface)
-    assert torch.autograd.gradcheck(lambda d: normals_from_depth(d, grid), slanted(grid, 0.3, 0.2, 1.0)[1].requires_grad_())
+    assert torch.autograd.gradcheck(
+        lambda d: normals_from_depth(d, grid), slanted(grid, 0.3, 0.2, 1.0)[1].requires_grad_()
+    )
 
 
 def test_gradients_of_empty_volumes_are_finite():

@@ -79,9 +79,9 @@ def test_what_is_no_grid():
     with pytest.raises(SceneError, match="size"):
         VoxelGrid.before(SCAN, [0.1], size=0)
     listed = Scan.points([[0, 0, 0], [1, 0, 0]], kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
-    with pytest.raises(ShapeError, match="size= for a list|say where x and y are"):
+    with pytest.raises(ShapeError, match=r"say where x and y are"):
         VoxelGrid.before(listed, [0.1], size=3, extent=1.0)
-    with pytest.raises(ShapeError, match="regular, rectangular grid|as a grid"):
+    with pytest.raises(ShapeError, match="as a grid"):
         VoxelGrid.before(listed, [0.1])
     with pytest.raises(ShapeError, match="bounds"):
         VoxelGrid.bounds([[0, 0], [1, 1]], 3)

@@ -1,4 +1,4 @@
-"""Small reconstruction operators of every kind, in double precision. What stands here runs the tests of the contract."""
+"""Small reconstruction operators of every kind: what stands here runs the tests of the contract."""
 
 import torch
 

@@ -9,6 +9,10 @@
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
 - `read_capture`, `write_capture`: captures on disk, HDF5 or .npz
+- `VoxelGrid`: where hidden points stand; `Backprojection`, `FilteredBackprojection`, `PhasorField`: linear operators
+  between their values and captures, with `backproject`, `filtered_backproject` and `phasor_image` for one capture;
+  `PhasorFilter`, `LaplacianFilter`; `DirectLight`, `ConfocalCamera`, `TransientCamera`
+- `depth_map`, `soft_depth`, `normals_from_depth`, `normals_from_volume`: surfaces in what was reconstructed
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -24,3 +28,20 @@ from torchtransient.nlos.scene import capture_scene as capture_scene
 from torchtransient.nlos.setup_files import read_setup as read_setup
 from torchtransient.nlos.simulation import forecast as forecast
 from torchtransient.nlos.simulation import simulate as simulate
+from torchtransient.reconstruction import Backprojection as Backprojection
+from torchtransient.reconstruction import ConfocalCamera as ConfocalCamera
+from torchtransient.reconstruction import DepthMap as DepthMap
+from torchtransient.reconstruction import DirectLight as DirectLight
+from torchtransient.reconstruction import FilteredBackprojection as FilteredBackprojection
+from torchtransient.reconstruction import LaplacianFilter as LaplacianFilter
+from torchtransient.reconstruction import PhasorField as PhasorField
+from torchtransient.reconstruction import PhasorFilter as PhasorFilter
+from torchtransient.reconstruction import TransientCamera as TransientCamera
+from torchtransient.reconstruction import VoxelGrid as VoxelGrid
+from torchtransient.reconstruction import backproject as backproject
+from torchtransient.reconstruction import depth_map as depth_map
+from torchtransient.reconstruction import filtered_backproject as filtered_backproject
+from torchtransient.reconstruction import normals_from_depth as normals_from_depth
+from torchtransient.reconstruction import normals_from_volume as normals_from_volume
+from torchtransient.reconstruction import phasor_image as phasor_image
+from torchtransient.reconstruction import soft_depth as soft_depth

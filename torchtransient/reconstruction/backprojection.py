@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -31,12 +29,12 @@ class Backprojection(EllipsoidOperator):
     between the two bins whose centres are next to it, so that their sum is the value: the transient of isotropic points
     that hide nothing. ``adjoint`` reads the transients there by linear interpolation and adds up. What falls outside of
     the record counts as zero. Scans of any kind are taken: confocal, single and exhaustive, grids and lists of points,
-    flat and curved walls, with or without first and last legs, in any precision of torch's.
+    flat and curved walls, with or without first and last legs, in single and double precision.
 
-    ``points``: a :class:`VoxelGrid` or any points (..., 3). ``falloff``: p of a factor (r_laser r_sensor)^-p in both:
-    0 leaves distances alone, 2 is the falloff of diffuse surfaces (a point of albedo one and solid angle one), 1 that of
-    retroreflectors in confocal scans; -2 makes ``adjoint`` compensate for it. Distances below half a bin count as half
-    a bin there. Cosines of wall and surface are not part of it.
+    ``points``: a :class:`VoxelGrid` or any points (..., 3). ``falloff``: p of a factor (r_laser r_sensor)^-p in both: 0
+    leaves distances alone, 2 is the falloff of small diffuse patches, 1 that of retroreflectors in confocal scans; -2
+    makes ``adjoint`` compensate for it. Distances below half a bin count as half a bin there. Cosines of wall and
+    surface are not part of it.
 
     Time grows with pairs times voxels (some 4 ns each on a core); memory beyond operands with neither. Raises
     ShapeError and UnitError.
@@ -71,6 +69,7 @@ class Backprojection(EllipsoidOperator):
         if y.is_complex():
             return torch.complex(self.adjoint_(y.real), self.adjoint_(y.imag))
         split = self.split(y)
-        found: Any = self.gather(lambda group: self.rows_of(split, group), len(split))
+        found = self.gather(lambda group: self.rows_of(split, group), len(split))
         lead = y.shape[: y.ndim - len(self.data_shape)]
-        return found.reshape(*lead, *self.volume_shape)
+        volume: Tensor = found.reshape(*lead, *self.volume_shape)
+        return volume

@@ -23,9 +23,7 @@ def filtered_backproject(
     """
     axis, dtype = checked_capture(capture, "filtered_backproject")
     assert capture.transient is not None  # a capture without one has been refused
-    operator = FilteredBackprojection(
-        capture.scan, points, time_axis=axis, filter=filter, falloff=falloff, dtype=dtype
-    )
+    operator = FilteredBackprojection(capture.scan, points, time_axis=axis, filter=filter, falloff=falloff, dtype=dtype)
     return operator.to(capture.transient.device).reconstruct(capture)
 
 
@@ -101,5 +99,3 @@ def _real_items(x: Tensor) -> Tensor:
 def _complex_items(x: Tensor) -> Tensor:
     real, imaginary = x.chunk(2)
     return torch.complex(real, imaginary)
-
-

@@ -72,7 +72,8 @@ class PhasorFilter:
         bins = rows.shape[-1]
         padded = _padded_length(bins)
         spectrum = torch.fft.fft(rows, n=padded).mul_(self._response(rows, padded, bin_width_opl))
-        return torch.fft.ifft(spectrum)[..., :bins]
+        filtered: Tensor = torch.fft.ifft(spectrum)[..., :bins]
+        return filtered
 
     def rows_adjoint(self, rows: Tensor, bin_width_opl: float) -> Tensor:
         # The response is real: the filter is its own adjoint, up to the imaginary part that real rows do not have.

@@ -34,9 +34,7 @@ def phasor_image(
     """
     axis, dtype = checked_capture(capture, "phasor_image")
     assert capture.transient is not None  # a capture without one has been refused
-    operator = PhasorField(
-        capture.scan, grid, time_axis=axis, pulse=pulse, camera=camera, falloff=falloff, dtype=dtype
-    )
+    operator = PhasorField(capture.scan, grid, time_axis=axis, pulse=pulse, camera=camera, falloff=falloff, dtype=dtype)
     return operator.to(capture.transient.device).reconstruct(capture)
 
 
@@ -46,9 +44,9 @@ class PhasorField(ScanOperator):
     ``adjoint`` takes a transient (..., T, *scan.shape) to the complex field (..., Z, Y, X) at the moment of focus: the
     transient convolved with the ``pulse`` of a virtual illumination, at the length laser spot - voxel - sensor point,
     times (r_laser r_sensor)^-falloff, summed over all pairs. With ``falloff=1`` that is the Rayleigh-Sommerfeld
-    integral; with 0 its phases alone, which is :class:`FilteredBackprojection` with the same filter. ``forward`` is its adjoint, a real
-    transient. ``camera``: :class:`DirectLight` (None), or :class:`ConfocalCamera`, :class:`TransientCamera`, whose
-    fields are videos (..., N, Z, Y, X).
+    integral; with 0 its phases alone, which is :class:`FilteredBackprojection` with the same filter. ``forward``
+    is its adjoint, a real transient. ``camera``: :class:`DirectLight` (None), or :class:`ConfocalCamera`,
+    :class:`TransientCamera`, whose fields are videos (..., N, Z, Y, X).
 
     Scans: confocal, single, and exhaustive with any laser spots, all sensor points on a flat, regular grid, with or
     without first and last legs. ``grid``: planes parallel to the wall with the pitch of the sensor grid, as
@@ -83,11 +81,13 @@ class PhasorField(ScanOperator):
         check_sampling(pulse.wavelength, time_axis.bin_width_opl, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
         if not isinstance(self.camera, Camera):
-            raise ShapeError(f"PhasorField: expected a DirectLight, ConfocalCamera or TransientCamera, got {shown(camera)}.")
+            raise ShapeError(
+                f"PhasorField: expected a DirectLight, ConfocalCamera or TransientCamera, got {shown(camera)}."
+            )
         if isinstance(self.camera, TransientCamera) and scan.kind != "single":
             raise SceneError(
-                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got a {scan.kind} one. Choose "
-                "a spot of an exhaustive capture with capture.single(index)."
+                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got a {scan.kind} one. "
+                "Choose a spot of an exhaustive capture with capture.single(index)."
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
         self.planes, self.real_volume = grid, False
@@ -106,15 +106,13 @@ class PhasorField(ScanOperator):
 
     def _check_planes(self) -> None:
         grid, wall = self.planes, self.wall
-        parallel = all(
-            float(a @ b) > 1 - 1e-6 for a, b in ((grid.along_x, wall.along_x), (grid.along_y, wall.along_y))
-        )
+        parallel = all(float(a @ b) > 1 - 1e-6 for a, b in ((grid.along_x, wall.along_x), (grid.along_y, wall.along_y)))
         same = all(abs(a - b) * n <= OFF_GRID * b for a, b, n in zip(grid.pitch, wall.pitch, grid.size, strict=True))
         if not (parallel and same):
             raise ShapeError(
-                f"PhasorField: expected planes along the wall's rows and columns with its pitch of {wall.pitch[0]:.5g} x "
-                f"{wall.pitch[1]:.5g} m, got {grid!r}. Use VoxelGrid.before(scan, depths), or FilteredBackprojection, "
-                "which takes any points."
+                "PhasorField: expected planes along the wall's rows and columns with its pitch of "
+                f"{wall.pitch[0]:.5g} x {wall.pitch[1]:.5g} m, got {grid!r}. "
+                "Use VoxelGrid.before(scan, depths), or FilteredBackprojection, which takes any points."
             )
         # Along the axes of the wall, from its first point; the normal of the planes may be the opposite one.
         self.corner = wall.local(grid.first)
@@ -127,7 +125,9 @@ class PhasorField(ScanOperator):
         if not self.scan.first_and_last_leg:
             return torch.zeros(len(self.lasers), dtype=torch.float64), torch.zeros(math.prod(self.wall.size)).double()
         spots, points = (legs.detach().cpu().reshape(-1) for legs in (self.scan.laser_legs, self.scan.sensor_legs))
-        return (torch.zeros(1, dtype=torch.float64), points + spots) if self.scan.kind == "confocal" else (spots, points)
+        return (
+            (torch.zeros(1, dtype=torch.float64), points + spots) if self.scan.kind == "confocal" else (spots, points)
+        )
 
     def _band(self) -> tuple[Tensor, Tensor]:
         """Frequencies (F,) in cycles per metre and their weights. They are so dense that the field of one record does
@@ -156,7 +156,11 @@ class PhasorField(ScanOperator):
             ],
             dtype=torch.float64,
         )
-        edge = [[i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0] for i in (0, self.wall.size[1] - 1) for j in (0, self.wall.size[0] - 1)]
+        edge = [
+            [i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0]
+            for i in (0, self.wall.size[1] - 1)
+            for j in (0, self.wall.size[0] - 1)
+        ]
         sensors = torch.tensor(edge, dtype=torch.float64)
         # Distances are convex: the longest ends at corners. None is shorter than the way along the normal.
         far, near = float(torch.cdist(corners, sensors).max()), float(self.heights.abs().min())
@@ -185,7 +189,7 @@ class PhasorField(ScanOperator):
         }
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The intensity |field|^2 (..., *volume) of a transient (..., T, *scan.shape) or a capture. Raises ShapeError."""
+        """The intensity |field|^2 (..., *volume) of a transient (..., T, *scan.shape) or capture. Raises ShapeError."""
         return self.pulse.image(self.adjoint(self.transients(transient)))
 
     # ------------------------------------------------------------------------------------------------- the two maps
@@ -217,9 +221,7 @@ class PhasorField(ScanOperator):
         spots, (rows, columns) = self._spots, self.wall.size
         frames, (height, width) = len(self.moments), self.planes.size
         field = x.reshape(-1, frames, len(self.heights), height, width)
-        out = torch.zeros(
-            len(field), self.axis.num_bins, spots, rows * columns, dtype=self.dtype, device=x.device
-        )
+        out = torch.zeros(len(field), self.axis.num_bins, spots, rows * columns, dtype=self.dtype, device=x.device)
         for band, some in self._chunks(len(field), x.device):
             size = (len(field), band.stop - band.start, some.stop - some.start, *self.shape_fft)
             spectra = torch.zeros(size, dtype=x.dtype, device=x.device)

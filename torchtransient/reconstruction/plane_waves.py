@@ -9,8 +9,8 @@ from torch import Tensor
 
 
 def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype) -> Tensor:
-    """``exp(2 pi i f r) / r^falloff``: (F, ...) of ``distances`` r (...), metres, and evenly spaced ``frequencies`` (F,)
-    in cycles per metre, both float64; ``dtype``: a complex one.
+    """``exp(2 pi i f r) / r^falloff``, (F, ...), of ``distances`` r (...) in metres and evenly spaced ``frequencies``
+    (F,) in cycles per metre, both float64; ``dtype``: a complex one.
 
     Phases are those of double precision: single precision has none left for r of many wavelengths. A sine of each
     frequency would be most of the work of a plane, so waves follow from each other by products, which lose F ulp.

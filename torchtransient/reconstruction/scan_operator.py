@@ -57,7 +57,7 @@ class ScanOperator(LinearOperator):
         """Moves and conversions of a module. Another precision makes new tables, since converted ones have the digits
         of the old.
         """
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point()}
         if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
             device = self.device

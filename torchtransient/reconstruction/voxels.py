@@ -39,7 +39,7 @@ class VoxelGrid:
         pitch = tuple(positive("VoxelGrid: pitch", p) for p in self.pitch)
         if len(size) != 2 or len(pitch) != 2:
             raise ShapeError(f"VoxelGrid: expected two sizes and pitches, got {shown(self.size)}, {shown(self.pitch)}.")
-        for name, value in dict(depths=depths, size=size, pitch=pitch).items():
+        for name, value in {"depths": depths, "size": size, "pitch": pitch}.items():
             object.__setattr__(self, name, value)
         for name in ("first", "along_x", "along_y", "normal"):
             plain = real_array(getattr(self, name))
@@ -49,8 +49,7 @@ class VoxelGrid:
         axes = torch.stack([self.along_x, self.along_y, self.normal])
         if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64), atol=1e-6):
             raise ShapeError(
-                "VoxelGrid: expected along_x, along_y and normal of length one at right angles, got "
-                f"{axes.tolist()}."
+                f"VoxelGrid: expected along_x, along_y and normal of length one at right angles, got {axes.tolist()}."
             )
 
     @classmethod
@@ -117,7 +116,9 @@ class VoxelGrid:
         if len(given) != 3:
             raise ShapeError(f"VoxelGrid.bounds: expected size as (X, Y, Z) or one number, got {shown(size)}.")
         sizes = [count("VoxelGrid.bounds: size", n) for n in given]
-        dx, dy, dz = (positive("VoxelGrid.bounds: a side", (b - a) / n) for a, b, n in zip(low, high, sizes, strict=True))
+        dx, dy, dz = (
+            positive("VoxelGrid.bounds: a side", (b - a) / n) for a, b, n in zip(low, high, sizes, strict=True)
+        )
         eye = torch.eye(3, dtype=torch.float64)
         first = torch.stack([low[0] + dx / 2, low[1] + dy / 2, torch.zeros((), dtype=torch.float64)])
         depths = low[2] + dz * (torch.arange(sizes[2], dtype=torch.float64) + 0.5)

@@ -38,10 +38,9 @@ def volume_views(
 
     ``volume`` (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, the
     highest one is white, `gamma` < 1 lightens what is dim. ``depths`` (Z,) and ``extent`` (width, height) in metres
-    scale the axes (those of a voxel grid: `grid.depths`, `grid.extent`), x and y from the middle; without them they count
-    voxels. With ``depth``
-    (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where ``mask`` (Y, X) is true. Writes
-    the figure when `path` is given. Raises ShapeError, UnitError, StorageError.
+    scale the axes (those of a voxel grid: `grid.depths`, `grid.extent`), x and y from the middle; without them they
+    count voxels. With ``depth`` (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where
+    ``mask`` (Y, X) is true. Writes the figure when `path` is given. Raises ShapeError, UnitError, StorageError.
     """
     values = _volume(volume)
     gamma = positive("volume_views: gamma", gamma)
