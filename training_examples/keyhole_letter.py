@@ -10,7 +10,7 @@ maximization (Richardson and Lucy) finds the picture of the highest likelihood t
 
 `FOLDER` holds one letter's files as published: `scan_*.mat` (`data` (positions, bins) counts, `xpos`, `zpos`),
 `LongExpNoObject_after.mat` (counts without the letter) and `direct_after.mat` (the response), HDF5, bins of 16 ps.
-The picture is compared with all letters of the alphabet, each at the place and size that suit it best.
+The picture is compared with all letters of the alphabet, at the place and size that suit the best of them.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ BINS, FIRST, SUMMED = 768, 270, 2
 # Where the track and the letter's plane are, metres: the letter moves in x and z, y is up.
 TRACK_X, TRACK_Z, TRACK_Y, PLANE_Z = 1.0, 0.15, 1.13, 0.79
 LOW, HIGH, HALF_WIDTH = 0.40, 1.12, 0.33
-# (r_laser r_sensor)^-p: wall and tape both lose light off their axes, beyond the squares of distances.
-FALLOFF = 3.0
+# (r_laser r_sensor)^-p. Inverse squares and the wall's cosines are p = 3, those of a diffuse patch too p = 4; tape that
+# sends light back lies between them.
+FALLOFF = 3.5
 # Response before and behind its maximum, in bins.
 BEFORE, BEHIND = 8, 40
 
@@ -144,52 +145,60 @@ def most_likely(model: Prediction, track: Track, steps: int, progress: bool = Tr
 # ------------------------------------------------------------------------------------------------------------ letters
 
 
-def drawn(letter: str) -> Tensor:
-    """A letter (H, W), cut out, from 0 to 1."""
+def alphabet() -> dict[str, Tensor]:
+    """The letters (H, W) of one font from 0 to 1: of one height, on one line, each in the middle of its picture."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans-Bold.ttf"), 96)
-    image = Image.new("L", (200, 200))
-    ImageDraw.Draw(image).text((40, 30), letter, fill=255, font=font)
-    left, top, right, bottom = image.getbbox() or (0, 0, 1, 1)
-    return torch.from_numpy(np.asarray(image.crop((left, top, right, bottom)), dtype=np.float64) / 255)
+    pictures = {}
+    for letter in ascii_uppercase:
+        image = Image.new("L", (160, 160))
+        draw = ImageDraw.Draw(image)
+        left, _, right, _ = draw.textbbox((0, 120), letter, font=font, anchor="ls")
+        draw.text((80 - (left + right) / 2, 120), letter, fill=255, font=font, anchor="ls")
+        pictures[letter] = torch.from_numpy(np.asarray(image, dtype=np.float64) / 255)
+    used = torch.stack(list(pictures.values())).amax(0) > 0
+    rows, columns = (used.any(dim).nonzero() for dim in (1, 0))
+    reach = int((columns - 80).abs().max())
+    box = (slice(int(rows.min()), int(rows.max()) + 1), slice(80 - reach, 80 + reach))
+    return {letter: picture[box] for letter, picture in pictures.items()}
 
 
-def blurred(picture: Tensor, sigma: float, reach: int = 3) -> Tensor:
-    """With a Gaussian of `sigma` pixels, `reach` pixels larger to every side."""
+def blurred(pictures: Tensor, sigma: float, reach: int = 3) -> Tensor:
+    """(N, H, W) with a Gaussian of `sigma` pixels, `reach` pixels larger to every side."""
     t = torch.arange(-reach, reach + 1, dtype=torch.float64)
     kernel = torch.exp(-(t**2) / (2 * sigma**2))
     kernel = kernel / kernel.sum()
-    wide = functional.pad(picture, (2 * reach,) * 4)[None, None]
-    return functional.conv2d(functional.conv2d(wide, kernel[None, None, :, None]), kernel[None, None, None])[0, 0]
-
-
-def correlation(picture: Tensor, letter: str, reach: int = 3) -> float:
-    """The highest correlation coefficient of a square picture with a letter, over places, heights of 30 to 85 % of the
-    picture and widths within 10 % of the font's.
-    """
-    size = picture.shape[0]
-    shape = drawn(letter)[None, None]
-    wide = functional.pad(picture, (reach,) * 4)[None, None]
-    deviation, best = (picture - picture.mean()).norm(), 0.0
-    for height in range(round(0.3 * size), round(0.85 * size)):
-        for stretch in (0.9, 1.0, 1.1):
-            width = round(height * stretch * shape.shape[-1] / shape.shape[-2])
-            if not 2 <= width < size:
-                continue
-            template = blurred(functional.interpolate(shape, (height, width), mode="area")[0, 0], 0.7, reach)
-            mean = template.sum() / size**2
-            spread = (template.square().sum() - size**2 * mean**2).sqrt()
-            products = functional.conv2d(wide, template[None, None]) - mean * picture.sum()
-            best = max(best, float(products.max() / (spread * deviation)))
-    return best
+    wide = functional.pad(pictures, (2 * reach,) * 4)[:, None]
+    return functional.conv2d(functional.conv2d(wide, kernel[None, None, :, None]), kernel[None, None, None])[:, 0]
 
 
 def letter_scores(picture: Tensor) -> dict[str, float]:
-    """Correlation with every letter, the best one first. Of the amplitude: squares hide what is dim."""
-    found = {letter: correlation(picture.sqrt(), letter) for letter in ascii_uppercase}
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+    """Correlation coefficients of a square picture with every letter of the alphabet, the highest first.
+
+    Place and size are one for the whole alphabet: those at which the highest coefficient of all is found. Compared is
+    the amplitude, the root of the picture: squares hide what is dim.
+    """
+    amplitude, size = picture.sqrt(), picture.shape[0]
+    letters = alphabet()
+    shapes = torch.stack(list(letters.values()))[:, None]
+    margin = size // 2
+    wide = functional.pad(amplitude, (margin,) * 4)[None, None]
+    deviation = (amplitude - amplitude.mean()).norm()
+    best, scores = -1.0, torch.zeros(len(letters))
+    for height in range(round(0.35 * size), size):
+        width = round(height * shapes.shape[-1] / shapes.shape[-2])
+        templates = blurred(functional.interpolate(shapes, (height, width), mode="area")[:, 0], 0.7)
+        mean = templates.sum((1, 2)) / size**2
+        spread = (templates.square().sum((1, 2)) - size**2 * mean**2).sqrt()
+        products = functional.conv2d(wide, templates[:, None])[0].flatten(1) - (mean * amplitude.sum())[:, None]
+        found = products / (spread[:, None] * deviation)
+        if float(found.max()) > best:
+            best = float(found.max())
+            scores = found[:, int(found.amax(0).argmax())]
+    pairs = zip(letters, scores.tolist(), strict=True)
+    return dict(sorted(pairs, key=lambda pair: -pair[1]))
 
 
 def draw(path: Path, picture: Tensor, plain: Tensor, scores: dict[str, float]) -> None:
@@ -197,7 +206,9 @@ def draw(path: Path, picture: Tensor, plain: Tensor, scores: dict[str, float]) -
     figure = figure_type()(figsize=(10, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     extent = (-HALF_WIDTH, HALF_WIDTH, LOW, HIGH)
-    for panel, (title, values) in zip(panels, {"backprojection": plain, "most likely": picture.sqrt()}.items()):
+    for panel, (title, values) in zip(
+        panels, {"backprojection": plain, "most likely": picture.sqrt()}.items(), strict=False
+    ):
         panel.imshow(values.clamp_min(0).numpy(), cmap="gray", extent=extent)
         panel.set_title(title, fontsize=9)
         panel.set_xlabel("x (m)")
@@ -211,7 +222,7 @@ def draw(path: Path, picture: Tensor, plain: Tensor, scores: dict[str, float]) -
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("folder", type=Path, help="files of one letter")
-    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--resolution", type=int, default=48, help="pixels of a side of the picture")
     parser.add_argument("--output", type=Path, default=Path("demo_output"))
     options = parser.parse_args(argv)

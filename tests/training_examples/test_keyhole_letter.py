@@ -28,8 +28,8 @@ def write_track(folder, example, letter, seed=0):
     x, z = columns.ravel(), rows.ravel()
     points = np.stack([0.5 - x, np.full_like(x, example["TRACK_Y"]), z], -1)
     scan = Scan.points(points, kind="confocal", sensor_origin=(0, 0, 2), laser_origin=(0, 0, 2))
-    shape = torch.nn.functional.interpolate(example["drawn"](letter)[None, None], (20, 16), mode="area")[0, 0]
-    plane = example["plane"](40)[8:28, 12:28]
+    shape = torch.nn.functional.interpolate(example["alphabet"]()[letter][None, None], (20, 22), mode="area")[0, 0]
+    plane = example["plane"](40)[8:28, 9:31]
     lit = shape > 0.3
 
     axis = tt.TimeAxis.from_seconds(0.0, example["BIN_S"], 1000)
@@ -86,6 +86,5 @@ def test_measured_letters_are_found(example, measured, tmp_path, letter):
     found = example["main"]([str(measured / "keyhole" / letter), "--output", str(tmp_path)])
     (first, value), (_, second) = list(found["scores"].items())[:2]
     assert first == letter
-    assert value > 0.8
-    # Every letter has its best place, size and width: an E and an F of the font are 0.84 alike then.
-    assert value - second > 0.06
+    assert value >= 0.6
+    assert value - second >= 0.1
