@@ -16,6 +16,10 @@
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
 - `subtract_legs`: a capture without the first and the last leg of its light
+- `VoxelGrid`: where hidden points stand; `Backprojection`, `FilteredBackprojection`, `PhasorField`: linear operators
+  between their values and captures, with `backproject`, `filtered_backproject` and `phasor_image` for one capture;
+  `PhasorFilter`, `LaplacianFilter`; `DirectLight`, `ConfocalCamera`, `TransientCamera`
+- `depth_map`, `soft_depth`, `normals_from_depth`, `normals_from_volume`: surfaces in what was reconstructed
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -33,11 +37,28 @@ from torchtransient.nlos.simulation import forecast as forecast
 from torchtransient.nlos.simulation import simulate as simulate
 from torchtransient.reconstruction import FK as FK
 from torchtransient.reconstruction import LCT as LCT
+from torchtransient.reconstruction import Backprojection as Backprojection
+from torchtransient.reconstruction import ConfocalCamera as ConfocalCamera
+from torchtransient.reconstruction import DepthMap as DepthMap
 from torchtransient.reconstruction import DiffusionDeconvolution as DiffusionDeconvolution
 from torchtransient.reconstruction import DirectionalLCT as DirectionalLCT
+from torchtransient.reconstruction import DirectLight as DirectLight
+from torchtransient.reconstruction import FilteredBackprojection as FilteredBackprojection
+from torchtransient.reconstruction import LaplacianFilter as LaplacianFilter
 from torchtransient.reconstruction import MidpointFK as MidpointFK
+from torchtransient.reconstruction import PhasorField as PhasorField
+from torchtransient.reconstruction import PhasorFilter as PhasorFilter
+from torchtransient.reconstruction import TransientCamera as TransientCamera
+from torchtransient.reconstruction import VoxelGrid as VoxelGrid
+from torchtransient.reconstruction import backproject as backproject
+from torchtransient.reconstruction import depth_map as depth_map
 from torchtransient.reconstruction import directional_lct as directional_lct
+from torchtransient.reconstruction import filtered_backproject as filtered_backproject
 from torchtransient.reconstruction import fk as fk
 from torchtransient.reconstruction import lct as lct
 from torchtransient.reconstruction import midpoint_fk as midpoint_fk
+from torchtransient.reconstruction import normals_from_depth as normals_from_depth
+from torchtransient.reconstruction import normals_from_volume as normals_from_volume
+from torchtransient.reconstruction import phasor_image as phasor_image
+from torchtransient.reconstruction import soft_depth as soft_depth
 from torchtransient.reconstruction import subtract_legs as subtract_legs
