@@ -16,10 +16,16 @@
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
 - `subtract_legs`: a capture without the first and the last leg of its light
-- `VoxelGrid`: where hidden points stand; `Backprojection`, `FilteredBackprojection`, `PhasorField`: linear operators
-  between their values and captures, with `backproject`, `filtered_backproject` and `phasor_image` for one capture;
-  `PhasorFilter`, `LaplacianFilter`; `DirectLight`, `ConfocalCamera`, `TransientCamera`
-- `depth_map`, `soft_depth`, `normals_from_depth`, `normals_from_volume`: surfaces in what was reconstructed
+- `VoxelGrid`: where the points of a hidden volume stand
+- `Backprojection`, `backproject`: linear operator between such a volume and captures of any kind, and of one capture
+- `FilteredBackprojection`, `filtered_backproject`: the same behind a filter in time
+- `PhasorFilter`, `LaplacianFilter`: such filters
+- `PhasorField`, `phasor_image`: waves of a band of frequencies, from plane to plane
+- `DirectLight`, `ConfocalCamera`: virtual cameras of phasor fields
+- `TransientCamera`: one that sees light travel
+- `depth_map`, `soft_depth`: where surfaces are in what was reconstructed, the latter with gradients
+- `DepthMap`: depths, strengths and where there is something
+- `normals_from_depth`, `normals_from_volume`: how those surfaces are turned
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
