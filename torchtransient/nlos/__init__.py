@@ -26,6 +26,13 @@
 - `depth_map`, `soft_depth`: where surfaces are in what was reconstructed, the latter with gradients
 - `DepthMap`: depths, strengths and where there is something
 - `normals_from_depth`, `normals_from_volume`: how those surfaces are turned
+- `reconstruct`: the volume that one of these methods finds in a capture
+- `choose_method`: which one suits it, and why
+- `default_grid`: voxels before the wall of a capture
+- `sum_bins`, `without_slab`: captures of fewer bins; without the foam before them
+- `HiddenVolume`: what `reconstruct` returns
+- `normals_of`: its unit normals, of methods that find them
+- `read_volume`, `write_volume`: such volumes on disk
 
 What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
@@ -36,6 +43,15 @@ from torchtransient.capture import Scan as Scan
 from torchtransient.capture import Wall as Wall
 from torchtransient.data.captures.formats import read_capture as read_capture
 from torchtransient.data.captures.formats import write_capture as write_capture
+from torchtransient.data.volume_file import HiddenVolume as HiddenVolume
+from torchtransient.data.volume_file import read_volume as read_volume
+from torchtransient.data.volume_file import write_volume as write_volume
+from torchtransient.nlos.methods import choose_method as choose_method
+from torchtransient.nlos.preparation import sum_bins as sum_bins
+from torchtransient.nlos.preparation import without_slab as without_slab
+from torchtransient.nlos.reconstruct import default_grid as default_grid
+from torchtransient.nlos.reconstruct import normals_of as normals_of
+from torchtransient.nlos.reconstruct import reconstruct as reconstruct
 from torchtransient.nlos.renderer import CaptureRenderer as CaptureRenderer
 from torchtransient.nlos.scene import capture_scene as capture_scene
 from torchtransient.nlos.setup_files import read_setup as read_setup
