@@ -61,7 +61,9 @@ def capture_options(command: Command) -> Command:
         click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
         click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
         click.option("--slab", type=float, metavar="METRES", help="Take off a slab of foam so thick (confocal scans)."),
-        click.option("--slab-snr", type=float, help="Light over noise in power where the slab lost none.  [default: 1e4]"),
+        click.option(
+            "--slab-snr", type=float, help="Light over noise in power where the slab lost none.  [default: 1e4]"
+        ),
     )
     for option in reversed(options):
         command = option(command)
@@ -70,17 +72,26 @@ def capture_options(command: Command) -> Command:
 
 @click.command()
 @click.argument("capture", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Volume, .h5 or .npz.  [default: CAPTURE_METHOD.h5]")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Volume, .h5 or .npz.  [default: CAPTURE_METHOD.h5]"
+)
 @click.option("--picture", type=click.Path(path_type=Path), help="Front, top, side, depth.  [default: OUTPUT.png]")
 @click.option("--no-picture", is_flag=True, help="The volume alone.")
 @click.option("--gamma", type=float, default=1.0, show_default=True, help="Below one lightens what is dim.")
+@click.option(
+    "--flip", type=click.Choice(("x", "y", "xy")), help="Turn the picture over; files may count rows downwards."
+)
 @click.option("--threshold", type=float, default=0.1, show_default=True, help="Least brightness that has a depth.")
 @click.option("--method", type=click.Choice(METHODS), help="[default: what suits the capture]")
 @click.option("--depths", type=(float, float), metavar="NEAR FAR", help="Before the wall, metres.  [default: all]")
-@click.option("--voxels", type=Numbers(int, 3, "N or X,Y[,Z]"), help="bp, fbp; Z of phasor.  [default: as the scan, 64]")
+@click.option(
+    "--voxels", type=Numbers(int, 3, "N or X,Y[,Z]"), help="bp, fbp; Z of phasor.  [default: as the scan, 64]"
+)
 @click.option("--extent", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the planes, metres (bp, fbp).")
 @click.option("--bounds", type=_SIX, metavar="X Y Z X Y Z", help="Lowest and highest corner of the voxels (bp, fbp).")
-@click.option("--target", type=click.Choice(("diffuse", "retroreflective")), help="f-k and light-cone.  [default: diffuse]")
+@click.option(
+    "--target", type=click.Choice(("diffuse", "retroreflective")), help="f-k and light-cone.  [default: diffuse]"
+)
 @click.option("--floor", type=float, help="Of the root of f-k: 0.25 for counts.  [default: 0]")
 @click.option("--snr", type=float, help="Of the light-cone transforms; larger is sharper.  [default: 10]")
 @click.option("--wavelength", type=float, help="Metres (fbp, phasor).  [default: the shortest without ghosts]")
@@ -100,10 +111,20 @@ def command(capture: Path, **options: Any) -> None:
     bp, fbp: any points. Which loses what: docs/nlos_reconstruction.md. The volume's file holds values (C, Z, Y, X),
     depths and axes; tt.nlos.read_volume reads it.
     """
+    from torchtransient.cli.words import arguments_as_options
+    from torchtransient.errors import TorchTransientError
+
+    _check_together(options)
+    try:
+        _run(capture, options)
+    except TorchTransientError as error:
+        raise type(error)(arguments_as_options(str(error), (*_OPEN, *_SETTINGS, "format", "camera"))) from error
+
+
+def _run(capture: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
     from torchtransient.data.volume_file import check_volume_target
 
-    _check_together(options)
     told = {name: options[name] for name in _OPEN if options[name] is not None}
     measured = tt.nlos.read_capture(capture, options["layout"], **{**told, **_wall_size(told)})
     choice = _choice(measured, options["method"])
@@ -193,8 +214,8 @@ def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
         return None
     if method not in _FREE:
         raise click.UsageError(
-            f"--method {method} has a voxel behind each point and a plane for each bin; leave out {' and '.join(given)}, "
-            "or take bp or fbp."
+            f"--method {method} has a voxel behind each point and a plane for each bin; leave out "
+            f"{' and '.join(given)}, or take bp or fbp."
         )
     voxels = options["voxels"] or ()
     if options["bounds"] is not None:
@@ -222,10 +243,13 @@ def _noted(volume: Any, path: Path, measured: Any, reason: str, options: dict[st
 def _draw(volume: Any, path: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
 
+    # Axes of pictures (..., Y, X), from behind.
+    over = [-1 - "xy".index(axis) for axis in options["flip"] or ""]
     found = volume.picture()
     surface = tt.nlos.depth_map(found.clamp_min(0), volume.grid, threshold=options["threshold"])
-    normals = tt.nlos.normals_of(volume) if volume.directions is not None else None
+    normals = None if volume.directions is None else tt.nlos.normals_of(volume).flip(over)
     tt.vis.volume_views(
-        found, path, depths=volume.grid.depths, extent=volume.grid.extent, depth=surface.depth, mask=surface.mask,
-        normals=normals, gamma=options["gamma"], title=f"{volume.metadata['capture']}, {volume.method}",
+        found.flip(over), path, depths=volume.grid.depths, extent=volume.grid.extent, depth=surface.depth.flip(over),
+        mask=surface.mask.flip(over), normals=normals, gamma=options["gamma"],
+        title=f"{volume.metadata['capture']}, {volume.method}",
     )  # fmt: skip

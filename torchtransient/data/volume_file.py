@@ -3,8 +3,8 @@
 Both hold the same names: `values` (..., C, Z, Y, X), or (..., C, N, Z, Y, X) with `times` (N,) where a camera filmed;
 `directions` (..., C, 3, Z, Y, X) of methods that find normals, in world coordinates. The grid is float64, in metres:
 `depths` (Z,), `pitch` (2,) as (dy, dx), and the vectors (3,) `first`, `along_x`, `along_y`, `normal`; voxel (k, j, i)
-stands at ``first + j dy along_y + i dx along_x + depths[k] normal``. `method` is a text, `metadata` one of JSON. Numbers
-and texts are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
+stands at ``first + j dy along_y + i dx along_x + depths[k] normal``. `method` is a text, `metadata` one of JSON; texts
+are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 """
 
 from __future__ import annotations

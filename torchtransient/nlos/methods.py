@@ -36,9 +36,7 @@ _ALL = ("single", "confocal", "exhaustive")
 _BAND = ("wavelength", "cycles", "falloff")
 METHODS = {
     "fk": Method("f-k migration", ("confocal",), ("target", "floor", "taps")),
-    "midpoint-fk": Method(
-        "f-k migration by midpoints", ("single", "exhaustive"), ("target", "floor", "taps")
-    ),
+    "midpoint-fk": Method("f-k migration by midpoints", ("single", "exhaustive"), ("target", "floor", "taps")),
     "lct": Method("light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
     "directional-lct": Method("directional light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
     "bp": Method("backprojection", _ALL, ("falloff",), planar=False, free_grid=True),

@@ -14,7 +14,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.data.volume_file import HiddenVolume
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength
+from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.quantities import finite, shown
 from torchtransient.reconstruction import (
     Backprojection,
@@ -122,6 +122,10 @@ def default_grid(
     if planes is None:
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64) + 0.5) / planes
+    if size is None and extent is None and not is_planar(capture.scan):
+        # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
+        shape = capture.scan.sensor_shape
+        size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
 
 
@@ -140,7 +144,9 @@ def normals_of(volume: HiddenVolume) -> Tensor:
     first item of a batch, summed over its channels. Raises ShapeError for a volume without directions.
     """
     if not isinstance(volume, HiddenVolume) or volume.directions is None:
-        raise ShapeError(f"normals_of: expected a volume with directions (method directional-lct), got {shown(volume)}.")
+        raise ShapeError(
+            f"normals_of: expected a volume with directions (method directional-lct), got {shown(volume)}."
+        )
     vectors = volume.directions
     while vectors.ndim > 5:
         vectors = vectors[0]
@@ -177,9 +183,7 @@ def _intensities(capture: Capture) -> Capture:
         dims = len(capture.scan.shape)
         transient = transient.select(transient.ndim - dims - 3, 0)
         steady = None if steady is None else steady.select(steady.ndim - dims - 2, 0)
-    return replace(
-        capture, transient=transient, steady=steady, polarized=False, phasor=None, frequencies=None
-    )
+    return replace(capture, transient=transient, steady=steady, polarized=False, phasor=None, frequencies=None)
 
 
 def _from_zero(capture: Capture) -> Capture:
