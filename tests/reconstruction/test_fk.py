@@ -46,7 +46,7 @@ def peak(volume, operator):
         before, at, after = (float(volume[(*index[:axis], k + i, *index[axis + 1 :])].log()) for i in (-1, 0, 1))
         place.append(k + 0.5 * (before - after) / (before - 2 * at + after))
     z = float(operator.depths[0]) + place[0] * operator.axis.bin_width_opl / 2
-    corner = operator.grid.points(torch.tensor([z]))[0, 0, 0]
+    corner = operator.grid.at_depths([z]).points[0, 0, 0]
     dy, dx = operator.grid.pitch
     return corner + place[1] * dy * operator.grid.along_y + place[2] * dx * operator.grid.along_x
 
@@ -99,7 +99,7 @@ def test_migration_of_the_model_is_the_cosine_of_the_wave(tilt):
     axis = TimeAxis(0.0, 0.04, 128)
     scan = Scan.grid(Wall.plane(2.0, 2.0), 48, kind="confocal")
     operator = FK(scan, time_axis=axis, dtype=F64)
-    off = operator.points() - torch.tensor([0.2 if tilt else 0.0, 0.0, 1.0], dtype=F64)
+    off = operator.points - torch.tensor([0.2 if tilt else 0.0, 0.0, 1.0], dtype=F64)
     turns = 5.0 * off[..., 2] + 5.0 * tilt * off[..., 0]
     packet = torch.polar(torch.exp(-off.square().sum(-1) / (2 * 0.2**2)), 2 * math.pi * turns)
     again = operator.adjoint(operator(packet))
@@ -133,9 +133,9 @@ def test_captures_and_planar_scans():
     assert fk(Capture(light[None], axis, SCAN)).dtype == F64
     planar = FK(PlanarScan.of_scan(SCAN, "test"), time_axis=axis)
     torch.testing.assert_close(planar.reconstruct(light), expected)
-    assert operator.points().shape == (64, SIDE, SIDE, 3)
-    torch.testing.assert_close(operator.points()[5, ..., 2], torch.full((SIDE, SIDE), 0.11, dtype=F64))
-    torch.testing.assert_close(operator.points()[0, ..., :2], SCAN.sensor_points[..., :2])
+    assert operator.points.shape == (64, SIDE, SIDE, 3)
+    torch.testing.assert_close(operator.points[5, ..., 2], torch.full((SIDE, SIDE), 0.11, dtype=F64))
+    torch.testing.assert_close(operator.points[0, ..., :2], SCAN.sensor_points[..., :2])
 
 
 def test_what_it_cannot_take_is_refused():
