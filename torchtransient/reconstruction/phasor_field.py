@@ -72,8 +72,8 @@ class PhasorField(ScanOperator):
     ) -> None:
         if not isinstance(points, VoxelGrid):
             raise ShapeError(
-                f"PhasorField: expected points as a VoxelGrid, got {shown(points)}. Give planes before the scan, "
-                "VoxelGrid.before(scan, depths), or take FilteredBackprojection, which takes any points."
+                f"PhasorField: expected planes as a VoxelGrid, got {shown(points)}. Make them with VoxelGrid.before; "
+                "FilteredBackprojection takes points."
             )
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         if not isinstance(pulse, PhasorFilter):
