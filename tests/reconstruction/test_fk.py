@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from support.grid_operators import confocal_points
+from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import SceneError, ShapeError, UnitError
@@ -51,8 +52,12 @@ def peak(volume, operator):
     return corner + place[1] * dy * operator.grid.along_y + place[2] * dx * operator.grid.along_x
 
 
-@pytest.mark.parametrize("z", [0.46, 1.0, 1.6, 2.2], ids=["18 %", "39 %", "63 %", "86 %"])
-def test_field_is_that_of_the_direct_transform(z):
+DEPTHS = {"18 %": 0.46, "39 %": 1.0, "63 %": 1.6, "86 %": 2.2}
+
+
+@pytest.mark.parametrize("share", long(DEPTHS, ["86 %"]))
+def test_field_is_that_of_the_direct_transform(share):
+    z = DEPTHS[share]
     operator = FK(SCAN, time_axis=AXIS, dtype=F64)
     psi = operator.wavefield(confocal_points([(0.1, -0.15, z)], SCAN, AXIS))
     exact, found = direct(psi, AXIS, operator.grid.pitch), operator.adjoint(psi)
@@ -71,7 +76,7 @@ def test_start_and_unequal_sides_are_those_of_the_direct_transform():
     assert float((operator.adjoint(psi) - exact).abs().max()) < 1e-3 * float(exact.abs().max())
 
 
-@pytest.mark.parametrize("z", [0.45, 1.0, 1.55, 2.1])
+@pytest.mark.parametrize("z", long([0.45, 1.0, 1.55, 2.1], [0.45, 2.1]))
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_points_come_out_where_they_are(z, dtype):
     axis = TimeAxis(0.0, 0.0096, 512)

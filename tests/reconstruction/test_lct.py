@@ -126,7 +126,13 @@ def tilted_plate(angle, squared):
 
 
 @pytest.mark.parametrize(
-    "angle, squared, least, most", [(0.0, False, -1, 1), (0.3, False, 9, 17), (0.3, True, 9, 17), (-0.3, True, -17, -9)]
+    "angle, squared, least, most",
+    [
+        pytest.param(0.0, False, -1, 1, marks=pytest.mark.slow),
+        (0.3, False, 9, 17),
+        pytest.param(0.3, True, 9, 17, marks=pytest.mark.slow),
+        pytest.param(-0.3, True, -17, -9, marks=pytest.mark.slow),
+    ],
 )
 def test_normals_of_plates(angle, squared, least, most):
     light = tilted_plate(angle, squared)

@@ -68,7 +68,9 @@ def test_points_come_out_where_they_are(name, place):
     assert float((found - torch.tensor(place)).abs().max()) < 0.045
 
 
-@pytest.mark.parametrize("name, least", [("single", 0.7), ("exhaustive", 0.8)])
+@pytest.mark.parametrize(
+    "name, least", [pytest.param("single", 0.7, marks=pytest.mark.slow), ("exhaustive", 0.8)]
+)
 def test_front_view_of_a_letter(name, least):
     bar = [(0.02 * k + 0.05, 0.2, 0.8) for k in range(-12, 13)]
     stem = [(0.05, 0.02 * k - 0.05, 0.8) for k in range(-12, 13)]
