@@ -2,6 +2,9 @@
 
 {"do": "capture", "file"}   .npz with H (T, X, Y) or (T, Lx, Ly, X, Y), sensors (X, Y, 3), lasers (X, Y, 3), bin_width
 {"do": "solve", "method", "planes", "out", ...options}   -> {"seconds"}, CPU seconds; the volume (X, Y, Z) as .npy
+{"do": "migrate", "out"}   f-k migration -> {"seconds"}; the volume (Z, X, Y) as .npy
+
+The argument is how many pieces along each side y-tal cuts volumes into.
 """
 
 import json
@@ -48,6 +51,13 @@ def solve(capture, method, planes, camera="DIRECT_LIGHT", **options):
     return np.asarray(found), time.process_time() - start
 
 
+def migrate(capture):
+    """The volume of f-k migration, whose planes are y-tal's own, and the CPU seconds that it took."""
+    start = time.process_time()
+    found = tal.reconstruct.fk.solve(capture)
+    return np.asarray(found), time.process_time() - start
+
+
 def main():
     set_log_level(LogLevel.ERROR)
     # Whole volumes at once take y-tal many GB.
@@ -56,11 +66,11 @@ def main():
     capture = None
     for line in sys.stdin:
         request = json.loads(line)
-        if request.pop("do") == "capture":
+        if (what := request.pop("do")) == "capture":
             capture, answer = load(request["file"]), {"ok": True}
         else:
             out = request.pop("out")
-            volume, seconds = solve(capture, **request)
+            volume, seconds = {"solve": solve, "migrate": migrate}[what](capture, **request)
             np.save(out, volume)
             answer = {"seconds": seconds}
         print(json.dumps(answer), file=ANSWERS)

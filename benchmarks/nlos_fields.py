@@ -16,7 +16,6 @@ import math
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +23,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from _runner import HERE, ChildProcess, arguments, environment, ratio, report, summary
+from _runner import arguments, environment, ratio, report, summary
+from _tal import Tal
 
 import torchtransient as tt
 from torchtransient.reconstruction import (
@@ -41,34 +41,6 @@ BINS, WIDTH = 512, 0.0096
 PLANES = [0.8 + 0.025 * k for k in range(16)]
 POINTS = [(0.1, -0.15, 1.0), (-0.2, 0.1, 0.85), (0.3, 0.3, 1.1)]
 BARS = {(64, "phasor planes"): 1 / 50, (64, "fbp"): 1 / 10, (32, "bp"): 1 / 10}
-
-
-class Tal(ChildProcess):
-    """A `_tal_worker.py` process with one thread."""
-
-    def __init__(self, python: str, downscale: int) -> None:
-        alone = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        place = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | alone
-        super().__init__([python, str(HERE / "_tal_worker.py"), str(downscale)], env=place)
-        self.folder = tempfile.TemporaryDirectory()
-
-    def load(self, capture: tt.nlos.Capture) -> None:
-        """Hand over a capture; x comes first in all of y-tal's arrays."""
-        file, scan = str(Path(self.folder.name) / "capture.npz"), capture.scan
-        light = capture.transient[0].float()
-        turned = light.transpose(-1, -2) if light.ndim == 3 else light.permute(0, 2, 1, 4, 3)
-        lasers = scan.laser_points if scan.laser_points.ndim == 3 else scan.laser_points[None, None]
-        grids = {"sensors": scan.sensor_points, "lasers": lasers}
-        points = {name: grid.transpose(0, 1).float().contiguous().numpy() for name, grid in grids.items()}
-        np.savez(file, H=turned.contiguous().numpy(), bin_width=capture.axis.bin_width_opl, **points)
-        self.ask(do="capture", file=file)
-
-    def solve(self, method: str, planes: list[float], **options: Any) -> tuple[torch.Tensor, float]:
-        """The volume (..., Z, Y, X) and its seconds."""
-        out = str(Path(self.folder.name) / "volume.npy")
-        seconds = self.ask(do="solve", method=method, planes=planes, out=out, **options)["seconds"]
-        volume = torch.from_numpy(np.load(out))
-        return volume.transpose(-1, -3), seconds
 
 
 def correlation(a: torch.Tensor, b: torch.Tensor) -> float:

@@ -15,15 +15,14 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from _runner import HERE, ChildProcess, arguments, environment, interleave, ratio, report, summary
+from _runner import arguments, environment, interleave, ratio, report, summary
+from _tal import Tal
 from torch import Tensor
 
 import torchtransient as tt
@@ -32,29 +31,6 @@ from torchtransient.reconstruction import FK, LCT, DirectionalLCT
 BINS, WIDTH = 512, 0.0096
 OVER_PEER = {"fk": 1 / 40, "fk, 2 taps": 1 / 40, "fk and backward": 1 / 15, "lct": 1 / 50, "directional lct": None}
 DEPTHS = {"18 %": 0.45, "39 %": 0.95, "63 %": 1.55, "86 %": 2.1}
-
-
-class Tal(ChildProcess):
-    """A `_tal_fk_worker.py` process with one thread."""
-
-    def __init__(self, python: str) -> None:
-        alone = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        place = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | alone
-        super().__init__([python, str(HERE / "_tal_fk_worker.py")], env=place)
-        self.folder = tempfile.TemporaryDirectory()
-
-    def load(self, light: Tensor, scan: tt.nlos.Scan, width: float) -> None:
-        """Hand over (T, Y, X); x comes first in all of y-tal's arrays."""
-        file = str(Path(self.folder.name) / "capture.npz")
-        turned, points = light.float().transpose(1, 2), scan.sensor_points.transpose(0, 1).float()
-        np.savez(file, H=turned.contiguous().numpy(), sensors=points.contiguous().numpy(), bin_width=width)
-        self.ask(do="capture", file=file)
-
-    def migrate(self) -> tuple[Tensor, float]:
-        """The volume (Z, Y, X) and its seconds."""
-        out = str(Path(self.folder.name) / "volume.npy")
-        seconds = self.ask(do="fk", out=out)["seconds"]
-        return torch.from_numpy(np.load(out)).transpose(1, 2).contiguous(), seconds
 
 
 def points(places: list[tuple[float, float, float]], scan: tt.nlos.Scan, axis: tt.TimeAxis) -> Tensor:
@@ -102,7 +78,7 @@ def speed(size: int, bins: int, repeats: int, peer: Tal | None) -> dict[str, Any
         "directional lct": lambda _: clock(lambda: directional.reconstruct(data)),
     }
     if peer is not None:
-        peer.load(light, scan, axis.bin_width_opl)
+        peer.load(tt.nlos.Capture(light[None], axis, scan))
         cases["y-tal: fk"] = lambda _: peer.migrate()[1]
     seconds = interleave(cases, repeats, warm_up=1)
     ratios = [ratio(seconds, "fk", "padded rfftn and ifftn", 1.2)]
@@ -145,7 +121,7 @@ def positions(size: int, bins: int, peer: Tal | None) -> dict[str, Any]:
             for name, operator in operators.items()
         }
         if peer is not None:
-            peer.load(light, scan, axis.bin_width_opl)
+            peer.load(tt.nlos.Capture(light[None], axis, scan))
             row["y-tal: fk"] = peak_off(peer.migrate()[0].double(), place, (dz, pitch, pitch), 0.0)
         found[f"{share} of the record"] = row
     return found

@@ -77,7 +77,7 @@ def bar(fk: tt.nlos.FK, generator: torch.Generator) -> Tensor:
     along = torch.linspace(0, 1, number, dtype=torch.float64)[:, None]
     # The wall faces +z and its middle is the origin.
     places = ends[0] * (1 - along) + ends[1] * along
-    wall = fk.grid.points(torch.zeros(1))[0]
+    wall = fk.wall.points
     edges = fk.axis.edges_opl / (PULSE_BINS * fk.axis.bin_width_opl)
     light = torch.zeros(fk.data_shape, dtype=torch.float64)
     for place in places:

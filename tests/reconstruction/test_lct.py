@@ -51,7 +51,7 @@ def test_a_point_sends_all_its_light(target, power):
     # Spread over some depth: a voxel alone is sharper than the band, and rings.
     volume[:, 10, 13] = slab_of(operator, 1.0, 0.02).flatten() * SIDE**2
     light = operator(volume)
-    r = (torch.tensor([*operator.points()[0, 10, 13][:2], 1.0]) - SCAN.sensor_points).norm(dim=-1)
+    r = (torch.tensor([*operator.points[0, 10, 13][:2], 1.0]) - SCAN.sensor_points).norm(dim=-1)
     torch.testing.assert_close(light.sum(0), r**-power, rtol=0.01, atol=0)
     mean = (light * AXIS.centers_opl[:, None, None]).sum(0) / light.sum(0)
     torch.testing.assert_close(mean, 2 * r, rtol=0, atol=0.005)
@@ -65,7 +65,7 @@ def test_points_come_out_where_they_are(z):
     k, y, x = (int(i) for i in torch.unravel_index(volume.argmax(), volume.shape))
     row = volume[k - 1 : k + 2, y, x]
     depth = operator.depths[k] + 0.5 * (row[0] - row[2]) / (row[0] - 2 * row[1] + row[2]) * 0.0096
-    point = operator.points()[k, y, x]
+    point = operator.points[k, y, x]
     assert float((point[:2] - torch.tensor([0.1041666, -0.1458333])).abs().max()) < 1e-3
     # Half a bin of v in depth.
     assert abs(float(depth) - z) < operator.cone.width / (4 * z) + 1e-3
@@ -100,7 +100,7 @@ def test_cones_do_not_come_round():
     volume = torch.zeros(operator.volume_shape, dtype=F64)
     volume[44, 0, 0] = 1.0
     light = operator(volume)
-    r = (operator.points()[44, 0, 0] - scan.sensor_points).norm(dim=-1)
+    r = (operator.points[44, 0, 0] - scan.sensor_points).norm(dim=-1)
     beyond = 2 * r > axis.end_opl + 0.2
     assert int(beyond.sum()) > 100
     assert float(light[:, beyond].abs().max()) < 2e-3 * float(light.max())
@@ -126,7 +126,13 @@ def tilted_plate(angle, squared):
 
 
 @pytest.mark.parametrize(
-    "angle, squared, least, most", [(0.0, False, -1, 1), (0.3, False, 9, 17), (0.3, True, 9, 17), (-0.3, True, -17, -9)]
+    "angle, squared, least, most",
+    [
+        pytest.param(0.0, False, -1, 1, marks=pytest.mark.slow),
+        (0.3, False, 9, 17),
+        pytest.param(0.3, True, 9, 17, marks=pytest.mark.slow),
+        pytest.param(-0.3, True, -17, -9, marks=pytest.mark.slow),
+    ],
 )
 def test_normals_of_plates(angle, squared, least, most):
     light = tilted_plate(angle, squared)
@@ -147,7 +153,7 @@ def test_directional_model_of_a_point():
     normal = torch.tensor([0.4, -0.3, -math.sqrt(0.75)], dtype=F64)
     volume = torch.zeros(operator.volume_shape, dtype=F64)
     volume[:, :, 10, 13] = normal[:, None] * slab_of(operator, 1.0, 0.02).flatten() * SIDE**2
-    way = SCAN.sensor_points - torch.tensor([*operator.points()[0, 10, 13][:2], 1.0])
+    way = SCAN.sensor_points - torch.tensor([*operator.points[0, 10, 13][:2], 1.0])
     r = way.norm(dim=-1)
     expected = (way @ normal) / r * r**-4
     torch.testing.assert_close(operator(volume).sum(0), expected, rtol=0.015, atol=0.002 * float(expected.max()))
@@ -167,8 +173,8 @@ def test_walls_that_stand_elsewhere_have_the_same_vectors_turned():
     there = DirectionalLCT(turned, time_axis=AXIS, dtype=F64)
     expected = torch.einsum("ij,jzyx->izyx", turn, here.reconstruct(light))
     torch.testing.assert_close(there.reconstruct(light), expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
-    moved = here.points() @ turn.T + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
-    torch.testing.assert_close(there.points(), moved)
+    moved = here.points @ turn.T + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
+    torch.testing.assert_close(there.points, moved)
 
 
 def test_captures():

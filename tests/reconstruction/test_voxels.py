@@ -92,3 +92,15 @@ def test_what_is_no_grid():
     grid = VoxelGrid.before(SCAN, [0.1])
     with pytest.raises(ShapeError, match="right angles"):
         VoxelGrid(grid.depths, grid.size, grid.pitch, grid.first, grid.along_x, grid.along_x, grid.normal)
+
+
+def test_walls_that_are_at_right_angles_to_a_share_of_their_pitch_have_voxels():
+    # Rows that lean by 5e-4, as points in single precision do: within what a grid may be off.
+    points = Scan.grid(Wall.plane(1.0, 1.0), 8, kind="confocal").sensor_points.clone()
+    points[..., 0] += 5e-4 * points[..., 1]
+    scan = Scan.points(points, kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
+    grid = VoxelGrid.before(scan, [0.5, 1.0])
+    off = (grid.points[..., :2] - points[..., :2]).norm(dim=-1)
+    # The lean itself over seven rows; lengths along it are longer by its square.
+    assert float(off.max()) == pytest.approx(5e-4 * 7 / 8, rel=5e-4)
+    assert float(grid.along_x @ grid.along_y) == pytest.approx(0.0, abs=1e-15)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator
-from torchtransient.reconstruction.scan_operator import checked_capture
+from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 
@@ -16,10 +16,7 @@ def backproject(capture: Capture, points: VoxelGrid | Tensor, *, falloff: float 
     """:meth:`Backprojection.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the device of its
     transient. Raises as the class.
     """
-    axis, dtype = checked_capture(capture, "backproject")
-    assert capture.transient is not None  # a capture without one has been refused
-    operator = Backprojection(capture.scan, points, time_axis=axis, falloff=falloff, dtype=dtype)
-    return operator.to(capture.transient.device).reconstruct(capture)
+    return reconstructed(capture, Backprojection, points, who="backproject", falloff=falloff)
 
 
 class Backprojection(EllipsoidOperator):
@@ -49,7 +46,7 @@ class Backprojection(EllipsoidOperator):
         falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, points, time_axis, falloff, dtype)
+        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
         """``adjoint`` of a transient (..., T, *scan.shape) or a capture: (..., *volume). Raises ShapeError."""

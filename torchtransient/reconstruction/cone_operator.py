@@ -34,20 +34,20 @@ class ConeOperator(ConfocalOperator):
     def __init__(
         self,
         scan: Scan | PlanarScan,
+        *,
         time_axis: TimeAxis,
         dtype: torch.dtype,
-        *,
         target: str,
         snr: float,
         v_bins: int | None,
     ) -> None:
-        super().__init__(scan, time_axis, dtype)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         who = type(self).__name__
         if target not in FALL:
             raise SceneError(f"{who}: expected target to be one of {', '.join(FALL)}, got {shown(target)}.")
         self.target, self.snr = target, positive(f"{who}: snr", snr)
         self.v_bins = time_axis.num_bins if v_bins is None else count(f"{who}: v_bins", v_bins, 4)
-        self.cone = ConeGrid.of(time_axis, self.grid, self.v_bins, who)
+        self.cone = ConeGrid.of(time_axis, self.wall, self.v_bins, who)
         self._set_tables()
 
     def fall(self) -> int:

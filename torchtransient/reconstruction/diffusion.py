@@ -89,7 +89,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         snr: float = 1e4,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, time_axis, dtype)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)

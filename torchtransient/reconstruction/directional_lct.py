@@ -20,8 +20,8 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.reconstruction.cone_operator import DEFAULT_SNR, FALL, ConeOperator
-from torchtransient.reconstruction.confocal_operator import check_capture, precision_of
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.transient_operator import reconstructed
 
 
 class DirectionalLCT(ConeOperator):
@@ -55,7 +55,7 @@ class DirectionalLCT(ConeOperator):
         v_bins: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, time_axis, dtype, target=target, snr=snr, v_bins=v_bins)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype, target=target, snr=snr, v_bins=v_bins)
         self.volume_shape = (3, *self.data_shape)
         self.scales = (1.0, 1.0, float(self.depths.mean()))
 
@@ -87,7 +87,4 @@ def directional_lct(capture: Capture, **options: Any) -> Tensor:
 
     ``options``: of :class:`DirectionalLCT`. Raises as it does.
     """
-    transient, axis = check_capture(capture, "directional_lct")
-    options.setdefault("dtype", precision_of(capture))
-    operator: DirectionalLCT = DirectionalLCT(capture.scan, time_axis=axis, **options).to(transient.device)
-    return operator.reconstruct(capture)
+    return reconstructed(capture, DirectionalLCT, who="directional_lct", **options)

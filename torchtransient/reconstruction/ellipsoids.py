@@ -55,9 +55,9 @@ class EllipsoidOperator(ScanOperator):
     """
 
     def __init__(
-        self, scan: Scan, points: VoxelGrid | Tensor, time_axis: TimeAxis, falloff: float, dtype: torch.dtype
+        self, scan: Scan, points: VoxelGrid | Tensor, *, time_axis: TimeAxis, falloff: float, dtype: torch.dtype
     ) -> None:
-        super().__init__(scan, points, time_axis, dtype)
+        super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         self.falloff = finite(f"{type(self).__name__}: falloff", falloff)
         self._set_tables()
         longest = 2.0 * float(self.voxels.abs().max() + self.sensors.abs().max() + self.lasers.abs().max())

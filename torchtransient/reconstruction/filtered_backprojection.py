@@ -11,7 +11,7 @@ from torchtransient.errors import ShapeError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
 from torchtransient.reconstruction.filters import ReconstructionFilter
-from torchtransient.reconstruction.scan_operator import checked_capture
+from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 
@@ -21,10 +21,8 @@ def filtered_backproject(
     """:meth:`FilteredBackprojection.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the
     device of its transient. Raises as the class.
     """
-    axis, dtype = checked_capture(capture, "filtered_backproject")
-    assert capture.transient is not None  # a capture without one has been refused
-    operator = FilteredBackprojection(capture.scan, points, time_axis=axis, filter=filter, falloff=falloff, dtype=dtype)
-    return operator.to(capture.transient.device).reconstruct(capture)
+    options = {"filter": filter, "falloff": falloff}
+    return reconstructed(capture, FilteredBackprojection, points, who="filtered_backproject", **options)
 
 
 class FilteredBackprojection(EllipsoidOperator):
@@ -50,7 +48,7 @@ class FilteredBackprojection(EllipsoidOperator):
         falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, points, time_axis, falloff, dtype)
+        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
         if not callable(getattr(filter, "rows_adjoint", None)):
             raise ShapeError(
                 f"FilteredBackprojection: expected filter as a PhasorFilter or a LaplacianFilter, got {shown(filter)}."

@@ -29,14 +29,10 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.capture_roots import checked_floor, stabilised_root
-from torchtransient.reconstruction.confocal_operator import (
-    ConfocalOperator,
-    check_capture,
-    chunk_rows,
-    precision_of,
-)
+from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.transient_operator import reconstructed
 
 TARGETS = ("diffuse", "retroreflective")
 TAPS = (2, 4)
@@ -77,7 +73,7 @@ class FK(ConfocalOperator):
         taps: int = 4,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, time_axis, dtype)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         if target not in TARGETS:
             raise SceneError(f"FK: expected target to be one of {', '.join(TARGETS)}, got {shown(target)}.")
         if taps not in TAPS:
@@ -217,10 +213,7 @@ def fk(capture: Capture, **options: Any) -> Tensor:
 
     ``options``: of :class:`FK`. Raises as it does.
     """
-    transient, axis = check_capture(capture, "fk")
-    options.setdefault("dtype", precision_of(capture))
-    operator: FK = FK(capture.scan, time_axis=axis, **options).to(transient.device)
-    return operator.reconstruct(capture)
+    return reconstructed(capture, FK, who="fk", **options)
 
 
 # ------------------------------------------------------------------------------------------------ interpolation windows

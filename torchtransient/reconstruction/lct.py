@@ -10,8 +10,8 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.reconstruction.cone_operator import DEFAULT_SNR, ConeOperator
-from torchtransient.reconstruction.confocal_operator import check_capture, precision_of
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.transient_operator import reconstructed
 
 
 class LCT(ConeOperator):
@@ -45,7 +45,7 @@ class LCT(ConeOperator):
         v_bins: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, time_axis, dtype, target=target, snr=snr, v_bins=v_bins)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype, target=target, snr=snr, v_bins=v_bins)
 
     def components(self, volume: Tensor, matrix: str) -> list[Tensor]:
         return [self._resampled(volume, matrix, transposed=False, to_v=True)]
@@ -59,7 +59,4 @@ def lct(capture: Capture, **options: Any) -> Tensor:
 
     ``options``: of :class:`LCT`. Raises as it does.
     """
-    transient, axis = check_capture(capture, "lct")
-    options.setdefault("dtype", precision_of(capture))
-    operator: LCT = LCT(capture.scan, time_axis=axis, **options).to(transient.device)
-    return operator.reconstruct(capture)
+    return reconstructed(capture, LCT, who="lct", **options)

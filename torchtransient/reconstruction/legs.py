@@ -11,7 +11,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction.confocal_operator import check_capture
+from torchtransient.reconstruction.capture_checks import checked_capture
 
 
 def subtract_legs(capture: Capture) -> Capture:
@@ -25,7 +25,7 @@ def subtract_legs(capture: Capture) -> Capture:
     Raises ShapeError for a capture without a transient or with phasors, whose phases would have to turn, and UnitError
     where nothing is left.
     """
-    transient, axis = check_capture(capture, "subtract_legs")
+    transient, axis = checked_capture(capture, "subtract_legs")
     if not capture.scan.first_and_last_leg:
         return capture
     if capture.phasor is not None:

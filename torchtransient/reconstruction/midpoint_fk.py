@@ -8,8 +8,7 @@ middle, only later: tau^2 = tau_0^2 + d^2. That is exact for what lies straight 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,23 +16,20 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.reconstruction.capture_checks import checked_axis, checked_scan, refuse_legs
 from torchtransient.reconstruction.capture_roots import stabilised_root
-from torchtransient.reconstruction.confocal_operator import (
-    check_capture,
-    checked_precision,
-    chunk_rows,
-    precision_of,
-)
+from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.fk import FK
-from torchtransient.reconstruction.linear import LinearOperator, each
+from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
+from torchtransient.reconstruction.transient_operator import TransientOperator, reconstructed
+from torchtransient.reconstruction.voxels import VoxelGrid
 
 
-class Midpoints(LinearOperator):
+class Midpoints(TransientOperator):
     """Confocal light at midpoints, and what pairs of spot and sensor point measure of it.
 
-    ``operator(confocal)``: (..., T, 2 Y, 2 X) on a grid of half the sensors' pitch (:attr:`grid`) to the scan's
+    ``operator(confocal)``: (..., T, 2 Y, 2 X) on a grid of half the sensors' pitch (:attr:`wall`) to the scan's
     (..., T, *scan.shape); ``operator.adjoint``: its adjoint, the mean over the pairs of each midpoint, moved to the
     time of a confocal pair by linear interpolation. Midpoints are rounded to the grid; those of one spot stand on it.
     Midpoints that no pair has are dark.
@@ -48,9 +44,8 @@ class Midpoints(LinearOperator):
     times: Tensor
 
     def __init__(self, scan: Scan, *, time_axis: TimeAxis, dtype: torch.dtype = torch.float32) -> None:
-        super().__init__()
-        sensors = _checked(scan, time_axis)
-        self.axis, self.dtype = time_axis, checked_precision(dtype, "MidpointFK")
+        sensors = _sensors(scan, time_axis, "MidpointFK")
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         rows, columns = sensors.size
         spots, points = (sensors.local(p).reshape(-1, 3) for p in (scan.laser_points, scan.sensor_points))
         pitch = torch.tensor([sensors.pitch[1], sensors.pitch[0], 1.0], dtype=torch.float64)
@@ -71,29 +66,24 @@ class Midpoints(LinearOperator):
         first = (
             sensors.first + float(phase[0]) * step[1] * sensors.along_x + float(phase[1]) * step[0] * sensors.along_y
         )
-        self.grid = PlanarScan(size, step, first, sensors.along_x, sensors.along_y, sensors.normal)
+        self.wall = PlanarScan(size, step, first, sensors.along_x, sensors.along_y, sensors.normal)
+        self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
         self._place = (index[..., 1] * size[1] + index[..., 0]).reshape(-1)
         self._distance_squared = (spots[:, None] - points).square().sum(-1).reshape(-1)
         self.data_shape, self.volume_shape = (time_axis.num_bins, *scan.shape), (time_axis.num_bins, *size)
-        self._set_tables("cpu")
+        self._set_tables()
 
-    def _set_tables(self, device: torch.device | str) -> None:
-        pairs = torch.bincount(self._place, minlength=math.prod(self.grid.size)).to(torch.float64)
-        tables = {
+    def tables(self) -> dict[str, Tensor]:
+        """Of each pair its ``place`` on the grid and ``distance_squared``, m^2; the ``share`` of a pair in the light of
+        each place; ``times`` (T,) of the bins.
+        """
+        pairs = torch.bincount(self._place, minlength=math.prod(self.wall.size)).to(torch.float64)
+        return {
+            "place": self._place,
             "distance_squared": self._distance_squared,
             "share": 1 / pairs.clamp_min(1),
             "times": self.axis.centers_opl,
         }
-        for name, table in tables.items():
-            self.register_buffer(name, table.to(device, self.dtype), persistent=False)
-        self.register_buffer("place", self._place.to(device), persistent=False)
-
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        if self.times.dtype != self.dtype:
-            self.dtype = checked_precision(self.times.dtype, "MidpointFK")
-            self._set_tables(self.times.device)
-        return self
 
     def map_(self, x: Tensor) -> Tensor:
         return each(self._spread, x, 3)
@@ -115,7 +105,7 @@ class Midpoints(LinearOperator):
     def _gather(self, measured: Tensor) -> Tensor:
         bins = self.axis.num_bins
         rows = torch.nn.functional.pad(measured.reshape(bins, -1).T, (1, 1))
-        out = measured.new_zeros(math.prod(self.grid.size), bins)
+        out = measured.new_zeros(math.prod(self.wall.size), bins)
         for first, last, low, high_share in self._pieces():
             piece = rows[first:last]
             light = torch.gather(piece, 1, low)
@@ -137,7 +127,7 @@ class Midpoints(LinearOperator):
             yield first, last, low.to(torch.int64), at - low
 
 
-class MidpointFK(LinearOperator):
+class MidpointFK(TransientOperator):
     """f-k migration for single and exhaustive captures of a flat wall, by way of their midpoints.
 
     ``operator(field)``: complex (..., Z, 2 Y, 2 X) on a grid of half the sensors' pitch to the wavefield of each pair,
@@ -150,6 +140,7 @@ class MidpointFK(LinearOperator):
     """
 
     real_volume = False
+    grid: VoxelGrid
 
     def __init__(
         self,
@@ -161,25 +152,16 @@ class MidpointFK(LinearOperator):
         taps: int = 4,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__()
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         self.midpoints = Midpoints(scan, time_axis=time_axis, dtype=dtype)
-        self.fk = FK(self.midpoints.grid, time_axis=time_axis, target=target, floor=floor, taps=taps, dtype=dtype)
-        self.scan, self.axis, self.dtype = scan, time_axis, dtype
+        self.fk = FK(self.midpoints.wall, time_axis=time_axis, target=target, floor=floor, taps=taps, dtype=dtype)
+        self.grid = self.fk.grid
         self.volume_shape, self.data_shape = self.fk.volume_shape, self.midpoints.data_shape
-
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.dtype = self.fk.dtype
-        return self
 
     @property
     def depths(self) -> Tensor:
         """(Z,) float64: distances of the planes from the wall, metres."""
-        return self.fk.depths
-
-    def points(self) -> Tensor:
-        """(Z, 2 Y, 2 X, 3) float64: the voxels in world coordinates, metres."""
-        return self.fk.points()
+        return self.grid.depths
 
     def map_(self, x: Tensor) -> Tensor:
         return self.midpoints.map_(self.fk.map_(x))
@@ -192,18 +174,10 @@ class MidpointFK(LinearOperator):
 
         Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
         """
-        data = transient
-        if isinstance(data, Capture):
-            if data.transient is None or data.axis != self.axis or data.scan != self.scan or data.polarized:
-                raise ShapeError(
-                    f"MidpointFK: expected a capture of intensities by {self.scan!r} with {self.axis}, got one by "
-                    f"{data.scan!r} with {data.axis}. Make an operator for it."
-                )
-            data = data.transient
-        data = self._taken("transient", data, self.data_shape, real=True)
+        data = self.transients(transient)
         psi = self.midpoints.adjoint(stabilised_root(data, self.fk.floor))
         if self.fk.target == "diffuse":
-            psi = psi * self.depths.to(psi)[:, None, None]
+            psi = psi * self.grid.depths.to(psi)[:, None, None]
         field = self.fk.adjoint(psi)
         return field.real.square() + field.imag.square()
 
@@ -213,25 +187,14 @@ def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
 
     ``options``: of :class:`MidpointFK`. Raises as it does.
     """
-    transient, axis = check_capture(capture, "midpoint_fk")
-    options.setdefault("dtype", precision_of(capture))
-    operator: MidpointFK = MidpointFK(capture.scan, time_axis=axis, **options).to(transient.device)
-    return operator.reconstruct(capture)
+    return reconstructed(capture, MidpointFK, who="midpoint_fk", **options)
 
 
-def _checked(scan: Scan, time_axis: TimeAxis) -> PlanarScan:
+def _sensors(scan: Scan, time_axis: TimeAxis, who: str) -> PlanarScan:
     """The sensors' grid of a scan. Raises ShapeError, UnitError."""
-    if not isinstance(scan, Scan):
-        raise ShapeError(f"MidpointFK: expected a tt.nlos.Scan, got {shown(scan)}.")
-    if not isinstance(time_axis, TimeAxis):
-        raise ShapeError(f"MidpointFK: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
-    if scan.kind == "confocal":
-        raise ShapeError("MidpointFK: expected a single or exhaustive scan, got a confocal one. Use FK.")
-    if scan.first_and_last_leg:
-        raise ShapeError(
-            "MidpointFK: expected lengths from the spot to the sensor point, got a scan that counts the first and last "
-            "leg too. Take the capture that subtract_legs(capture) gives, with its scan and axis."
-        )
-    if time_axis.start_opl < 0:
-        raise UnitError(f"MidpointFK: expected a time axis from zero on, got {time_axis}. Crop the capture.")
-    return PlanarScan.of_scan(scan, "MidpointFK")
+    if checked_scan(scan, who).kind == "confocal":
+        raise ShapeError(f"{who}: expected a single or exhaustive scan, got a confocal one. Use FK.")
+    refuse_legs(scan, who)
+    if checked_axis(time_axis, who).start_opl < 0:
+        raise UnitError(f"{who}: expected a time axis from zero on, got {time_axis}. Crop the capture.")
+    return PlanarScan.of_scan(scan, who)

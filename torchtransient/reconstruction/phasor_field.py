@@ -17,7 +17,8 @@ from torchtransient.reconstruction.cameras import Camera, DirectLight, Transient
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
 from torchtransient.reconstruction.plane_waves import good_length, phase_pairs, waves
-from torchtransient.reconstruction.scan_operator import ScanOperator, checked_capture
+from torchtransient.reconstruction.scan_operator import ScanOperator
+from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 # Complex numbers of spectra that are worked on at once.
@@ -27,15 +28,13 @@ BAND = 4.0
 
 
 def phasor_image(
-    capture: Capture, grid: VoxelGrid, *, pulse: PhasorFilter, camera: Camera | None = None, falloff: float = 0.0
+    capture: Capture, points: VoxelGrid, *, pulse: PhasorFilter, camera: Camera | None = None, falloff: float = 0.0
 ) -> Tensor:
     """:meth:`PhasorField.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the device of its
     transient. Raises as the class.
     """
-    axis, dtype = checked_capture(capture, "phasor_image")
-    assert capture.transient is not None  # a capture without one has been refused
-    operator = PhasorField(capture.scan, grid, time_axis=axis, pulse=pulse, camera=camera, falloff=falloff, dtype=dtype)
-    return operator.to(capture.transient.device).reconstruct(capture)
+    options = {"pulse": pulse, "camera": camera, "falloff": falloff}
+    return reconstructed(capture, PhasorField, points, who="phasor_image", **options)
 
 
 class PhasorField(ScanOperator):
@@ -49,7 +48,7 @@ class PhasorField(ScanOperator):
     :class:`TransientCamera`, whose fields are videos (..., N, Z, Y, X).
 
     Scans: confocal, single, and exhaustive with any laser spots, all sensor points on a flat, regular grid, with or
-    without first and last legs. ``grid``: planes parallel to the wall with the pitch of the sensor grid, as
+    without first and last legs. ``points``: planes parallel to the wall with the pitch of the sensor grid, as
     ``VoxelGrid.before(scan, depths)`` makes them; size and place of the planes are free, `at_depths` and larger
     ``size`` and ``extent`` of the same pitch too. The convolution is linear: nothing wraps around, neither in space nor
     in time.
@@ -63,7 +62,7 @@ class PhasorField(ScanOperator):
     def __init__(
         self,
         scan: Scan,
-        grid: VoxelGrid,
+        points: VoxelGrid,
         *,
         time_axis: TimeAxis,
         pulse: PhasorFilter,
@@ -71,11 +70,12 @@ class PhasorField(ScanOperator):
         falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if not isinstance(grid, VoxelGrid):
+        if not isinstance(points, VoxelGrid):
             raise ShapeError(
-                f"PhasorField: expected planes as a VoxelGrid, got {shown(grid)}. FilteredBackprojection takes points."
+                f"PhasorField: expected planes as a VoxelGrid, got {shown(points)}. Make them with VoxelGrid.before; "
+                "FilteredBackprojection takes points."
             )
-        super().__init__(scan, grid, time_axis, dtype)
+        super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         if not isinstance(pulse, PhasorFilter):
             raise ShapeError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
         check_sampling(pulse.wavelength, time_axis.bin_width_opl, "PhasorField")
@@ -90,22 +90,23 @@ class PhasorField(ScanOperator):
                 "Choose a spot of an exhaustive capture with capture.single(index)."
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
-        self.planes, self.real_volume = grid, False
+        self.real_volume = False
         self.wall = PlanarScan.of_scan(scan, "PhasorField")
         self._check_planes()
         self.lasers = self.wall.local(scan.laser_points).reshape(-1, 3)
         if self.camera.times is not None:
             self.volume_shape = (len(self.camera.times), *self.volume_shape)
         self.frequencies, self.band_weights = self._band()
-        self.shape_fft = tuple(good_length(s + v - 1) for s, v in zip(self.wall.size, grid.size, strict=True))
+        self.shape_fft = tuple(good_length(s + v - 1) for s, v in zip(self.wall.size, points.size, strict=True))
         self._set_tables()
 
+    grid: VoxelGrid
     dft: Tensor
     legs: Tensor
     moments: Tensor
 
     def _check_planes(self) -> None:
-        grid, wall = self.planes, self.wall
+        grid, wall = self.grid, self.wall
         parallel = all(float(a @ b) > 1 - 1e-6 for a, b in ((grid.along_x, wall.along_x), (grid.along_y, wall.along_y)))
         same = all(abs(a - b) * n <= OFF_GRID * b for a, b, n in zip(grid.pitch, wall.pitch, grid.size, strict=True))
         if not (parallel and same):
@@ -147,8 +148,8 @@ class PhasorField(ScanOperator):
 
     def _lengths(self) -> tuple[float, float]:
         """Lengths that are looked at, without legs: none is shorter or longer."""
-        rows, columns = self.planes.size
-        dy, dx = self.planes.pitch
+        rows, columns = self.grid.size
+        dy, dx = self.grid.pitch
         corners = torch.tensor(
             [
                 [float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h]
@@ -197,7 +198,7 @@ class PhasorField(ScanOperator):
     def adjoint_(self, y: Tensor) -> Tensor:
         spots, (rows, columns) = self._spots, self.wall.size
         data = y.reshape(-1, self.axis.num_bins, spots, rows * columns)
-        frames, (height, width) = len(self.moments), self.planes.size
+        frames, (height, width) = len(self.moments), self.grid.size
         out = torch.zeros(
             len(data), frames, len(self.heights), height, width, dtype=self.dtype.to_complex(), device=y.device
         )
@@ -219,7 +220,7 @@ class PhasorField(ScanOperator):
 
     def map_(self, x: Tensor) -> Tensor:
         spots, (rows, columns) = self._spots, self.wall.size
-        frames, (height, width) = len(self.moments), self.planes.size
+        frames, (height, width) = len(self.moments), self.grid.size
         field = x.reshape(-1, frames, len(self.heights), height, width)
         out = torch.zeros(len(field), self.axis.num_bins, spots, rows * columns, dtype=self.dtype, device=x.device)
         for band, some in self._chunks(len(field), x.device):
@@ -287,7 +288,7 @@ class PhasorField(ScanOperator):
         """Of each plane the transform (F, Y, X) of waves from a sensor point to voxels at every displacement."""
         confocal = self.scan.kind == "confocal"
         along = []
-        for axis, (voxels, pitch) in enumerate(zip(self.planes.size, self.wall.pitch, strict=True)):
+        for axis, (voxels, pitch) in enumerate(zip(self.grid.size, self.wall.pitch, strict=True)):
             places = torch.arange(self.shape_fft[axis], dtype=torch.float64, device=device)
             # Displacements that are negative stand at the end.
             places = torch.where(places < voxels, places, places - self.shape_fft[axis])
@@ -306,7 +307,7 @@ class PhasorField(ScanOperator):
             return None
         spots = self.lasers[some].to(device)
         sides = []
-        for axis, (voxels, pitch) in enumerate(zip(self.planes.size, self.wall.pitch, strict=True)):
+        for axis, (voxels, pitch) in enumerate(zip(self.grid.size, self.wall.pitch, strict=True)):
             places = torch.arange(voxels, dtype=torch.float64, device=device) * pitch + float(self.corner[1 - axis])
             sides.append((places - spots[:, 1 - axis, None]).square())
         height = (float(self.heights[plane]) - spots[:, 2]).square()

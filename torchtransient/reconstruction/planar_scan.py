@@ -16,7 +16,7 @@ from torchtransient.quantities import shown
 OFF_GRID = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlanarScan:
     """``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
     ``first``; ``normal`` points to the hidden side. Vectors are (3,) float64 on the CPU.
@@ -50,7 +50,10 @@ class PlanarScan:
                 f"{who}: expected {what} on a regular, rectangular grid of a flat wall, got some {off:.3g} m off it "
                 f"(pitch {dy:.3g} x {dx:.3g} m, angle {_angle(x, y)}). Use Backprojection, which takes any points."
             )
-        along_x, along_y = x / dx, y / dy
+        along_x = x / dx
+        # At right angles to rounding, where the points are to a share of their pitch.
+        along_y = y - (y @ along_x) * along_x
+        along_y = along_y / along_y.norm()
         normal = torch.linalg.cross(along_x, along_y)
         if normals is not None:
             mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
@@ -64,12 +67,23 @@ class PlanarScan:
             raise ShapeError(f"{who}: expected a tt.nlos.Scan, got {shown(scan)}.")
         return PlanarScan.of(scan.sensor_points, scan.sensor_normals, who=who)
 
-    def points(self, depths: Tensor) -> Tensor:
-        """The points (Z, Y, X, 3) at ``depths`` (Z,) metres before the wall, behind each point of the grid, float64."""
+    @property
+    def points(self) -> Tensor:
+        """(Y, X, 3) float64 on the CPU: its points in world coordinates, metres."""
         rows, columns = (torch.arange(n, dtype=torch.float64) for n in self.size)
         wall = self.first + (rows[:, None, None] * self.pitch[0]) * self.along_y
-        wall = wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
-        return wall + depths.to("cpu", torch.float64)[:, None, None, None] * self.normal
+        return wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
+
+    def matches(self, other: PlanarScan) -> bool:
+        """Whether it is the same grid with the same hidden side, to what points of a grid may be off it."""
+        if self.size != other.size or float(self.normal @ other.normal) <= 0:
+            return False
+        off = float((self.points - other.points).norm(dim=-1).max())
+        return off <= OFF_GRID * min(*self.pitch, *other.pitch)
+
+    def __repr__(self) -> str:
+        (rows, columns), (dy, dx) = self.size, self.pitch
+        return f"PlanarScan({columns} x {rows} points, {dx:.4g} x {dy:.4g} m apart)"
 
     def local(self, points: Tensor) -> Tensor:
         """Coordinates (..., 3) along x, y and the normal, from the first point, metres, float64."""

@@ -22,7 +22,7 @@ class VoxelGrid:
 
     Voxel (k, j, i) stands at ``first + j pitch[0] along_y + i pitch[1] along_x + depths[k] normal``. ``size``: (Y, X)
     voxels of a plane, ``pitch``: (dy, dx) between them. ``depths`` increase, not necessarily evenly. Make one with
-    :meth:`before` or :meth:`bounds`. Raises ShapeError and UnitError for what is no such grid.
+    :meth:`before`, :meth:`bounds` or :meth:`of_wall`. Raises ShapeError and UnitError for what is no such grid.
     """
 
     depths: Tensor
@@ -79,7 +79,7 @@ class VoxelGrid:
         depths = _depths(depths, "VoxelGrid.before")
         if size is None and extent is None:
             wall = PlanarScan.of_scan(scan, "VoxelGrid.before without size and extent")
-            return cls(depths, wall.size, wall.pitch, wall.first, wall.along_x, wall.along_y, wall.normal)
+            return cls.of_wall(wall, depths)
         points = scan.sensor_points.detach().to("cpu", torch.float64)
         along_x, along_y, normal = _wall_axes(scan, points)
         shape = _pair("VoxelGrid.before: size", size) if size is not None else tuple(reversed(points.shape[:-1]))
@@ -103,6 +103,11 @@ class VoxelGrid:
             + (flat.mean(0) @ normal) * normal
         )
         return cls(depths, (rows, columns), (dy, dx), first, along_x, along_y, normal)
+
+    @classmethod
+    def of_wall(cls, wall: PlanarScan, depths: Any) -> VoxelGrid:
+        """A voxel before each point of a regular grid, at each of ``depths`` (Z,) metres. Raises as the class."""
+        return cls(depths, wall.size, wall.pitch, wall.first, wall.along_x, wall.along_y, wall.normal)
 
     @classmethod
     def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
