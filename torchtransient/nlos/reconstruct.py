@@ -213,7 +213,7 @@ def _on_own_grid(
     assert axis is not None and transient is not None
     dim = transient.ndim - len(capture.scan.shape) - 2
     wall = (
-        Midpoints(capture.scan, time_axis=axis).grid
+        Midpoints(capture.scan, time_axis=axis).wall
         if name == "midpoint-fk"
         else PlanarScan.of_scan(capture.scan, "reconstruct")
     )
@@ -230,7 +230,7 @@ def _on_own_grid(
             one = replace(capture, transient=transient.narrow(dim, channel, 1), steady=None, channels=())
             found.append(function(one, **options).index_select(-3, kept.to(transient.device)))
             bar.update()
-    grid = VoxelGrid(z[kept], wall.size, wall.pitch, wall.first, wall.along_x, wall.along_y, wall.normal)
+    grid = VoxelGrid.of_wall(wall, z[kept])
     together = torch.cat(found, dim)
     return (together.norm(dim=-4), together, grid) if name == "directional-lct" else (together, None, grid)
 
