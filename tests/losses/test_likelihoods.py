@@ -13,8 +13,10 @@ from torchtransient.losses import (
     FreeRunningNLL,
     PoissonNLL,
     ReadNoiseNLL,
+    first_photon_loss,
     first_photon_nll,
     free_running_nll,
+    poisson_loss,
     poisson_nll,
     read_noise_nll,
 )
@@ -208,3 +210,49 @@ def test_fit_by_likelihood_beats_the_raw_histogram():
         optimiser.step(closure)
     assert float(position.detach()) == pytest.approx(11.3, abs=0.1)
     assert float((n * t).sum() / n.sum()) < 10.0
+
+
+# name, loss(counts, rates, mask): all four, also the two with the model first
+MASKED = {
+    "poisson": lambda n, r, **k: poisson_nll(n, r, **k),
+    "poisson, constant": lambda n, r, **k: poisson_nll(n, r, constant=True, **k),
+    "first photon": lambda n, r, **k: first_photon_nll(n, r, CYCLES, **k),
+    "free running": lambda n, r, **k: free_running_nll(n, r, 50_000, 7.5, **k),
+    "read noise": lambda n, r, **k: read_noise_nll(n, r, 2.0, **k),
+}
+
+
+@pytest.mark.parametrize("loss", MASKED.values(), ids=MASKED.keys())
+def test_masked_pixels_are_not_looked_at(loss):
+    """Dead pixels (NaN), hot ones (more counts than cycles) and models that mean nothing there, as if absent."""
+    r = rates().expand(2, 1, BINS, 2, 3) * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    n = torch.poisson(50 * r, generator=seeded(7))
+    wanted = loss(n[..., 1:], r[..., 1:])
+    n[..., 0], r = float("nan"), r.clone()
+    n[1, ..., 0] = 1e9
+    r[..., 0] = -1.0
+    mask = torch.tensor([False, True, True])
+    r.requires_grad_()
+    value = loss(n, r, mask=mask)
+    torch.testing.assert_close(value, wanted)
+    value.backward()
+    assert bool(torch.isfinite(r.grad).all()) and bool((r.grad[..., 0] == 0).all())
+    assert bool((loss(n, r, mask=mask, reduction="none")[..., 0] == 0).all())
+
+
+def test_masked_bins_still_take_cycles():
+    """The window of a first-photon histogram: what came before it stays detected."""
+    r, mask = rates(3.0), torch.zeros(BINS, 1, 1, dtype=torch.bool)
+    mask[10:] = True
+    n = SynchronousSPAD(CYCLES).sample(r, seeded(8))
+    each = first_photon_nll(n, r, CYCLES, floor=0.0, reduction="none")
+    torch.testing.assert_close(first_photon_nll(n, r, CYCLES, floor=0.0, mask=mask), each[:, 10:].mean())
+    alone = first_photon_nll(n[:, 10:], r[:, 10:], CYCLES, floor=0.0)
+    assert abs(float(alone) - float(each[:, 10:].mean())) > 0.1
+
+
+def test_model_first():
+    n, r = torch.poisson(50 * rates(), generator=seeded(7)), rates()
+    torch.testing.assert_close(poisson_loss(r, n, floor=1e-3), poisson_nll(n, r, floor=1e-3), rtol=0, atol=0)
+    found = first_photon_loss(r, n, CYCLES, dead_bins=4.5)
+    torch.testing.assert_close(found, first_photon_nll(n, r, CYCLES, dead_bins=4.5), rtol=0, atol=0)

@@ -13,6 +13,11 @@ import pytest
 import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported; child processes inherit what it found)
 
 
+@pytest.fixture(name="peer_python")
+def _peer_python():
+    return peer_python()
+
+
 def peer_python():
     """The interpreter that has mitransient: the one that is named, or this one."""
     named = os.environ.get("TORCHTRANSIENT_PEER_PYTHON")

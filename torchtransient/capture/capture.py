@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.files import reader, writer
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.quantities import finite, flag, shown
@@ -119,6 +121,18 @@ class Capture(TensorRecord):
 
     def _shown_notes(self) -> dict[str, str]:
         return {"metadata": ", ".join(self.metadata)} if self.metadata else {}
+
+    # ------------------------------------------------------------------------------------------------------- on disk
+
+    @classmethod
+    def read(cls, path: str | Path, format: str | None = None, **said: Any) -> Capture:
+        """Read a capture of any known layout: `tt.nlos.read_capture`, with its arguments and errors."""
+        capture: Capture = reader()(path, format, **said)
+        return capture
+
+    def write(self, path: str | Path, format: str = "torchtransient") -> Path:
+        """Write it in a layout, the library's own or another: `tt.nlos.write_capture`, with its errors."""
+        return writer()(path, self, format=format)
 
     # -------------------------------------------------------------------------------------------------- measurements
 

@@ -25,6 +25,7 @@ COMMANDS = {
     "video": "Write the light in flight of a result as .mp4 or .gif.",
     "picture": "Draw a result: peak time, rainbow, streak, frames, polarization, ...",
     "nlos": "Simulate a capture around a corner, going on where it was stopped.",
+    "reconstruct": "Find what a capture around a corner has seen, and draw it.",
     "cost": "Measure what accuracy costs in time on a scene.",
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 from torchtransient.render.films.choices import all_films
 
 _WORDS = {
@@ -25,5 +28,26 @@ def in_options(message: str) -> str:
             flags = ", ".join(f"--{option.name.replace('_', '-')}" for option in kind.options)
             message = message.replace(f"Give {kind.example}", f"Give {flags}")
     for python, option in _WORDS.items():
+        message = message.replace(python, option)
+    return message
+
+
+# Calls and classes of reconstruction, after arguments have become options.
+_RECONSTRUCTION = {
+    " to read_capture": "",
+    "reconstruct: ": "",
+    "method '": "--method '",
+    "Use VoxelGrid.bounds, or VoxelGrid with axes of its own.": "Give --bounds and --voxels.",
+    "Use Backprojection, which takes any points.": "Take --method bp or fbp.",
+    "expected size= for a list of points": "expected --voxels for a list of points",
+    "Crop the capture.": "Give --record.",
+}
+
+
+def arguments_as_options(message: str, names: Sequence[str]) -> str:
+    """The message with ``name=`` as ``--name`` for these arguments, and without calls of reconstruction."""
+    for name in names:
+        message = re.sub(rf"\b{name}=", f"--{name.replace('_', '-')}", message)
+    for python, option in _RECONSTRUCTION.items():
         message = message.replace(python, option)
     return message

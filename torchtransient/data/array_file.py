@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import os
 import secrets
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.data.hdf5_limits import read_attributes, read_dataset
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
@@ -25,7 +29,10 @@ HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
 _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
-_DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
+_DAMAGED = (
+    OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, RuntimeError, AttributeError, IndexError,
+    ArithmeticError, zlib.error, struct.error, tokenize.TokenError, SyntaxError,
+)  # fmt: skip
 
 
 def path_of(path: Any, what: str) -> Path:
@@ -46,7 +53,7 @@ def check_target(path: str | Path, what: str) -> Path:
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{target}'.")
     check_folder(target, what)
     if target.suffix.lower() in HDF5:
-        _h5py(what)
+        hdf5_package(what)
     return target
 
 
@@ -65,7 +72,7 @@ def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapp
     """Write a file that was checked. One that is there is replaced once the new one is complete. Raises StorageError
     for a full disk.
     """
-    with _replacing(target, what) as unfinished:
+    with replacing(target, what) as unfinished:
         if target.suffix.lower() in HDF5:
             _write_hdf5(unfinished, arrays, entries, what)
             return
@@ -94,15 +101,17 @@ def read_arrays(path: str | Path, form: str, what: str) -> dict[str, Any]:
 
 
 @contextmanager
-def damage_said(source: Path, what: str) -> Iterator[None]:
-    """Errors of readers, and of what is made of what they read, as StorageError."""
+def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
+    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected."""
     try:
         yield
+    except MemoryError as error:
+        raise StorageError(f"{what}: '{source}' does not fit into memory, or is damaged.") from error
     except _DAMAGED as error:
         if isinstance(error, StorageError):
             raise
-        kind = what.removesuffix(" file")
-        raise StorageError(f"{what}: '{source}' is not a {kind} of torchtransient, or is damaged: {error}.") from error
+        kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {error}.") from error
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
@@ -116,7 +125,7 @@ def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
 
 
 @contextmanager
-def _replacing(target: Path, what: str) -> Iterator[Path]:
+def replacing(target: Path, what: str) -> Iterator[Path]:
     """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails."""
     unfinished = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
     try:
@@ -129,7 +138,7 @@ def _replacing(target: Path, what: str) -> Iterator[Path]:
 
 
 def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
-    with _h5py(what).File(path, "w") as file:
+    with hdf5_package(what).File(path, "w") as file:
         for name, value in entries.items():
             file.attrs[name] = value
         for name, array in arrays.items():
@@ -150,8 +159,8 @@ def _parts(array: NDArray[Any]) -> Iterator[Any]:
 
 
 def _read_hdf5(path: Path, what: str) -> dict[str, Any]:
-    with _h5py(what).File(path, "r") as file:
-        return {**{name: file[name][()] for name in file}, **dict(file.attrs)}
+    with hdf5_package(what).File(path, "r") as file:
+        return {**{name: read_dataset(file, name, what) for name in file}, **read_attributes(file, what)}
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
@@ -159,7 +168,8 @@ def _read_npz(path: Path) -> dict[str, Any]:
         return {name: file[name] for name in file.files}
 
 
-def _h5py(what: str) -> Any:
+def hdf5_package(what: str) -> Any:
+    """The module h5py. Raises StorageError where it is missing."""
     try:
         import h5py
     except ImportError as error:

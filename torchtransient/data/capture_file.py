@@ -25,14 +25,13 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.data import array_file
 from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.data.plain_data import plain, restored
 from torchtransient.errors import StorageError
 
 FORMAT = "torchtransient capture 1"
 _WHAT = "capture file"
 _MEASURED = ("transient", "phasor", "steady")
 _POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
-# Keys of JSON objects that stand for what JSON does not have.
-_ARRAY, _TUPLE = "__array__", "__tuple__"
 
 
 def check_capture_target(path: str | Path) -> Path:
@@ -72,7 +71,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
         entries["phasor_start_opl"] = capture.frequencies.start_opl
     if scan.wall is not None:
         parts: list[NDArray[Any]] = []
-        entries["wall"] = json.dumps(_plain(scan.wall, parts, "wall"))
+        entries["wall"] = json.dumps(plain(scan.wall, parts, "wall"))
         arrays |= {f"wall_{number}": part for number, part in enumerate(parts)}
     write_arrays(target, arrays, entries, _WHAT)
     return target
@@ -98,7 +97,7 @@ def _capture(values: Mapping[str, Any]) -> Capture:
     if "frequencies_per_metre" in values:
         found = tuple(np.asarray(values["frequencies_per_metre"]).tolist())
         frequencies = FrequencyAxis(found, float(values["phasor_start_opl"]))
-    wall = _restored(json.loads(str(values["wall"])), values) if "wall" in values else None
+    wall = restored(json.loads(str(values["wall"])), values) if "wall" in values else None
     points = {name: tensor(name) for name in _POINTS}
     scan = Scan(str(values["kind"]), **points, first_and_last_leg=bool(values["first_and_last_leg"]), wall=wall)  # type: ignore[arg-type]
     return Capture(
@@ -106,41 +105,3 @@ def _capture(values: Mapping[str, Any]) -> Capture:
         phasor=tensor("phasor"), frequencies=frequencies, steady=tensor("steady"),
         channels=tuple(json.loads(str(values["channels"]))), polarized=bool(values["polarized"]),
     )  # fmt: skip
-
-
-# -------------------------------------------------------------------------------------------------------------- walls
-
-
-def _plain(value: Any, parts: list[NDArray[Any]], where: str) -> Any:
-    """What JSON can hold; arrays are put into `parts` and numbered."""
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Mapping):
-        return {str(name): _plain(entry, parts, f"{where}.{name}") for name, entry in value.items()}
-    if isinstance(value, tuple):
-        return {_TUPLE: [_plain(entry, parts, where) for entry in value]}
-    if isinstance(value, list):
-        return [_plain(entry, parts, where) for entry in value]
-    if isinstance(value, torch.Tensor):
-        value = array_of(value, _WHAT)
-    # Transforms of Mitsuba keep their numbers in `matrix`.
-    array = np.asarray(getattr(value, "matrix", value))
-    if array.dtype.kind not in "biufc":
-        raise StorageError(
-            f"capture file: {where} is a {type(value).__name__}, which no file can hold; expected numbers, texts, "
-            "lists, dictionaries and arrays. Write the capture with a scan whose wall is None or of plain data."
-        )
-    parts.append(array)
-    return {_ARRAY: f"wall_{len(parts) - 1}"}
-
-
-def _restored(value: Any, values: Mapping[str, Any]) -> Any:
-    if isinstance(value, dict):
-        if set(value) == {_ARRAY}:
-            return np.asarray(values[value[_ARRAY]])
-        if set(value) == {_TUPLE}:
-            return tuple(_restored(entry, values) for entry in value[_TUPLE])
-        return {name: _restored(entry, values) for name, entry in value.items()}
-    return [_restored(entry, values) for entry in value] if isinstance(value, list) else value

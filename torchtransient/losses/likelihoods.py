@@ -4,22 +4,24 @@ All take rates or means (..., C, T, H, W) and measurements of the same shape, an
 zero counts and in empty bins. Where the model says "impossible" (a count where the mean is 0) a floor keeps them so:
 `floor`, in the unit of the mean, is added to it. Counts below 0 (those of a normal surrogate) enter the same formulas,
 which keeps the gradient unbiased. Terms that do not depend on the mean are left out unless `constant`.
-Half precision is computed, and the loss returned, in float32.
+Half precision is computed, and the loss returned, in float32. `mask`: truth values that broadcast to the tensors, True
+counts (`comparison.py`). First-photon and free-running detectors are dead for some time after every detection: a bin
+that does not count still takes cycles from those behind it, only pixels without any bin that counts are not looked at.
+`poisson_loss(input, target)` and `first_photon_loss` are the same with the model first, as torch and the other losses.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses.comparison import Reduction, check_mask, counted, item_mean
+from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.spad import first_photon_log_prob
-
-Reduction = Literal["none", "sum", "mean"]
 
 _TIME = -3
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
@@ -37,19 +39,10 @@ def _check(measured: Tensor, model: Tensor, where: str) -> None:
         raise UnitError(f"{where}: expected a floating dtype, got {model.dtype}.")
 
 
-def _check_counts(counts: Tensor, model: Tensor, where: str) -> None:
-    """As `_check`, and rates cannot be negative. NaN in either passes and is what comes out."""
-    _check(counts, model, where)
+def _check_rates(model: Tensor, where: str) -> None:
+    """Rates cannot be negative. NaN passes and is what comes out."""
     if bool((model.detach() < 0).any()):
         raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
-
-
-def _reduce(value: Tensor, reduction: Reduction, where: str) -> Tensor:
-    if reduction not in get_args(Reduction):
-        raise ShapeError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {reduction!r}.")
-    if reduction == "none":
-        return value
-    return value.sum() if reduction == "sum" else value.mean()
 
 
 def _single(model: Tensor) -> Tensor:
@@ -57,15 +50,23 @@ def _single(model: Tensor) -> Tensor:
     return model.float() if model.dtype in (torch.float16, torch.bfloat16) else model
 
 
-def relative_floor(model: Tensor, share: float = _RELATIVE_FLOOR) -> Tensor:
+def _counted_pixels(x: Tensor, mask: Tensor | None) -> Tensor:
+    """`x`, and 0 in pixels of which no bin counts."""
+    return x if mask is None else counted(x, mask.any(_TIME, keepdim=True))
+
+
+def relative_floor(model: Tensor, share: float = _RELATIVE_FLOOR, mask: Tensor | None = None) -> Tensor:
     """`share` of the mean of each item (its C, T, H, W) of the model, without gradient: a floor that knows the scale.
 
     Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one; an
-    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite.
+    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite. `mask`:
+    means are over what counts.
     """
-    size = model.detach().abs()
-    whole = size.mean() if size.numel() else size.sum()
-    item = size.mean((-4, -3, -2, -1), keepdim=True) if size.ndim > 4 else whole
+    mask = check_mask(mask, model.shape, "relative_floor")
+    size = counted(model.detach(), mask).abs()
+    number = max(1, size.numel()) if mask is None else mask.sum().clamp_min(1)
+    whole = size.sum() / number
+    item = item_mean(model, mask) if size.ndim > 4 else whole
     return (share * torch.where(item > 0, item, whole)).clamp_min(torch.finfo(model.dtype).tiny)
 
 
@@ -75,6 +76,7 @@ def poisson_nll(
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
+    mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """-log of the Poisson probability of `counts`: m - n log m (+ log n! with `constant`), m = mean + floor.
@@ -83,16 +85,18 @@ def poisson_nll(
     likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. Raises
     ShapeError for different shapes, UnitError for negative means.
     """
-    _check_counts(counts, mean, "poisson_nll")
-    mean = _single(mean)
-    m = mean + (relative_floor(mean) if floor is None else floor)
+    _check(counts, mean, "poisson_nll")
+    mask = check_mask(mask, mean.shape, "poisson_nll")
+    counts, mean = counted(counts, mask), counted(_single(mean), mask, 1.0)
+    _check_rates(mean, "poisson_nll")
+    m = mean + (relative_floor(mean, mask=mask) if floor is None else floor)
     hit = counts != 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(hit, m, torch.ones_like(m)).log()
     value = m - torch.where(hit, counts * log_mean, torch.zeros_like(m))
     if constant:
         value = value + torch.lgamma(counts + 1)
-    return _reduce(value, reduction, "poisson_nll")
+    return _reduce(value, reduction, "poisson_nll", mask)
 
 
 def first_photon_nll(
@@ -103,6 +107,7 @@ def first_photon_nll(
     dead_bins: float | None = None,
     floor: Tensor | float | None = None,
     constant: bool = False,
+    mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """-log-likelihood of a synchronous SPAD's histogram: binomial in each bin given the cycles still armed.
@@ -112,11 +117,13 @@ def first_photon_nll(
     dead; `dead_bins`: several detections per cycle (`SynchronousSPAD`). `floor` as in `poisson_nll`. Raises ShapeError;
     UnitError for negative rates or more counts than cycles.
     """
-    _check_counts(counts, rate, "first_photon_nll")
-    rate = _single(rate)
-    r = rate + (relative_floor(rate) if floor is None else floor)
+    _check(counts, rate, "first_photon_nll")
+    mask = check_mask(mask, rate.shape, "first_photon_nll")
+    counts, rate = _counted_pixels(counts, mask), counted(_single(rate), mask, 1.0)
+    _check_rates(rate, "first_photon_nll")
+    r = rate + (relative_floor(rate, mask=mask) if floor is None else floor)
     value = -first_photon_log_prob(counts, r, cycles, dead_bins, constant=constant)
-    return _reduce(value, reduction, "first_photon_nll")
+    return _reduce(value, reduction, "first_photon_nll", mask)
 
 
 def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
@@ -149,6 +156,7 @@ def free_running_nll(
     dead_bins: float,
     *,
     floor: Tensor | float | None = None,
+    mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """-log-likelihood of a free-running SPAD's histogram with non-paralyzable dead time, up to a constant.
@@ -158,9 +166,11 @@ def free_running_nll(
     best rate, r = n/armed, is second order in the counts of a bin per period. Its least is where Rapp et al. and Gupta
     et al. (see `sensing.free_running`) put it. Arguments as in `first_photon_nll`.
     """
-    _check_counts(counts, rate, "free_running_nll")
-    rate = _single(rate)
-    n = counts.to(torch.float64)
+    _check(counts, rate, "free_running_nll")
+    mask = check_mask(mask, rate.shape, "free_running_nll")
+    rate = counted(_single(rate), mask, 1.0)
+    _check_rates(rate, "free_running_nll")
+    n = _counted_pixels(counts, mask).to(torch.float64)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the places inside a bin leave an uncertainty of about the square root of the counts
     if bool((armed < -(2 + 6 * n.sum(_TIME, keepdim=True).sqrt())).any()):
@@ -168,10 +178,10 @@ def free_running_nll(
             f"free_running_nll: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
             "got more. Check periods and dead time."
         )
-    r = (rate + (relative_floor(rate) if floor is None else floor)).to(torch.float64)
+    r = (rate + (relative_floor(rate, mask=mask) if floor is None else floor)).to(torch.float64)
     hit = n != 0
     value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
-    return _reduce(value.to(rate.dtype), reduction, "free_running_nll")
+    return _reduce(value.to(rate.dtype), reduction, "free_running_nll", mask)
 
 
 def read_noise_nll(
@@ -181,6 +191,7 @@ def read_noise_nll(
     *,
     shot_noise: bool = True,
     constant: bool = True,
+    mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """-log-likelihood of a normal distribution: read noise, and the normal approximation of shot noise.
@@ -189,7 +200,8 @@ def read_noise_nll(
     electrons. `read_noise` > 0, a number or a tensor that broadcasts; differentiable in it and in `mean`.
     """
     _check(measured, mean, "read_noise_nll")
-    measured, mean = _single(measured), _single(mean)
+    mask = check_mask(mask, mean.shape, "read_noise_nll")
+    measured, mean = counted(_single(measured), mask), counted(_single(mean), mask)
     sigma = torch.as_tensor(read_noise, device=mean.device).to(mean.dtype)
     if not bool((sigma.detach() > 0).all()):
         raise UnitError("read_noise_nll: expected read_noise > 0 electrons: without it an empty pixel has no width.")
@@ -197,7 +209,33 @@ def read_noise_nll(
     value = (measured - mean) ** 2 / (2 * variance) + 0.5 * variance.log()
     if constant:
         value = value + 0.5 * math.log(2 * math.pi)
-    return _reduce(value, reduction, "read_noise_nll")
+    return _reduce(value, reduction, "read_noise_nll", mask)
+
+
+def poisson_loss(
+    input: Tensor,
+    target: Tensor,
+    *,
+    floor: Tensor | float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts."""
+    return poisson_nll(target, input, floor=floor, mask=mask, reduction=reduction)
+
+
+def first_photon_loss(
+    input: Tensor,
+    target: Tensor,
+    cycles: int,
+    *,
+    dead_bins: float | None = None,
+    floor: Tensor | float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`first_photon_nll(target, input, cycles)`: a model's rates per cycle and bin against a histogram of counts."""
+    return first_photon_nll(target, input, cycles, dead_bins=dead_bins, floor=floor, mask=mask, reduction=reduction)
 
 
 class PoissonNLL(nn.Module):
@@ -207,8 +245,8 @@ class PoissonNLL(nn.Module):
         super().__init__()
         self.floor, self.reduction = floor, reduction
 
-    def forward(self, counts: Tensor, mean: Tensor) -> Tensor:
-        return poisson_nll(counts, mean, floor=self.floor, reduction=self.reduction)
+    def forward(self, counts: Tensor, mean: Tensor, mask: Tensor | None = None) -> Tensor:
+        return poisson_nll(counts, mean, floor=self.floor, mask=mask, reduction=self.reduction)
 
 
 class FirstPhotonNLL(nn.Module):
@@ -220,9 +258,9 @@ class FirstPhotonNLL(nn.Module):
         super().__init__()
         self.cycles, self.dead_bins, self.floor, self.reduction = cycles, dead_bins, floor, reduction
 
-    def forward(self, counts: Tensor, rate: Tensor) -> Tensor:
+    def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
-            counts, rate, self.cycles, dead_bins=self.dead_bins, floor=self.floor, reduction=self.reduction
+            counts, rate, self.cycles, dead_bins=self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
         )
 
 
@@ -235,8 +273,10 @@ class FreeRunningNLL(nn.Module):
         super().__init__()
         self.periods, self.dead_bins, self.floor, self.reduction = periods, dead_bins, floor, reduction
 
-    def forward(self, counts: Tensor, rate: Tensor) -> Tensor:
-        return free_running_nll(counts, rate, self.periods, self.dead_bins, floor=self.floor, reduction=self.reduction)
+    def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
+        return free_running_nll(
+            counts, rate, self.periods, self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
+        )
 
 
 class ReadNoiseNLL(nn.Module):
@@ -246,5 +286,33 @@ class ReadNoiseNLL(nn.Module):
         super().__init__()
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
 
-    def forward(self, measured: Tensor, mean: Tensor) -> Tensor:
-        return read_noise_nll(measured, mean, self.read_noise, shot_noise=self.shot_noise, reduction=self.reduction)
+    def forward(self, measured: Tensor, mean: Tensor, mask: Tensor | None = None) -> Tensor:
+        return read_noise_nll(
+            measured, mean, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
+        )
+
+
+class PoissonLoss(nn.Module):
+    """`poisson_loss(input, target)` with its options held."""
+
+    def __init__(self, floor: float | None = None, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        self.floor, self.reduction = floor, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return poisson_loss(input, target, floor=self.floor, mask=mask, reduction=self.reduction)
+
+
+class FirstPhotonLoss(nn.Module):
+    """`first_photon_loss(input, target, cycles)` with its options held."""
+
+    def __init__(
+        self, cycles: int, dead_bins: float | None = None, floor: float | None = None, reduction: Reduction = "mean"
+    ) -> None:
+        super().__init__()
+        self.cycles, self.dead_bins, self.floor, self.reduction = cycles, dead_bins, floor, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return first_photon_loss(
+            input, target, self.cycles, dead_bins=self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
+        )

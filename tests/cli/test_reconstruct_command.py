@@ -1,0 +1,197 @@
+"""`torchtransient reconstruct`: captures of all kinds and layouts in, volumes and pictures out."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+import torchtransient as tt
+from torchtransient.cli.main import main
+from torchtransient.testing.point_captures import point_capture
+
+POINT = (0.15, -0.1, 0.7)
+AXIS = tt.TimeAxis(0.0, 0.02, 128)
+WALL = tt.nlos.Wall.plane(1.0, 1.0)
+EVERY = [
+    ("confocal", ["fk", "lct", "directional-lct", "bp", "fbp", "phasor"]),
+    ("single", ["midpoint-fk", "bp", "fbp", "phasor"]),
+    ("exhaustive", ["midpoint-fk", "bp", "fbp", "phasor"]),
+]
+PAIRS = [(kind, method) for kind, methods in EVERY for method in methods]
+
+
+def captured(kind, legs=False, axis=AXIS):
+    """Light of one point, 12 x 12 sensor points."""
+    more = {"laser_grid": 3} if kind == "exhaustive" else {}
+    scan = tt.nlos.Scan.grid(WALL, 12, kind=kind, first_and_last_leg=legs, **more)
+    return point_capture(scan, [POINT], time_axis=axis)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["reconstruct", *map(str, arguments)])
+
+
+def brightest(volume):
+    index = int(volume.picture().argmax())
+    return volume.grid.points.reshape(-1, 3)[index]
+
+
+@pytest.mark.parametrize(("kind", "method"), PAIRS)
+def test_a_point_is_found_by_every_method(folder, kind, method):
+    captured(kind).write("a.h5")
+    result = run("a.h5", "--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture")
+    assert result.exit_code == 0, result.output
+    volume = tt.nlos.read_volume(f"a_{method}.h5")
+    assert volume.method == method and volume.values.shape[-3:] == volume.grid.shape
+    assert float(volume.grid.depths[0]) >= 0.4 and float(volume.grid.depths[-1]) <= 1.0
+    # One pitch of the scan, and two planes.
+    torch.testing.assert_close(brightest(volume), torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
+
+
+@pytest.mark.parametrize(("kind", "method"), [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor")])
+def test_without_a_method_the_one_that_suits_is_taken(folder, kind, method):
+    captured(kind).write("a.npz")
+    result = run("a.npz", "-o", "v.npz", "--depths", 0.4, 1.0)
+    assert result.exit_code == 0, result.output
+    assert f"--method {method}: a {kind} scan" in result.stderr and "volume: 100%" in result.stderr
+    volume = tt.nlos.read_volume("v.npz")
+    assert volume.method == method and volume.metadata["reason"].startswith(f"a {kind} scan")
+    assert volume.metadata["capture"] == "a.npz"
+    assert "v.npz: 1 x " in result.stdout and (folder / "v.png").stat().st_size > 5000
+
+
+def test_lists_of_points_go_to_filtered_backprojection(folder):
+    scan = captured("confocal").scan
+    points = scan.sensor_points.reshape(-1, 3)[::2]
+    some = tt.nlos.Scan.points(
+        points, kind="confocal", sensor_origin=scan.sensor_origin, laser_origin=scan.laser_origin
+    )
+    point_capture(some, [POINT], time_axis=AXIS).write("list.h5")
+    result = run("list.h5", "--quiet")
+    assert result.exit_code == 2 and "--bounds and --voxels" in result.stderr
+    box = ("--bounds", -0.5, -0.5, 0.4, 0.5, 0.5, 1.0, "--voxels", "20,20,16")
+    result = run("list.h5", *box)
+    assert result.exit_code == 0 and "--method fbp" in result.stderr, result.output
+    found = brightest(tt.nlos.read_volume("list_fbp.h5"))
+    torch.testing.assert_close(found, torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.06)
+
+
+@pytest.mark.parametrize("method", ["fk", "fbp"])
+def test_legs_do_not_matter(folder, method):
+    axis = tt.TimeAxis(0.3, 0.02, 160)
+    captured("confocal", legs=True, axis=axis).write("legs.h5")
+    options = ("--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture")
+    assert run("legs.h5", *options).exit_code == 0
+    found = brightest(tt.nlos.read_volume(f"legs_{method}.h5"))
+    torch.testing.assert_close(found, torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
+
+
+def test_options_are_those_of_the_function(folder):
+    capture = captured("single")
+    capture.write("a.h5")
+    options = ("--wavelength", 0.3, "--cycles", 5, "--falloff", 1, "--voxels", "10,8,6", "--extent", "0.8,0.6")
+    result = run("a.h5", "--method", "fbp", *options, "--depths", 0.5, 0.9, "--quiet", "--no-picture")
+    assert result.exit_code == 0, result.output
+    found = tt.nlos.read_volume("a_fbp.h5")
+    grid = tt.nlos.default_grid(capture, depths=(0.5, 0.9), size=(10, 8), extent=(0.8, 0.6), planes=6)
+    expected = tt.nlos.FilteredBackprojection(
+        capture.scan,
+        grid,
+        time_axis=capture.axis,
+        filter=tt.nlos.PhasorFilter(0.3, 5),
+        falloff=1.0,
+        dtype=torch.float64,
+    ).reconstruct(capture)
+    assert found.grid == grid
+    torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-6 * float(expected.max()))
+    assert found.metadata["settings"] == {"wavelength": 0.3, "cycles": 5.0, "falloff": 1.0}
+
+
+def test_cut_and_summed_bins(folder):
+    capture = captured("confocal")
+    capture.write("a.h5")
+    result = run("a.h5", "--record", 0.4, 2.4, "--sum-bins", 3, "--quiet", "--no-picture", "--floor", 0.1)
+    assert result.exit_code == 0, result.output
+    cut = tt.nlos.sum_bins(capture.crop(0.4, 2.4), 3)
+    expected = tt.nlos.fk(cut, floor=0.1)
+    assert torch.equal(tt.nlos.read_volume("a_fk.h5").values, expected)
+
+
+def test_films_and_normals(folder):
+    captured("single").write("a.h5")
+    film = ("--method", "phasor", "--camera", "transient", "--times", 0.6, 1.0, 5)
+    result = run("a.h5", *film, "--voxels", "12,12,4", "--depths", 0.5, 0.9, "--quiet")
+    assert result.exit_code == 0, result.output
+    volume = tt.nlos.read_volume("a_phasor.h5")
+    assert volume.values.shape == (1, 5, 4, 12, 12) and torch.equal(
+        volume.times, torch.linspace(0.6, 1, 5, dtype=torch.float64)
+    )
+    captured("confocal").write("b.h5")
+    result = run("b.h5", "--method", "directional-lct", "--snr", 100, "--flip", "xy", "--quiet")
+    assert result.exit_code == 0, result.output
+    volume = tt.nlos.read_volume("b_directional-lct.h5")
+    assert volume.directions.shape == (1, 3, *volume.grid.shape)
+    assert torch.equal(volume.directions.norm(dim=-4), volume.values)
+    length = tt.nlos.normals_of(volume).norm(dim=0)
+    torch.testing.assert_close(length, torch.ones_like(length))
+
+
+def test_what_a_file_leaves_open_is_asked_for(folder):
+    h5py = pytest.importorskip("h5py")
+    counts = torch.poisson(torch.full((6, 6, 40), 5.0), generator=torch.Generator().manual_seed(0))
+    with h5py.File("foam.mat", "w") as file:
+        file["meas"] = counts.numpy()
+    result = run("foam.mat", "--quiet")
+    assert result.exit_code == 2 and "Give --wall-size." in result.stderr and "wall_size=" not in result.stderr
+    slab = ("--slab", 0.01, "--slab-snr", 100, "--target", "retroreflective")
+    result = run("foam.mat", "--wall-size", 0.6, "--format", "cdt", *slab, "--quiet")
+    assert result.exit_code == 0, result.output
+    volume = tt.nlos.read_volume("foam_fk.h5")
+    assert volume.metadata["assumed"]["bin_width_s"] == 16e-12 and volume.metadata["prepared"]["slab"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("missing.h5",), "missing.h5"),
+        (("a.h5", "--method", "midpoint-fk"), "--method 'midpoint-fk' takes single and exhaustive scans"),
+        (("a.h5", "--method", "fk", "--snr", 3), "has no --snr"),
+        (("a.h5", "--method", "bp", "--wavelength", 0.1), "has no --wavelength"),
+        (("a.h5", "--method", "fbp", "--filter", "laplacian", "--cycles", 3), "--cycles"),
+        (("a.h5", "--method", "fk", "--voxels", 8), "leave out --voxels"),
+        (("a.h5", "--method", "bp", "--voxels", "4,x"), "X,Y[,Z]"),
+        (("a.h5", "--method", "bp", "--bounds", 0, 0, 0, 1, 1, 1), "--bounds needs --voxels"),
+        (("a.h5", "--bounds", 0, 0, 0, 1, 1, 1, "--depths", 0, 1), "leave out --depths"),
+        (("a.h5", "--method", "phasor", "--camera", "confocal"), "give --times"),
+        (("a.h5", "--times", 0, 1, 3), "--camera"),
+        (("a.h5", "--method", "phasor", "--camera", "transient", "--times", 0, 1, 3), "one laser spot"),
+        (("a.h5", "--slab-snr", 3), "--slab"),
+        (("a.h5", "--depths", 1, 0.5), "near < far"),
+        (("a.h5", "--depths", 5, 6), "within the record"),
+        (("a.h5", "--record", 9, 10), "hold no bin"),
+        (("a.h5", "--sum-bins", 500), "128 bins at most"),
+        (("a.h5", "--wall-size", 1), "--wall-size has no meaning"),
+        (("a.h5", "--format", "xyz"), "expected format to be one of"),
+        (("a.h5", "-o", "v.txt"), ".npz"),
+        (("a.h5", "--picture", "nowhere/a.png"), "'nowhere' does not exist"),
+        (("a.h5", "--picture", "a.png", "--no-picture"), "--no-picture"),
+        (("a.h5", "--device", "abacus"), "abacus"),
+        (("a.h5", "--method", "lct", "--snr", -1), "snr"),
+    ],
+)
+def test_mistakes_are_said_in_options(folder, arguments, message):
+    captured("confocal").write("a.h5")
+    result = run(*arguments, "--quiet")
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr, result.stderr
+    assert not re.search(r"Traceback|reconstruct:", result.stderr)
+    assert sorted(path.name for path in folder.iterdir()) == ["a.h5"]

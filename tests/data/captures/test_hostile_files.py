@@ -1,0 +1,202 @@
+"""Files that are damaged or made to harm give StorageError, in little memory, and run nothing."""
+
+from __future__ import annotations
+
+import multiprocessing
+import random
+import resource
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from support.capture_files import grids, made
+from support.hostile_captures import TEXTS, bytes_changed, structure_changed, whole_files
+from torchtransient.errors import StorageError
+
+SAID = {
+    "wall_size": 0.6, "bin_width_s": 1e-11, "start_s": 0.0, "sensor_origin": (0.0, 0.0, 1.0),
+    "laser_origin": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+def read(path, said=None):
+    """What comes of a file: True for a capture, False for a StorageError. Everything else is raised."""
+    try:
+        tt.nlos.read_capture(path, **(said or {}))
+    except StorageError:
+        return False
+    return True
+
+
+def read_mutants(folder, seeds):
+    """How many of the mutants of these seeds are still captures, and by how many bytes the process has grown.
+
+    Every third has its structure changed; every fourth is read with answers to what a file may leave open.
+    """
+    folder = Path(folder)
+    warnings.simplefilter("error", RuntimeWarning)
+    sources = whole_files(folder)
+    structured = [path for path in sources if h5py.is_hdf5(path)]
+    before, good = _memory(), 0
+    for seed in seeds:
+        rng = random.Random(seed)
+        source = rng.choice(structured if seed % 3 == 0 else sources)
+        target = folder / f"mutant{source.suffix}"
+        (structure_changed if seed % 3 == 0 else bytes_changed)(source, target, rng)
+        names = rng.sample(list(SAID), rng.randrange(1, 6)) if seed % 4 == 0 else ()
+        good += read(target, {name: SAID[name] for name in names})
+        target.unlink()
+    return good, _memory() - before
+
+
+def _memory():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def test_mutated_files(tmp_path):
+    good, _ = read_mutants(tmp_path, range(150))
+    assert 0 < good < 150
+
+
+@pytest.mark.slow
+def test_ten_thousand_mutated_files(tmp_path):
+    """In a process of its own, which also shows that it survives, and what memory it takes: all files are small, and
+    the limit is what the libraries take beside them.
+    """
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        good, grown = pool.apply(read_mutants, (str(tmp_path), range(1000, 11_000)))
+    assert 0 < good < 10_000
+    assert grown < 100e6
+
+
+@pytest.fixture
+def tal_file(tmp_path):
+    return made(grids()["confocal"]).write(tmp_path / "a.h5", "tal")
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=range(len(TEXTS)))
+def test_yaml_is_neither_executed_nor_expanded(tmp_path, tal_file, text):
+    executed = tmp_path / "executed"
+    with h5py.File(tal_file, "r+") as file:
+        del file["scene_info"]
+        if "\0" in text:
+            with pytest.raises(ValueError, match="NULL"):
+                file["scene_info"] = text
+            file["scene_info"] = "a: [\x01]"
+        else:
+            file["scene_info"] = text.replace("{executed}", str(executed))
+    before = _memory()
+    read(tal_file)
+    assert not executed.exists()
+    assert _memory() - before < 50e6
+
+
+def test_tags_of_python_are_left_as_data(tal_file, tmp_path):
+    with h5py.File(tal_file, "r+") as file:
+        del file["scene_info"]
+        file["scene_info"] = "a: !!python/object/apply:os.f []\nb: !!python/tuple [1, 2]\nc: !!python/name:os.f ''"
+    capture = tt.nlos.read_capture(tal_file)
+    assert capture.metadata["scene_info"] == {"a": [], "b": [1, 2], "c": ""}
+    again = capture.write(tmp_path / "b.h5", "tal")
+    with h5py.File(tal_file) as a, h5py.File(again) as b:
+        assert a["scene_info"][()] == b["scene_info"][()]  # the text itself, for y-tal
+
+
+@pytest.mark.parametrize("settings", [{}, {"chunks": True}, {"chunks": True, "compression": "gzip"}])
+@pytest.mark.parametrize("layout", ["tal", "torchtransient"])
+def test_terabytes_that_nobody_stored(tmp_path, layout, settings):
+    path = made(grids()["confocal"]).write(tmp_path / "a.h5", layout)
+    name = "H" if layout == "tal" else "transient"
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file.create_dataset(name, (2**14, 2**14, 2**14), "f4", **settings)
+    with pytest.raises(StorageError, match=r"declares .* bytes of numbers and stores"):
+        tt.nlos.read_capture(path)
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("layout", ["tal", "torchtransient"])
+def test_texts_that_say_they_are_gigabytes(tmp_path, layout, libver):
+    """HDF5 would fill that much memory before it looks for the text."""
+    path = made(grids()["confocal"]).write(tmp_path / "a.h5", layout)
+    with h5py.File(path) as file:
+        text = file["scene_info"].asstr()[()] if layout == "tal" else file.attrs["metadata"]
+    text += " " * (0x1A2B - len(text.encode()))  # a length that stands nowhere else in the file
+    again = tmp_path / "b.h5"
+    with h5py.File(path) as old, h5py.File(again, "w", libver=libver) as new:
+        for name in old:
+            old.copy(name, new)
+        for name, value in old.attrs.items():
+            new.attrs[name] = value
+        if layout == "tal":
+            del new["scene_info"]
+            new["scene_info"] = text
+        else:
+            new.attrs["metadata"] = text
+    assert read(again)
+    data, length = again.read_bytes(), (0x1A2B).to_bytes(4, "little")
+    before, place, changed = _memory(), data.find(length), 0
+    while place >= 0:
+        again.write_bytes(data[:place] + (0xF0000000).to_bytes(4, "little") + data[place + 4 :])
+        changed += not read(again)
+        place = data.find(length, place + 1)
+    assert changed and _memory() - before < 50e6
+
+
+@pytest.mark.parametrize("kind", ["external", "virtual", "link", "soft link"])
+@pytest.mark.parametrize("layout", ["tal", "torchtransient"])
+def test_other_files_are_not_read(tmp_path, layout, kind):
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(4 * 7 * 12))
+    path = made(grids()["confocal"]).write(tmp_path / "a.h5", layout)
+    name = "H" if layout == "tal" else "transient"
+    with h5py.File(path, "r+") as file:
+        shape = file[name].shape
+        del file[name]
+        if kind == "external":
+            file.create_dataset(name, shape, "f4", external=[(str(secret), 0, 4 * 7 * 12)])
+        elif kind == "virtual":
+            virtual = h5py.VirtualLayout(shape=shape, dtype="f4")
+            virtual[:] = h5py.VirtualSource(str(secret), "a", shape=shape)
+            file.create_virtual_dataset(name, virtual)
+        else:
+            file[name] = h5py.ExternalLink(str(secret), "/a") if kind == "link" else h5py.SoftLink("/sensor_points")
+    with pytest.raises(StorageError, match=r"other files|a link to elsewhere|missing"):
+        tt.nlos.read_capture(path)
+
+
+class Touch:
+    """Pickled, it makes a file when it is loaded."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_pickles_are_not_loaded(tmp_path):
+    executed = tmp_path / "executed"
+    path = made(grids()["confocal"]).write(tmp_path / "a.npz")
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(path, **arrays | {"transient": np.array([Touch(executed)], dtype=object)})
+    with pytest.raises(StorageError, match="pickle"):
+        tt.nlos.read_capture(path)
+    assert not executed.exists()
+
+
+def test_files_of_other_kinds(tmp_path):
+    for number, data in enumerate(
+        (b"", b"x" * 200, bytes(116) + b"\x00\x01IM", bytes(124) + b"\x00\x01IM", b"PK\x03\x04")
+    ):
+        path = tmp_path / f"{number}.mat"
+        path.write_bytes(data)
+        assert not read(path)
+    assert not read(tmp_path)
+    with pytest.raises(StorageError, match="name of a file"):
+        tt.nlos.read_capture(3)

@@ -1,0 +1,282 @@
+"""What holds of every loss (input, target): batches, masks, reductions, precision, derivatives, errors."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+from support.loss_cases import CASES
+from torchtransient import losses
+from torchtransient.errors import ShapeError, UnitError
+
+every = pytest.mark.parametrize("case", CASES, ids=str)
+HALVES = (torch.float16, torch.bfloat16)
+
+
+def over(condition):
+    return pytest.mark.parametrize("case", [case for case in CASES if condition(case)], ids=str)
+
+
+def real(x):
+    return not x.is_complex()
+
+
+def gradient(case, x, y, mask=None):
+    x = x.detach().clone().requires_grad_()
+    case(x, y, mask, "sum").backward()
+    return x.grad
+
+
+def mask_of(y):
+    """Of what a mask speaks of: the measurement, or the volume where there is no other."""
+    return torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
+
+
+def test_every_loss_is_in_the_list():
+    named = {name for name in dir(losses) if name.endswith("Loss")} - {"PairLoss"}
+    assert named | {"MeasurementConsistency", "TotalVariation"} == {case.module.__name__ for case in CASES}
+
+
+@every
+def test_modules_hold_the_options_of_functions(case):
+    x, y = case.tensors()
+    mask = mask_of(y)
+    torch.testing.assert_close(case.as_module(x, y, mask, "sum"), case(x, y, mask, "sum"), rtol=0, atol=0)
+    module = case.module(**case.options)
+    again = pickle.loads(pickle.dumps(module))
+    arguments = (x, y) if case.pair else (x,)
+    for other in (again, copy.deepcopy(module)):
+        torch.testing.assert_close(other(*arguments), case(x, y), rtol=0, atol=0)
+    assert module.state_dict() == {}
+
+
+@every
+def test_items_of_a_batch_do_not_see_each_other(case):
+    x, y = case.tensors()
+    y = y * torch.tensor([1.0, 3.0], dtype=x.real.dtype).reshape(2, *[1] * (y.ndim - 1))
+    whole = case(x, y, reduction="none")
+    for i in range(2):
+        torch.testing.assert_close(whole[i], case(x[i], y[i], reduction="none"))
+    more = case(x[None].expand(3, *x.shape), y[None].expand(3, *y.shape), reduction="none")
+    torch.testing.assert_close(more[2], whole)
+
+
+@every
+def test_reductions(case):
+    x, y = case.tensors()
+    each = case(x, y, reduction="none")
+    assert real(each) and each.dtype == torch.float64
+    torch.testing.assert_close(case(x, y), (case(x[0], y[0]) + case(x[1], y[1])) / 2)
+    if case.function is not losses.projection_ssim_loss:  # a mean of three views of different sizes
+        torch.testing.assert_close(case(x, y, reduction="sum"), each.sum())
+        torch.testing.assert_close(case(x, y), each.mean())
+    mask = torch.ones_like(y, dtype=torch.bool)
+    torch.testing.assert_close(case(x, y, mask, "none"), each)
+    torch.testing.assert_close(case(x, y, mask), case(x, y))
+
+
+@over(lambda case: case.crop is not None)
+def test_a_mask_is_a_restriction(case):
+    x, y = case.tensors()
+    mask = torch.zeros_like(y, dtype=torch.bool)
+    mask[case.crop] = True
+    inside = case(x[case.crop], y[case.crop], reduction="none")
+    torch.testing.assert_close(case(x, y, mask, "sum"), inside.sum())
+    torch.testing.assert_close(case(x, y, mask), inside.mean())
+    # likewise for a mask that broadcasts
+    narrow = torch.zeros(y.shape[-2:], dtype=torch.bool)
+    narrow[1:3, 1:4] = True
+    crop = (..., slice(1, 3), slice(1, 4))
+    if case.options.get("dead_bins") is None:
+        torch.testing.assert_close(case(x, y, narrow), case(x[crop], y[crop]))
+
+
+@every
+def test_what_does_not_count_may_be_anything(case):
+    x, y = case.tensors()
+    mask = mask_of(y)
+    mask[..., 2, 3] = False  # a dead pixel: no bin of it counts
+    reference, slope = case(x, y, mask), gradient(case, x, y, mask)
+    for rubbish in (float("nan"), float("inf"), -1e6):
+        other, volume = y.clone(), x.clone()
+        other[..., 2, 3] = rubbish
+        if not case.pair or x.shape == y.shape:
+            volume[..., 2, 3] = rubbish
+        torch.testing.assert_close(case(volume, other, mask), reference, rtol=0, atol=0)
+        torch.testing.assert_close(gradient(case, volume, other, mask), slope, rtol=0, atol=0)
+    assert bool(torch.isfinite(slope).all()) and bool((slope[..., 2, 3] == 0).all())
+
+
+@every
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_nothing_counts(case, reduction):
+    x, y = case.tensors()
+    mask = torch.zeros_like(y, dtype=torch.bool)
+    assert bool((case(x, y, mask, reduction) == 0).all())
+    assert bool((gradient(case, x, y, mask) == 0).all())
+
+
+@over(lambda case: case.symmetric and case.pair)
+def test_symmetric(case):
+    x, y = case.tensors()
+    torch.testing.assert_close(case(x, y, reduction="none"), case(y, x, reduction="none"))
+    torch.testing.assert_close(case(x, y, mask_of(y)), case(y, x, mask_of(y)))
+
+
+@over(lambda case: case.zero_at_equality)
+def test_zero_at_equality_alone(case):
+    x, y = case.tensors()
+    same = case(x, x, reduction="none")
+    torch.testing.assert_close(same, torch.zeros_like(same), rtol=0, atol=1e-14)
+    assert bool((case(x, y, reduction="none") > 0).all())
+
+
+@over(lambda case: not case.floors_detached)
+def test_gradcheck(case):
+    x, y = case.tensors()
+    mask = mask_of(y)
+    x, y = x[:1].clone().requires_grad_(), y[:1]
+    assert torch.autograd.gradcheck(lambda x: case(x, y, mask[:1], "none"), x, fast_mode=True)
+    if case.pair and case.draw_target is None:
+        y = y.clone().requires_grad_()
+        assert torch.autograd.gradcheck(lambda x, y: case(x, y, None, "none"), (x, y), fast_mode=True)
+
+
+@over(lambda case: case.floors_detached)
+def test_the_gradient_is_that_of_a_fixed_scale(case):
+    """The direction that changes no scale: two bins of one record trade light."""
+    x, y = case.tensors()
+    step = torch.zeros_like(x)
+    step[0, 0, 1, 2, ...], step[0, 0, 3, 2, ...] = 1e-6, -1e-6
+    found = float((gradient(case, x, y) * step).sum())
+    wanted = float((case(x + step, y, reduction="sum") - case(x - step, y, reduction="sum")) / 2)
+    assert found == pytest.approx(wanted, rel=1e-4)
+
+
+@every
+def test_finite_for_no_light_and_even_light(case):
+    x, y = case.tensors(dtype=torch.float32)
+    for a in (0.0, 1.0, 1e-30):
+        for b in (0.0, 1.0):
+            inputs, targets = torch.full_like(x, a), torch.full_like(y, b)
+            assert bool(torch.isfinite(case(inputs, targets))), (a, b)
+            assert bool(torch.isfinite(gradient(case, inputs, targets)).all()), (a, b)
+            # one dark pixel among others
+            inputs[..., 0, 0], targets[..., 0, 0] = a, b
+            inputs[..., 1:, :], targets[..., 1:, :] = 1.0, 2.0
+            slope = gradient(case, inputs, targets)
+            assert bool(torch.isfinite(slope).all()) and float(slope.abs().max()) < 1e6, (a, b)
+
+
+@over(lambda case: case.draw_target is None and "value_range" not in case.options)
+def test_six_decades_of_light_at_any_level(case):
+    x, y = case.tensors(dtype=torch.float32)
+    generator = torch.Generator().manual_seed(3)
+    x = x * 10 ** (6 * torch.rand(x.shape, generator=generator))
+    y = y * 10 ** (6 * torch.rand(y.shape, generator=generator))
+    for level in (1e-12, 1e-6, 1.0, 1e6):
+        assert bool(torch.isfinite(case(level * x, level * y))), level
+        assert bool(torch.isfinite(gradient(case, level * x, level * y)).all()), level
+
+
+@every
+def test_a_single_bin(case):
+    x, y = case.tensors()
+    if case.function in (losses.transient_phasor_loss, losses.measurement_consistency):
+        x, y = x[..., :1, :1], y[..., :1, :1]  # the axis and the operator say how many bins there are
+    elif x.ndim == 5 and case.crop is not None:
+        x, y = x[..., :1, :1, :1], y[..., :1, :1, :1]
+    elif case.crop is not None:
+        x, y = x[..., :1, :1], y[..., :1, :1]
+    assert bool(torch.isfinite(case(x, y)))
+    assert bool(torch.isfinite(gradient(case, x, y)).all())
+
+
+@every
+def test_precision(case):
+    x, y = case.tensors()
+    wanted = case(x, y)
+    single = case(*case.tensors(dtype=torch.float32))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), wanted, rtol=1e-4, atol=1e-6)
+
+
+@over(lambda case: real(case.tensors()[0]))
+@pytest.mark.parametrize("dtype", HALVES, ids=str)
+def test_half_precision_under_autocast(case, dtype):
+    x, y = (t.to(dtype) for t in case.tensors())
+    wanted = case(x.float(), y.float())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = case(x, y)
+    if case.function is losses.measurement_consistency:  # its operator here is one that autocast reaches into
+        torch.testing.assert_close(found.float(), wanted, rtol=0.05, atol=0.01)
+    else:
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
+    assert bool(torch.isfinite(gradient(case, x, y)).all())
+
+
+@over(lambda case: case.mapped)
+def test_transforms_of_functions(case):
+    x, y = case.tensors()
+    mask = mask_of(y)
+    each = torch.vmap(lambda x, y, m: case(x, y, m))(x, y, mask)
+    wanted = torch.stack([case(x[i], y[i], mask[i]) for i in range(2)])
+    torch.testing.assert_close(each, wanted)
+    torch.testing.assert_close(torch.vmap(lambda x, y: case(x, y))(x, y).mean(), case(x, y))
+    if real(x):
+        slopes = torch.vmap(torch.func.grad(lambda x, y: case(x, y, reduction="sum")))(x, y)
+        torch.testing.assert_close(slopes, gradient(case, x, y))
+        direction = torch.ones_like(x)
+        _, tangent = torch.func.jvp(lambda x: case(x, y, reduction="sum"), (x,), (direction,))
+        torch.testing.assert_close(tangent, gradient(case, x, y).sum())
+
+
+@over(lambda case: case.mapped and "SSIM" not in case.name)  # kornia turns autocast off, which this device has not
+def test_no_tensor_stays_on_the_cpu(case):
+    """Tensors without memory are on another device, too: one of the CPU among them is an error."""
+    x, y = (t.to("meta") for t in case.tensors())
+    x.requires_grad_()
+    value = case(x, y, mask_of(torch.empty(y.shape)).to("meta"))
+    value.backward()
+    assert value.device.type == x.grad.device.type == "meta"
+
+
+@over(lambda case: real(case.tensors()[0]) and case.pair)
+def test_whole_numbers_as_targets(case):
+    """Counts as detectors give them, beside a network's half precision: 70,000 is no number of float16."""
+    x, y = case.tensors(dtype=torch.float32)
+    whole = (70_000 * y if case.draw_target is None else y).to(torch.int64)
+    torch.testing.assert_close(case(x, whole), case(x, whole.float()), rtol=0, atol=0)
+    # an operator of half precision has its rounding, 2^-11, in the residual
+    rtol = 2**-10 if case.function is losses.measurement_consistency else 0
+    torch.testing.assert_close(case(x.half(), whole), case(x.half().float(), whole.float()), rtol=rtol, atol=0)
+
+
+@pytest.mark.gpu
+@every
+def test_on_the_device_of_the_tensors(case):
+    x, y = (t.to("cuda") for t in case.tensors())
+    mask = mask_of(y).cuda()
+    found = case.module(**case.options).cuda()(*((x, y) if case.pair else (x,)), mask=mask)
+    assert found.device.type == "cuda"
+    torch.testing.assert_close(found.cpu(), case(x.cpu(), y.cpu(), mask.cpu()))
+
+
+@every
+def test_errors(case):
+    x, y = case.tensors()
+    with pytest.raises(ShapeError, match="reduction"):
+        case(x, y, reduction="median")
+    with pytest.raises(UnitError, match="mask of truth values"):
+        case(x, y, torch.ones_like(y))
+    with pytest.raises(ShapeError, match="mask that broadcasts"):
+        case(x, y, torch.ones(3, *y.shape, dtype=torch.bool))
+    with pytest.raises(ShapeError, match="expected"):
+        case(x.tolist() if not case.pair else x, y.tolist())
+    if case.pair:
+        with pytest.raises(ShapeError, match="shape"):
+            case(x, y[..., :-1])

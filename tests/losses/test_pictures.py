@@ -1,0 +1,92 @@
+"""Losses of pictures: depth maps with holes, structural similarity, projections of volumes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchtransient import losses
+from torchtransient.errors import ShapeError, UnitError
+
+
+def draw(*shape, seed=0):
+    return torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def test_depth_in_metres_where_there_is_a_surface():
+    truth = torch.tensor([[1.0, 2.0, float("nan")], [float("inf"), 0.5, 1.5]])
+    found = torch.tensor([[1.1, 1.8, 7.0], [3.0, 0.5, 9.0]], requires_grad=True)
+    mask = torch.tensor([[True, True, True], [True, True, False]])
+    value = losses.depth_loss(found, truth, mask=mask)
+    assert float(value) == pytest.approx((0.1 + 0.2 + 0) / 3, rel=1e-6)
+    value.backward()
+    torch.testing.assert_close(found.grad, torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.0, 0.0]]) / 3)
+    nowhere = losses.depth_loss(found, torch.full_like(truth, float("nan")))
+    assert float(nowhere) == 0
+    # a network that gives NaN where there is a surface is not passed over
+    assert torch.isnan(losses.depth_loss(torch.full((2, 3), float("nan")), truth))
+
+
+def test_similarity_of_flat_pictures_is_that_of_their_brightness():
+    """`(2 a b + c1) / (a^2 + b^2 + c1)`, c1 = (0.01 L)^2."""
+    a, b = torch.full((1, 12, 12), 0.3, dtype=torch.float64), torch.full((1, 12, 12), 0.6, dtype=torch.float64)
+    for scale, value_range in ((1.0, 1.0), (50.0, 50.0), (1.0, 3.0)):
+        c1 = (0.01 * value_range) ** 2
+        x, y = 0.3 * scale, 0.6 * scale
+        wanted = 1 - (2 * x * y + c1) / (x**2 + y**2 + c1)
+        found = losses.ssim_loss(scale * a, scale * b, value_range=value_range, reduction="none")
+        torch.testing.assert_close(found, torch.full_like(found, wanted), rtol=1e-6, atol=1e-9)
+
+
+def test_similarity_against_its_definition():
+    """Moments of a Gaussian window, summed by hand, at a pixel whose window is inside."""
+    a, b = draw(1, 11, 11), draw(1, 11, 11, seed=1)
+    x = torch.arange(11, dtype=torch.float64) - 5
+    line = torch.exp(-(x**2) / (2 * 1.5**2))
+    w = torch.outer(line, line) / line.sum() ** 2
+    ma, mb = (w * a).sum(), (w * b).sum()
+    va, vb, cov = (w * a * a).sum() - ma**2, (w * b * b).sum() - mb**2, (w * a * b).sum() - ma * mb
+    c1, c2 = 0.01**2, 0.03**2
+    wanted = 1 - (2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
+    found = losses.ssim_loss(a, b, value_range=1.0, reduction="none")[0, 5, 5]
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
+
+
+def test_the_default_range_knows_the_scale():
+    a, b = draw(2, 1, 12, 12), draw(2, 1, 12, 12, seed=1)
+    torch.testing.assert_close(losses.ssim_loss(1e9 * a, 1e9 * b), losses.ssim_loss(a, b))
+    opposite = losses.ssim_loss(1 - a, a)
+    assert 1 < float(opposite) < 2
+    assert float(losses.ssim_loss(0 * a, 0 * a)) == 0
+
+
+def test_projections():
+    volume = draw(2, 1, 3, 4, 5)
+    front, top, side = losses.maximum_projections(volume)
+    assert (front.shape, top.shape, side.shape) == ((2, 1, 4, 5), (2, 1, 3, 5), (2, 1, 3, 4))
+    point = torch.zeros(1, 8, 8, 8, dtype=torch.float64)
+    point[0, 2, 3, 5] = 4.0
+    for view, place in zip(losses.maximum_projections(point), ((3, 5), (2, 5), (2, 3)), strict=True):
+        assert float(view[0][place]) == 4 and float(view.sum()) == 4
+
+
+def test_similarity_of_volumes_is_that_of_three_views():
+    a, b = draw(2, 1, 8, 9, 10), draw(2, 1, 8, 9, 10, seed=1)
+    views = zip(losses.maximum_projections(a), losses.maximum_projections(b), strict=True)
+    wanted = torch.stack([losses.ssim_loss(x, y, window=7) for x, y in views]).mean()
+    torch.testing.assert_close(losses.projection_ssim_loss(a, b, window=7), wanted)
+    assert losses.projection_ssim_loss(a, b, window=7, reduction="none").shape == (2, 1)
+
+
+def test_errors():
+    a = draw(1, 8, 8)
+    with pytest.raises(ShapeError, match="odd window"):
+        losses.ssim_loss(a, a, window=4)
+    with pytest.raises(ShapeError, match="smaller window"):
+        losses.ssim_loss(a, a, window=17)
+    with pytest.raises(UnitError, match="value_range"):
+        losses.ssim_loss(a, a, window=3, value_range=0.0)
+    with pytest.raises(ShapeError, match="real volume"):
+        losses.maximum_projections(a + 0j)
+    with pytest.raises(ShapeError, match="volumes"):
+        losses.projection_ssim_loss(a, a)

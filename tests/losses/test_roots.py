@@ -1,0 +1,110 @@
+"""Counts on other scales: the variance of Anscombe's root, logarithms of ratios, values below zero."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import pytest
+import torch
+
+from torchtransient import losses
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.reconstruction import stabilised_root
+
+
+def moments(mean, function):
+    """Mean and variance of a function of Poisson counts, summed over all counts that matter."""
+    n = torch.arange(int(mean + 20 * mean**0.5 + 40), dtype=torch.float64)
+    p = torch.exp(n * math.log(mean) - mean - torch.lgamma(n + 1))
+    value = function(n)
+    first = float((p * value).sum())
+    return first, float((p * value**2).sum()) - first**2
+
+
+@pytest.mark.parametrize("mean", [4.0, 10.0, 30.0, 300.0])
+def test_anscombe_has_variance_one(mean):
+    found, variance = moments(mean, losses.anscombe)
+    assert abs(variance - 1) < 1 / (8 * mean)
+    # Anscombe 1948: the mean is that of the mean less 1/(4 sqrt(m))
+    assert found == pytest.approx(2 * math.sqrt(mean + 3 / 8) - 1 / (4 * math.sqrt(mean)), abs=1 / (4 * mean**1.5))
+
+
+def test_anscombe_with_little_light():
+    assert moments(1.0, losses.anscombe)[1] == pytest.approx(0.717, abs=0.001)
+
+
+def test_anscombe_with_read_noise():
+    """Counts and normal noise of two counts: variance one within 2 %, where the plain root has five times that."""
+    generator = torch.Generator().manual_seed(0)
+    m = torch.full((400_000,), 6.0, dtype=torch.float64)
+    y = torch.poisson(m, generator=generator) + 2 * torch.randn(m.shape, generator=generator, dtype=torch.float64)
+    # 400,000 draws know a variance to sqrt(2 / 4e5) = 0.22 %
+    assert float(losses.anscombe(y, read_noise=2.0).var()) == pytest.approx(1.0, abs=0.02 + 4 * 0.0022)
+    assert float(losses.anscombe(y).var()) > 1.5
+
+
+def test_root_loss_of_a_perfect_fit_is_about_one():
+    mean = torch.full((200_000,), 20.0, dtype=torch.float64)
+    counts = torch.poisson(mean, generator=torch.Generator().manual_seed(1))
+    found, variance = moments(20.0, losses.anscombe)
+    wanted = variance + (found - float(losses.anscombe(mean[:1]))) ** 2
+    assert wanted == pytest.approx(1.0, abs=0.02)
+    assert float(losses.root_loss(mean, counts)) == pytest.approx(wanted, abs=5 * (2 / 200_000) ** 0.5)
+
+
+def test_the_tangent_below_zero():
+    x = torch.tensor([-3.0, -1e-9, 0.0, 1e-9], dtype=torch.float64, requires_grad=True)
+    for function in (losses.anscombe, lambda x: losses.root_loss(x, torch.zeros_like(x), reduction="none").sqrt()):
+        slope = torch.autograd.grad(function(x).sum(), x)[0]
+        assert bool(torch.isfinite(slope[[0, 1, 3]]).all())
+    slope = torch.autograd.grad(losses.anscombe(x).sum(), x)[0]
+    torch.testing.assert_close(slope, torch.full_like(x, 1 / math.sqrt(3 / 8)), rtol=1e-7, atol=0)
+
+
+def test_other_roots():
+    a, b = torch.tensor([0.0, 1.0, 4.0]), torch.tensor([2.0, 0.0, 9.0])
+    found = losses.root_loss(a, b, root=stabilised_root, reduction="none")
+    torch.testing.assert_close(found, (a / (a + 0.25).sqrt() - b / (b + 0.25).sqrt()) ** 2)
+    noisy = functools.partial(losses.anscombe, read_noise=3.0)
+    torch.testing.assert_close(
+        losses.RootLoss(noisy)(a, b), (2 * (a + 9.375).sqrt() - 2 * (b + 9.375).sqrt()).square().mean()
+    )
+    with pytest.raises(ShapeError, match="keeps the shape"):
+        losses.root_loss(a, b, root=torch.sum)
+    with pytest.raises(UnitError, match="read_noise"):
+        losses.anscombe(a, read_noise=-1.0)
+
+
+def test_log_ratio():
+    """A factor is the square of its logarithm, over twelve decades; below the background it fades."""
+    y = 10 ** torch.linspace(-6, 6, 13, dtype=torch.float64)
+    found = losses.log_ratio_loss(math.e * y, y, background=1e-12, reduction="none")
+    torch.testing.assert_close(found, torch.ones_like(y), rtol=5e-6, atol=0)
+    found = losses.log_ratio_loss(2 * y, y, background=y, reduction="none")
+    torch.testing.assert_close(found, torch.full_like(y, math.log(1.5) ** 2))
+    # far below it: the squared difference over the square of the background
+    found = losses.log_ratio_loss(3 * y[:3], y[:3], background=100.0, reduction="none")
+    torch.testing.assert_close(found, (2 * y[:3] / 100) ** 2, rtol=1e-5, atol=0)
+
+
+def test_log_ratio_below_zero_and_in_the_dark():
+    x = torch.tensor([-2.0, -1.0, 0.0, 5.0], requires_grad=True)
+    value = losses.log_ratio_loss(x, torch.zeros(4), background=0.5, reduction="none")
+    torch.testing.assert_close(value, torch.tensor([16.0, 4.0, 0.0, math.log(11) ** 2]))
+    value.sum().backward()
+    torch.testing.assert_close(x.grad, torch.tensor([-16.0, -8.0, 0.0, 2 * math.log(11) / 5.5]))
+    # a dark target: 1e-3 of the input's mean
+    found = losses.log_ratio_loss(torch.ones(4), torch.zeros(4))
+    assert float(found) == pytest.approx(math.log(1001) ** 2, rel=1e-5)
+
+
+def test_log_ratio_takes_a_background_of_each_pixel():
+    a, b = torch.rand(2, 1, 4, 3, 3), torch.rand(2, 1, 4, 3, 3)
+    background = torch.rand(3, 3) + 0.1
+    found = losses.log_ratio_loss(a, b, background=background)
+    torch.testing.assert_close(found, ((a + background).log() - (b + background).log()).square().mean())
+    with pytest.raises(UnitError, match="background above zero"):
+        losses.log_ratio_loss(a, b, background=background - 1)
+    with pytest.raises(UnitError, match="background"):
+        losses.log_ratio_loss(a, b, background=0.0)

@@ -1,0 +1,85 @@
+"""Total variation: areas of boxes, slopes of ramps, noise against edges, smoothness in flat places."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchtransient import losses
+from torchtransient.errors import ShapeError, UnitError
+
+
+def box(n=16, low=4, high=10, height=3.0):
+    volume = torch.zeros(1, n, n, n, dtype=torch.float64)
+    volume[:, low:high, low:high, low:high] = height
+    return volume
+
+
+def test_a_box_has_the_area_of_its_faces():
+    """Six faces of 6^2 voxels, a step of 3: along the axes. Isotropic, at three edges that meet differences share."""
+    found = losses.total_variation(box(), isotropic=False, smoothing=0.0, reduction="sum")
+    assert float(found) == pytest.approx(6 * 36 * 3)
+    metres = losses.total_variation(box(), spacing=(0.1, 0.1, 0.1), isotropic=False, smoothing=0.0, reduction="sum")
+    assert float(metres) * 0.1**3 == pytest.approx(6 * 0.6**2 * 3)
+    # differences to the next voxel: those of the three far faces start in one voxel of the box on an edge or a corner
+    far = 3 * 25 + 3 * 5 * math.sqrt(2) + math.sqrt(3)
+    found = losses.total_variation(box(), smoothing=0.0, reduction="sum")
+    assert float(found) == pytest.approx(3 * (3 * 36 + far))
+
+
+@pytest.mark.parametrize("isotropic", [True, False])
+def test_a_ramp_has_its_slope(isotropic):
+    z, y, x = (torch.arange(8, dtype=torch.float64).reshape(s) for s in ((8, 1, 1), (8, 1), (8,)))
+    volume = 0.2 * z * 2.0 + 0.5 * y * 3.0 - 0.1 * x * 4.0
+    found = losses.total_variation(
+        volume, spacing=(0.2, 0.5, 0.1), isotropic=isotropic, smoothing=0.0, reduction="none"
+    )[:-1, :-1, :-1]
+    wanted = math.sqrt(2**2 + 3**2 + 4**2) if isotropic else 2 + 3 + 4
+    torch.testing.assert_close(found, torch.full_like(found, wanted))
+
+
+def test_smoothing_takes_off_at_most_itself_and_has_no_slope_in_flat_places():
+    volume = box().requires_grad_()
+    exact = losses.total_variation(volume, smoothing=0.0, reduction="none")
+    smooth = losses.total_variation(volume, smoothing=0.1, reduction="none")
+    assert bool((smooth <= exact).all()) and bool((exact - smooth <= 0.1).all())
+    torch.testing.assert_close(smooth, (exact**2 + 0.01).sqrt() - 0.1)
+    smooth.sum().backward()
+    assert bool((volume.grad[:, :3, :3, :3] == 0).all()) and bool(torch.isfinite(volume.grad).all())
+    flat = torch.ones(1, 4, 4, 4, dtype=torch.float64)
+    curvature = torch.autograd.functional.hessian(lambda v: losses.total_variation(v, smoothing=0.1), flat)
+    assert bool(torch.isfinite(curvature).all()) and float(curvature.diagonal().abs().max()) > 0
+
+
+def test_a_bump_is_better_than_the_same_noise():
+    noise = torch.rand(1, 12, 12, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    flat = noise.clone().flatten().sort().values.reshape(noise.shape)
+    assert float(losses.total_variation(flat)) < 0.3 * float(losses.total_variation(noise))
+
+
+def test_complex_fields():
+    """The modulus of differences: a turning phase varies, a global one does not."""
+    volume = box().to(torch.complex128)
+    turned = volume * torch.exp(torch.tensor(1.1j, dtype=torch.complex128))
+    torch.testing.assert_close(losses.total_variation(turned), losses.total_variation(box()))
+
+
+def test_relative_smoothing_scales_with_the_volume():
+    noise = torch.rand(2, 1, 6, 6, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    one = losses.total_variation(noise, reduction="none")
+    torch.testing.assert_close(losses.total_variation(1e-9 * noise, reduction="none"), 1e-9 * one, rtol=1e-7, atol=0)
+
+
+def test_thin_volumes_and_errors():
+    picture = torch.rand(1, 1, 5, 5, dtype=torch.float64)
+    assert losses.total_variation(picture, reduction="none").shape == picture.shape
+    with pytest.raises(ShapeError, match=r"\(..., Z, Y, X\)"):
+        losses.total_variation(torch.zeros(4, 4))
+    with pytest.raises(ShapeError, match="spacing"):
+        losses.total_variation(picture, spacing=(1.0, 1.0))
+    with pytest.raises(UnitError, match="spacing"):
+        losses.total_variation(picture, spacing=(1.0, 0.0, 1.0))
+    with pytest.raises(UnitError, match="smoothing"):
+        losses.total_variation(picture, smoothing=-1.0)

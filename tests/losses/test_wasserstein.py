@@ -1,0 +1,130 @@
+"""The Wasserstein distance over time: shifts in metres, other ways to compute it, missing light, empty pixels."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+
+from torchtransient import losses
+from torchtransient.errors import ShapeError, UnitError
+
+WIDTH = 0.03
+
+
+def record(*values):
+    return torch.tensor(values, dtype=torch.float64).reshape(1, -1, 1, 1)
+
+
+def delta(k, height=1.0, bins=40):
+    return record(*(height if i == k else 0.0 for i in range(bins)))
+
+
+def draw(bins, seed):
+    return torch.rand(1, bins, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("shift", [0, 1, 17, 39])
+@pytest.mark.parametrize("height", [1e-20, 1.0, 3e8])
+def test_a_shift_in_metres(shift, height):
+    found = losses.wasserstein_loss(delta(0), delta(shift, height), WIDTH)
+    assert float(found) == pytest.approx(WIDTH * shift, rel=1e-12)
+
+
+def test_equals_the_distance_of_sorted_photons():
+    """Records of equal counts: photons in the order of their arrival, one by one."""
+    generator = torch.Generator().manual_seed(2)
+    a, b = (torch.randint(0, 40, (500,), generator=generator).sort().values for _ in range(2))
+    found = losses.wasserstein_loss(*(record(*torch.bincount(x, minlength=40).double()) for x in (a, b)), WIDTH)
+    assert float(found) == pytest.approx(WIDTH * float((a - b).abs().double().mean()), rel=1e-12)
+
+
+def test_agrees_with_scipy():
+    stats = pytest.importorskip("scipy.stats")
+    a, b = draw(25, 0), draw(25, 1) ** 4
+    found = losses.wasserstein_loss(a, b, WIDTH, reduction="none")
+    assert found.shape == (1, 2, 3)
+    places = (torch.arange(25, dtype=torch.float64) * WIDTH).numpy()
+    for y, x in itertools.product(range(2), range(3)):
+        wanted = stats.wasserstein_distance(places, places, a[0, :, y, x].numpy(), b[0, :, y, x].numpy())
+        assert float(found[0, y, x]) == pytest.approx(wanted, rel=1e-10)
+
+
+def test_triangle_inequality_and_time_anywhere():
+    a, b, c = (draw(25, seed) for seed in range(3))
+    distance = [losses.wasserstein_loss(*pair, WIDTH, reduction="none") for pair in ((a, b), (b, c), (a, c))]
+    assert bool((distance[2] <= distance[0] + distance[1]).all())
+    moved = losses.wasserstein_loss(a.movedim(1, -1), b.movedim(1, -1), WIDTH, dim=-1, reduction="none")
+    torch.testing.assert_close(moved, distance[0])
+    exhaustive = (x.reshape(1, 25, 1, 2, 3, 1) for x in (a, b))
+    found = losses.wasserstein_loss(*exhaustive, WIDTH, dim=-5)
+    torch.testing.assert_close(found, distance[0].mean())
+
+
+def test_the_gradient_sees_pulses_that_do_not_overlap():
+    """Where the squared difference is blind: light that is moved later by one bin brings the loss down by its share."""
+    x = delta(5, bins=20).requires_grad_()
+    losses.wasserstein_loss(x, delta(15, bins=20), WIDTH).backward()
+    slope = x.grad[0, :, 0, 0]
+    torch.testing.assert_close(slope[5:16].diff(), torch.full((10,), -WIDTH, dtype=torch.float64))
+
+
+def test_missing_light_costs_its_length():
+    """`m W1 + L |difference of masses|`, by hand: 2 units move 3 bins, 1 is missing."""
+    a, b = delta(4, 2.0), delta(7, 3.0)
+    found = losses.wasserstein_loss(a, b, WIDTH, creation_cost_opl=0.4)
+    assert float(found) == pytest.approx(2 * 3 * WIDTH + 0.4, rel=1e-12)
+    assert float(losses.wasserstein_loss(a, 0 * a, WIDTH, creation_cost_opl=0.4)) == pytest.approx(0.8, rel=1e-12)
+    # equal masses: the balanced distance times the mass
+    c, d = draw(25, 0), draw(25, 1)
+    c, d = 3 * c / c.sum(1), 3 * d / d.sum(1)
+    found = losses.wasserstein_loss(c, d, WIDTH, creation_cost_opl=0.4)
+    torch.testing.assert_close(found, 3 * losses.wasserstein_loss(c, d, WIDTH))
+
+
+def test_unbalanced_gradient_of_an_empty_pixel():
+    """Light anywhere is better than none: each bin by the cost of what is missing."""
+    x = torch.zeros(1, 10, 1, 1, requires_grad=True)
+    losses.wasserstein_loss(x, delta(3, 2.0, bins=10).float(), WIDTH, creation_cost_opl=0.4).backward()
+    torch.testing.assert_close(x.grad, torch.full_like(x, -0.4))
+
+
+def test_an_empty_pixel_is_one_of_even_light():
+    even, full = torch.full((1, 40, 1, 1), 0.5, dtype=torch.float64), delta(0)
+    # from bin 0 to the middle of the record, on average
+    wanted = WIDTH * 39 / 2
+    assert float(losses.wasserstein_loss(even, full, WIDTH)) == pytest.approx(wanted, rel=1e-12)
+    assert float(losses.wasserstein_loss(0 * even, full, WIDTH)) == pytest.approx(wanted, rel=1e-12)
+    assert float(losses.wasserstein_loss(0 * even, 0 * full, WIDTH)) == 0
+
+
+def test_dim_pixels_fade_into_even_light():
+    """Continuous at the floor, and linear below it."""
+    a, b = delta(3, bins=10), delta(6, bins=10)
+    values = [float(losses.wasserstein_loss(m * a, b, WIDTH, floor=0.5)) for m in (0.0, 0.25, 0.5 - 1e-9, 0.5, 2.0)]
+    assert values[2] == pytest.approx(values[3], rel=1e-7)
+    assert values[3] == values[4] == pytest.approx(3 * WIDTH)
+    # 6 bins early and 3 late at most: 2.7 on average; half of the light is 3 early
+    assert values[0] == pytest.approx(2.7 * WIDTH)
+    assert values[1] == pytest.approx((3 + 2.7) / 2 * WIDTH)
+
+
+def test_single_precision_over_a_long_record():
+    bins = 16384
+    a, b = (torch.rand(1, bins, 1, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    wanted = losses.wasserstein_loss(a, b, WIDTH)
+    # a cumulative sum of n roundings of 6e-8 of at most one wanders by sqrt(n) of them
+    found = losses.wasserstein_loss(a.float(), b.float(), WIDTH)
+    assert abs(float(found) - float(wanted)) < 6e-8 * bins**0.5 * bins * WIDTH
+
+
+def test_errors():
+    with pytest.raises(UnitError, match="bin_width_opl"):
+        losses.wasserstein_loss(delta(0), delta(1), 0.0)
+    with pytest.raises(UnitError, match="creation_cost_opl"):
+        losses.wasserstein_loss(delta(0), delta(1), WIDTH, creation_cost_opl=-1.0)
+    with pytest.raises(UnitError, match="floor"):
+        losses.wasserstein_loss(delta(0), delta(1), WIDTH, floor=0.0)
+    with pytest.raises(ShapeError, match="dimension -5"):
+        losses.wasserstein_loss(delta(0), delta(1), WIDTH, dim=-5)

@@ -1,0 +1,228 @@
+"""Backprojection against sums that are written out, and where light of known points comes out."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.scan_operators import AXIS, DEPTHS, SCANS, WALL, bent_scan, listed_scan, points_anywhere
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.reconstruction import (
+    Backprojection,
+    FilteredBackprojection,
+    LaplacianFilter,
+    PhasorFilter,
+    VoxelGrid,
+    backproject,
+    ellipsoids,
+    filtered_backproject,
+)
+from torchtransient.testing.point_captures import point_capture
+
+F64 = torch.float64
+POINTS = points_anywhere()
+ALL = {**SCANS, "bent wall": bent_scan(), "lists": listed_scan()}
+
+
+def written_out(scan, points, axis, falloff):
+    """The matrix (T, pairs, V) of linear interpolation at the length of every pair and point."""
+    spots, sensors = scan.laser_points.reshape(-1, 3), scan.sensor_points.reshape(-1, 3)
+    legs = scan.first_and_last_leg
+    first, last = scan.laser_legs.reshape(-1) * legs, scan.sensor_legs.reshape(-1) * legs
+    if scan.kind == "exhaustive":
+        pairs = [(a, b) for a in range(len(spots)) for b in range(len(sensors))]
+    else:
+        pairs = [(b if scan.kind == "confocal" else 0, b) for b in range(len(sensors))]
+    matrix = torch.zeros(axis.num_bins, len(pairs), len(points), dtype=F64)
+    for row, (a, b) in enumerate(pairs):
+        for column, point in enumerate(points):
+            to_spot, to_sensor = float((spots[a] - point).norm()), float((sensors[b] - point).norm())
+            place = (to_spot + to_sensor + float(first[a] + last[b]) - axis.start_opl) / axis.bin_width_opl - 0.5
+            low = math.floor(place)
+            for k, share in ((low, 1 - (place - low)), (low + 1, place - low)):
+                if 0 <= k < axis.num_bins:
+                    matrix[k, row, column] += share * (to_spot * to_sensor) ** -falloff
+    return matrix.reshape(axis.num_bins, *scan.shape, len(points))
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("falloff", [0.0, 1.5])
+def test_is_the_matrix_that_is_written_out(name, falloff):
+    scan = ALL[name]
+    operator = Backprojection(scan, POINTS, time_axis=AXIS, falloff=falloff, dtype=F64)
+    expected = written_out(scan, POINTS, AXIS, falloff)
+    found = operator(torch.eye(len(POINTS), dtype=F64)).movedim(0, -1)
+    assert expected.abs().sum() > 0
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10 * float(expected.max()))
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_pieces_do_not_show(name, monkeypatch):
+    scan = ALL[name]
+    operator = Backprojection(scan, POINTS, time_axis=AXIS, falloff=1.0, dtype=F64)
+    light = torch.randn(2, *operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    whole, forward = operator.adjoint(light), operator(operator.adjoint(light))
+    for setting, value in (("CPU_TILE", 3), ("CPU_BLOCK", 6), ("GROUP_NUMBERS", 60), ("MOST_SPOTS", 2)):
+        monkeypatch.setattr(ellipsoids, setting, value)
+    torch.testing.assert_close(operator.adjoint(light), whole, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(operator(whole), forward, rtol=1e-12, atol=1e-12)
+
+
+def test_a_voxel_gives_its_value_to_every_pair():
+    # Two shares of one value: all of it arrives, at its length.
+    scan = SCANS["single"]
+    axis = TimeAxis(0.0, 0.01, 100)
+    light = Backprojection(scan, POINTS, time_axis=axis, dtype=F64)(torch.full((len(POINTS),), 2.0, dtype=F64))
+    torch.testing.assert_close(light.sum(0), torch.full(scan.shape, 2.0 * len(POINTS), dtype=F64))
+    lengths = (scan.laser_points - POINTS).norm(dim=-1) + (scan.sensor_points[:, :, None] - POINTS).norm(dim=-1)
+    mean = (light * axis.centers_opl[:, None, None]).sum(0) / light.sum(0)
+    torch.testing.assert_close(mean, lengths.mean(-1))
+
+
+def test_what_is_outside_of_the_record_counts_as_nothing():
+    scan, point = SCANS["confocal"], torch.tensor([[0.0, 0.0, 0.5]], dtype=F64)
+    for axis in (TimeAxis(0.0, 0.02, 20), TimeAxis(2.0, 0.02, 20)):
+        operator = Backprojection(scan, point, time_axis=axis, dtype=F64)
+        assert not operator(torch.ones(1, dtype=F64)).any()
+        assert not operator.adjoint(torch.ones(operator.data_shape, dtype=F64)).any()
+
+
+def test_far_from_the_origin_and_late_single_precision_keeps_its_digits():
+    # The same hidden point 300 m away from the origin, with legs of 500 m: 1e9 float32 ulp of a bin otherwise.
+    shift = torch.tensor([300.0, -200.0, 100.0], dtype=F64)
+    near = Scan.grid(WALL, 4, kind="confocal")
+    origin = near.sensor_points.mean((0, 1)) + torch.tensor([0.0, 0.0, 500.0], dtype=F64)
+    far = Scan.points(
+        near.sensor_points + shift, kind="confocal", sensor_origin=origin + shift, laser_origin=origin + shift,
+        first_and_last_leg=True,
+    )  # fmt: skip
+    axis = TimeAxis(1000.1, 0.02, 24)
+    double = Backprojection(far, POINTS + shift, time_axis=axis, dtype=F64)
+    single = Backprojection(far, POINTS + shift, time_axis=axis)
+    ones = torch.ones(len(POINTS), dtype=F64)
+    assert double(ones).sum() > 0
+    assert (single(ones.float()) - double(ones)).abs().max() < 1e-5
+
+
+def test_distances_below_half_a_bin_do_not_grow_without_bound():
+    scan = SCANS["confocal"]
+    operator = Backprojection(scan, scan.sensor_points, time_axis=TimeAxis(-0.05, 0.02, 24), falloff=2.0, dtype=F64)
+    light = operator(torch.ones(operator.volume_shape, dtype=F64))
+    assert torch.isfinite(light).all()
+    assert light.max() <= 4 * (0.01**2) ** -2.0
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_a_point_is_brightest_where_it_is(kind):
+    settings = {"exhaustive": {"laser_grid": 3}}.get(kind, {})
+    scan = Scan.grid(WALL, 8, kind=kind, **settings)
+    axis = TimeAxis(0.1, 0.01, 50)
+    grid = VoxelGrid.before(scan, torch.linspace(0.1, 0.2, 11), size=9, extent=0.2)
+    place = grid.points[6, 2, 5]
+    capture = point_capture(scan, place[None], time_axis=axis)
+    volume = backproject(capture, grid)
+    assert volume.shape == (1, 11, 9, 9)
+    assert volume.dtype == F64
+    assert int(volume.argmax()) == (6 * 9 + 2) * 9 + 5
+    picture = filtered_backproject(capture, grid, filter=PhasorFilter(0.04, 3.0))
+    assert int(picture.argmax()) == (6 * 9 + 2) * 9 + 5
+
+
+def test_phasor_filter_is_the_convolution_with_its_pulse():
+    # Closed form: a bin holds a delta, the filtered row is the pulse itself, of a spectrum of height one.
+    pulse, width, bins = PhasorFilter(0.2, 4.0), 0.01, 128
+    row = torch.zeros(bins, dtype=F64)
+    row[50] = 1.0
+    found = pulse.rows(row, width)
+    t = width * (torch.arange(bins, dtype=F64) - 50)
+    envelope = torch.exp(-(t**2) / (2 * pulse.sigma**2)) * width / (pulse.sigma * math.sqrt(2 * math.pi))
+    expected = torch.polar(envelope, 2 * math.pi * t / pulse.wavelength)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10 * float(envelope.max()))
+
+
+def test_filtered_light_of_the_end_does_not_come_back_at_the_start():
+    row = torch.zeros(100, dtype=F64)
+    row[-1] = 1.0
+    filtered = PhasorFilter(0.1, 4.0).rows(row, 0.01)
+    assert filtered[:40].abs().max() < 1e-12
+
+
+def test_laplacian_of_quadratic_brightness():
+    # -(a + b + c) times two inside, whatever the smoothing; zero for a linear one.
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=F64) for n in (15, 16, 17)), indexing="ij")
+    laplacian = LaplacianFilter(0.7)
+    inside = (slice(6, -6),) * 3
+    quadratic = laplacian.volume(1.0 * z**2 - 0.5 * y**2 + 2.0 * x**2)[inside]
+    torch.testing.assert_close(quadratic, torch.full_like(quadratic, -2 * 2.5), rtol=1e-9, atol=1e-9)
+    assert laplacian.volume(1 + z - 2 * y + 3 * x)[inside].abs().max() < 1e-9
+
+
+def test_laplacian_sharpens():
+    scan, axis = Scan.grid(WALL, 8, kind="confocal"), TimeAxis(0.1, 0.01, 50)
+    grid = VoxelGrid.before(scan, torch.linspace(0.1, 0.2, 11), size=9, extent=0.2)
+    capture = point_capture(scan, grid.points[6, 4, 4][None], time_axis=axis)
+    plain, sharp = backproject(capture, grid)[0], filtered_backproject(capture, grid, filter=LaplacianFilter())[0]
+    assert int(sharp.argmax()) == (6 * 9 + 4) * 9 + 4
+    widths = [int((volume > volume.max() / 2).sum()) for volume in (plain, sharp)]
+    assert widths[1] < widths[0]
+
+
+def test_captures_go_in_as_they_are():
+    scan = SCANS["exhaustive"]
+    operator = Backprojection(scan, POINTS, time_axis=AXIS)
+    light = torch.rand(3, 2, *operator.data_shape, generator=torch.Generator().manual_seed(0))
+    capture = Capture(light, AXIS, scan)
+    torch.testing.assert_close(operator.reconstruct(capture), operator.adjoint(light))
+    torch.testing.assert_close(backproject(capture, POINTS), operator.adjoint(light))
+    same = Scan.grid(WALL, (3, 2), kind="exhaustive", laser_grid=(2, 2))
+    operator.reconstruct(Capture(light, AXIS, same))
+    for other, words in (
+        (Capture(light, TimeAxis(0.2, 0.02, 24), scan), "expected a capture with"),
+        (Capture(light, AXIS, Scan.grid(WALL, (3, 2), kind="exhaustive", laser_grid=2, cell_centers=False)), "own"),
+        (Capture(light, AXIS, replace(scan, first_and_last_leg=True)), "own"),
+        (Capture(light.reshape(3, 1, 2, *light.shape[2:]).expand(3, 4, 2, *light.shape[2:]), AXIS, scan,
+                 polarized=True), "Stokes"),
+    ):  # fmt: skip
+        with pytest.raises(ShapeError, match=words):
+            operator.reconstruct(other)
+
+
+@pytest.mark.parametrize(
+    "arguments, error, words",
+    [
+        ((None, POINTS, AXIS, torch.float32), ShapeError, "tt.nlos.Scan"),
+        ((SCANS["single"], POINTS, None, torch.float32), ShapeError, "TimeAxis"),
+        ((SCANS["single"], POINTS.tolist(), AXIS, torch.float32), ShapeError, "VoxelGrid"),
+        ((SCANS["single"], POINTS[:0], AXIS, torch.float32), ShapeError, "VoxelGrid"),
+        ((SCANS["single"], POINTS * math.nan, AXIS, torch.float32), UnitError, "finite points"),
+        ((SCANS["single"], POINTS * 1e12, AXIS, torch.float32), UnitError, "within 1e9 bins"),
+        ((SCANS["single"], POINTS, AXIS, torch.float16), UnitError, "float32 or torch.float64"),
+    ],
+)
+def test_arguments_that_cannot_be_taken(arguments, error, words):
+    scan, points, axis, dtype = arguments
+    with pytest.raises(error, match=words):
+        Backprojection(scan, points, time_axis=axis, dtype=dtype)
+
+
+def test_filters_that_cannot_be_taken():
+    scan, grid = SCANS["confocal"], VoxelGrid.before(SCANS["confocal"], DEPTHS)
+    of = {"time_axis": AXIS}
+    with pytest.raises(UnitError, match="falloff"):
+        Backprojection(scan, grid, falloff=math.nan, **of)
+    with pytest.raises(ShapeError, match="PhasorFilter or a LaplacianFilter"):
+        FilteredBackprojection(scan, grid, filter="pf", **of)
+    with pytest.raises(UnitError, match="two bins"):
+        FilteredBackprojection(scan, grid, filter=PhasorFilter(0.03), **of)
+    with pytest.raises(ShapeError, match="a VoxelGrid for a LaplacianFilter"):
+        FilteredBackprojection(scan, POINTS, filter=LaplacianFilter(), **of)
+    with pytest.raises(ShapeError, match="evenly spaced"):
+        FilteredBackprojection(scan, grid.at_depths([0.1, 0.2, 0.4]), filter=LaplacianFilter(), **of)
+    for make in (lambda: PhasorFilter(0.0), lambda: PhasorFilter(1.0, -1.0), lambda: LaplacianFilter(math.inf)):
+        with pytest.raises(UnitError):
+            make()
+    with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
+        backproject(torch.zeros(3), grid)

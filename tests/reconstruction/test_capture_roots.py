@@ -1,0 +1,44 @@
+"""Roots of captures: values, bounds and derivatives at empty bins."""
+
+import pytest
+import torch
+
+from torchtransient.errors import UnitError
+from torchtransient.reconstruction import StabilisedRoot, stabilised_root
+
+F64 = torch.float64
+VALUES = torch.tensor([-4.0, -0.5, 0.0, 1e-30, 1e-8, 1.0, 100.0, 1e12], dtype=F64)
+
+
+@pytest.mark.parametrize("floor", [0.0, 1e-6, 0.25, 3.0])
+def test_odd_and_growing_and_the_root_far_above_the_floor(floor):
+    found = stabilised_root(VALUES, floor)
+    torch.testing.assert_close(found, -stabilised_root(-VALUES, floor), rtol=0, atol=0)
+    assert (found.diff() > 0).all()
+    assert float(found[2]) == 0
+    assert float(found[-1]) == pytest.approx(1e6, rel=1e-10)
+    torch.testing.assert_close(found, VALUES / (VALUES.abs() + floor).sqrt().clamp_min(1e-300))
+
+
+def test_slope_has_a_bound():
+    x = VALUES.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(stabilised_root(x, 0.25).sum(), x)
+    assert float(slope.max()) == float(slope[2]) == 2.0
+    assert float(stabilised_root(torch.ones(1), 0.25)) == pytest.approx(0.894, abs=1e-3)
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.25])
+def test_derivatives(floor):
+    x = torch.tensor([-3.0, -0.2, 0.4, 7.0], dtype=F64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda h: stabilised_root(h, floor), x, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(lambda h: stabilised_root(h, floor), x)
+
+
+def test_kinds_of_numbers():
+    assert stabilised_root(torch.tensor([4]), 0.0).dtype == torch.float32
+    assert stabilised_root(torch.ones(2, dtype=torch.float16)).dtype == torch.float16
+    assert StabilisedRoot(0.0)(torch.tensor([9.0])).item() == 3.0
+    with pytest.raises(UnitError, match="floor"):
+        StabilisedRoot(-1.0)
+    with pytest.raises(UnitError, match="finite"):
+        stabilised_root(torch.ones(1), float("nan"))

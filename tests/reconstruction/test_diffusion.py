@@ -1,0 +1,156 @@
+"""Captures through a diffusing slab: against the transmittance in closed form, and letters that were measured."""
+
+import itertools
+import math
+import string
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.grid_operators import SCAN as SMALL
+from support.grid_operators import confocal_points
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Scan, Wall
+from torchtransient.errors import UnitError
+from torchtransient.reconstruction import FK, DiffusionDeconvolution
+from torchtransient.reconstruction.diffusion import FOAM, slab_transmittance
+from torchtransient.testing import diffusion
+
+F64 = torch.float64
+MEASURED = Path(__file__).parents[2] / "benchmarks" / "data" / "foam_captures.npz"
+
+
+def test_transmittance_is_that_of_the_closed_form():
+    opl = torch.tensor([-0.1, 0.0, 0.02, 0.05, 0.1, 0.3, 1.0], dtype=F64)
+    scattering, absorption, index, extrapolation = FOAM
+    for rho in (0.0, 0.03):
+        found = slab_transmittance(
+            opl, torch.tensor(rho**2, dtype=F64), thickness=0.0254, reduced_scattering=scattering,
+            absorption=absorption, index=index, extrapolation=extrapolation,
+        )  # fmt: skip
+        expected = diffusion.slab_transmittance(
+            opl[2:].numpy(), 0.0254, scattering, absorption, index, rho=rho, extrapolation=extrapolation
+        )
+        assert (found[:2] == 0).all()
+        np.testing.assert_allclose(found[2:].numpy(), expected, rtol=1e-10)
+
+
+def test_the_slab_keeps_light_and_delays_it_twice():
+    axis = TimeAxis(0.0, 0.02, 192)
+    scan = Scan.grid(Wall.plane(0.6, 0.6), 24, kind="confocal")
+    flash = torch.zeros(192, 24, 24, dtype=F64)
+    flash[10, 12, 12] = 1.0
+    means = []
+    for passes in (1, 2):
+        spread = DiffusionDeconvolution(scan, time_axis=axis, passes=passes, dtype=F64)(flash)
+        # A slab that lets none through at the sides keeps it; 3 per mille leave the record and the scan.
+        assert float(spread.sum()) == pytest.approx(1.0, abs=3e-3)
+        assert float(spread.min()) > -1e-12
+        means.append(float((spread.sum((1, 2)) * axis.centers_opl).sum() / spread.sum()) - 0.21)
+    assert means[1] == pytest.approx(2 * means[0], rel=0.02)
+
+
+def test_deconvolution_undoes_the_slab_up_to_noise():
+    axis = TimeAxis(0.0, 0.02, 128)
+    scan = Scan.grid(Wall.plane(0.6, 0.6), 20, kind="confocal")
+    light = confocal_points([(0.0, 0.0, 0.6), (0.1, 0.1, 0.7)], scan, axis, sigma_bins=3.0)
+    slab = DiffusionDeconvolution(scan, time_axis=axis, snr=1e8, dtype=F64)
+    through = slab(light)
+
+    def alike(x):
+        return float((x * light).sum() / (x.norm() * light.norm()))
+
+    assert alike(through) < 0.75
+    assert alike(slab.reconstruct(through)) > 0.95
+    weak = DiffusionDeconvolution(scan, time_axis=axis, snr=1e2, dtype=F64)
+    assert alike(through) < alike(weak.reconstruct(through)) < alike(slab.reconstruct(through))
+
+
+def test_what_it_cannot_take_is_refused():
+    axis = TimeAxis(0.0, 0.02, 32)
+    for settings, message in (
+        ({"thickness": 0.0}, "thickness"),
+        ({"snr": -1.0}, "snr"),
+        ({"passes": 3}, "once or twice"),
+        ({"properties": (262.0, 0.5)}, "properties"),
+        ({"properties": (262.0, -0.5, 1.1, 0.003)}, "absorption"),
+        ({"properties": (262.0, math.nan, 1.1, 0.003)}, "absorption"),
+        ({"properties": (1e5, 1e5, 1.1, 0.003)}, "slab thinner"),
+    ):
+        with pytest.raises(UnitError, match=message):
+            DiffusionDeconvolution(SMALL, time_axis=axis, **settings)
+
+
+# ---------------------------------------------------------------------------------------- letters behind measured foam
+
+
+def front_view(name):
+    """All light of each place (32, 32) behind the foam; one set of parameters for every capture."""
+    with np.load(MEASURED) as arrays:
+        counts, size = torch.from_numpy(arrays[name].astype(np.float64)), float(arrays[f"{name}_size"])
+    axis = TimeAxis.from_seconds(0.0, 48e-12, len(counts))
+    scan = Scan.grid(Wall.plane(size, size), 32, kind="confocal")
+    clear = DiffusionDeconvolution(scan, time_axis=axis, snr=3e3, dtype=F64).reconstruct(counts)
+    volume = FK(scan, time_axis=axis, target="retroreflective", dtype=F64).reconstruct(clear)
+    # The foam's own light comes first, and what the deconvolution makes of the record's end last.
+    return volume[8:-16].sum(0)
+
+
+def rendered(letter, poses, side=32, finer=4):
+    """A bold letter at every pose (height of capitals, y, x, in pixels from the middle) as unit vectors (P, side^2)."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.path import Path as Outline
+    from matplotlib.textpath import TextPath
+
+    font = FontProperties(family="DejaVu Sans", weight="bold")
+    glyph, capital = (TextPath((0, 0), text, size=100, prop=font) for text in (letter, "H"))
+    box, upright = glyph.get_extents(), capital.get_extents()
+    outlines = [Outline(polygon) for polygon in glyph.to_polygons()]
+    at = (np.arange(side * finer) + 0.5) / finer - side / 2
+    y, x = np.meshgrid(at, at, indexing="ij")
+    pictures = []
+    for height in sorted({pose[0] for pose in poses}):
+        scale = upright.height / height
+        across, up = (box.x0 + box.x1) / 2 + x.ravel() * scale, (upright.y0 + upright.y1) / 2 - y.ravel() * scale
+        inside = np.zeros(x.size, bool)
+        for outline in outlines:
+            inside ^= outline.contains_points(np.stack([across, up], 1))
+        picture = inside.reshape(side, finer, side, finer).mean((1, 3))
+        pictures += [np.roll(picture, (dy, dx), (0, 1)) for h, dy, dx in poses if h == height]
+    stack = torch.from_numpy(np.stack(pictures)).reshape(len(poses), -1)
+    stack = stack - stack.mean(1, keepdim=True)
+    return stack / stack.norm(dim=1, keepdim=True)
+
+
+@pytest.fixture(scope="module")
+def alphabet():
+    poses = [(h, dy, dx) for h in range(16, 32, 2) for dy in range(-4, 5) for dx in range(-4, 5)]
+    return torch.stack([rendered(letter, poses) for letter in string.ascii_uppercase])
+
+
+@pytest.mark.parametrize("letter", ["s", "t"])
+def test_letters_behind_foam_are_read(alphabet, letter):
+    picture = front_view(f"letter_{letter}").flatten()
+    picture = picture - picture.mean()
+    scores = alphabet @ (picture / picture.norm())  # (26, poses)
+    # One size and place for the whole alphabet: where any letter fits best.
+    scores = scores[:, scores.amax(0).argmax()]
+    own = string.ascii_uppercase.index(letter.upper())
+    others = torch.cat([scores[:own], scores[own + 1 :]])
+    assert float(scores[own]) >= 0.6
+    assert float(scores[own]) >= float(others.max()) + 0.1
+
+
+def test_bars_behind_foam_are_told_apart():
+    picture = front_view("resolution_50")
+    for row, bars in ((8, 2), (17, 3)):
+        profile = picture[row - 1 : row + 2].mean(0)
+        inner = profile[1:-1]
+        peaks = [k + 1 for k in range(30) if inner[k] > profile[k] and inner[k] >= profile[k + 2]]
+        peaks = [k for k in peaks if profile[k] > 0.4 * profile.max()]
+        assert len(peaks) == bars
+        for left, right in itertools.pairwise(peaks):
+            low, high = float(profile[left:right].min()), float(torch.minimum(profile[left], profile[right]))
+            assert (high - low) / (high + low) >= 0.2

@@ -1,0 +1,104 @@
+"""f-k migration of single and exhaustive captures by their midpoints."""
+
+import math
+
+import pytest
+import torch
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan, Wall
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.reconstruction import MidpointFK, midpoint_fk
+from torchtransient.reconstruction.midpoint_fk import Midpoints
+
+F64 = torch.float64
+WALL = Wall.plane(1.0, 1.0)
+AXIS = TimeAxis(0.0, 0.0192, 192)
+
+
+def capture_of(points, scan):
+    """(T, *scan.shape): light (r_laser r_sensor)^-2 of points, Gaussian pulses of two bins."""
+    spots, sensors = scan.laser_points.reshape(-1, 1, 3), scan.sensor_points.reshape(1, -1, 3)
+    light = torch.zeros(AXIS.num_bins, spots.shape[0], sensors.shape[1], dtype=F64)
+    for point in torch.tensor(points, dtype=F64):
+        near, far = (spots - point).norm(dim=-1), (sensors - point).norm(dim=-1)
+        steps = (AXIS.edges_opl[:, None, None] - near - far) / (2 * AXIS.bin_width_opl)
+        light += (near * far) ** -2 * torch.special.ndtr(steps).diff(dim=0)
+    return light.reshape(AXIS.num_bins, *scan.shape)
+
+
+SCANS = {
+    "single": Scan.grid(WALL, 24, kind="single", laser=(0.5, 0.5)),
+    "single, aside": Scan.grid(WALL, 24, kind="single", laser=(0.3, 0.62)),
+    "exhaustive": Scan.grid(WALL, 12, kind="exhaustive", laser_grid=4),
+}
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_midpoints_stand_between_spot_and_sensor_point(name):
+    scan = SCANS[name]
+    midpoints = Midpoints(scan, time_axis=AXIS, dtype=F64)
+    grid = midpoints.wall.points.reshape(-1, 3)
+    spots, sensors = scan.laser_points.reshape(-1, 1, 3), scan.sensor_points.reshape(1, -1, 3)
+    off = (grid[midpoints.place] - ((spots + sensors) / 2).reshape(-1, 3)).norm(dim=-1)
+    # Exactly where one spot has all midpoints on a grid; else within half a step of it in each direction.
+    assert float(off.max()) < (1e-9 if scan.kind == "single" else math.hypot(*midpoints.grid.pitch) / 2 + 1e-9)
+
+
+def test_moveout_brings_a_point_below_the_middle_to_its_confocal_time():
+    scan = SCANS["exhaustive"]
+    midpoints = Midpoints(scan, time_axis=AXIS, dtype=F64)
+    z = 0.9
+    light = torch.zeros(AXIS.num_bins, len(midpoints.place), dtype=F64)
+    tau = torch.sqrt(4 * z**2 + midpoints.distance_squared)
+    light += torch.special.ndtr((AXIS.edges_opl[:, None] - tau) / 0.06).diff(dim=0)
+    moved = midpoints.adjoint(light.reshape(midpoints.data_shape)).reshape(AXIS.num_bins, -1)
+    seen = moved.sum(0) > 0
+    assert int(seen.sum()) > 300
+    mean = (moved * AXIS.centers_opl[:, None]).sum(0)[seen] / moved.sum(0)[seen]
+    assert float((mean - 2 * z).abs().max()) < 0.005
+
+
+@pytest.mark.parametrize("name, place", [("single", (0.0, 0.0, 0.8)), ("exhaustive", (0.1, -0.1, 0.9))])
+def test_points_come_out_where_they_are(name, place):
+    operator = MidpointFK(SCANS[name], time_axis=AXIS, dtype=F64)
+    volume = operator.reconstruct(capture_of([place], SCANS[name]))
+    found = operator.points.reshape(-1, 3)[volume.argmax()]
+    # Within a step of the fine grid, and a bin.
+    assert float((found - torch.tensor(place)).abs().max()) < 0.045
+
+
+@pytest.mark.parametrize(
+    "name, least", [pytest.param("single", 0.7, marks=pytest.mark.slow), ("exhaustive", 0.8)]
+)
+def test_front_view_of_a_letter(name, least):
+    bar = [(0.02 * k + 0.05, 0.2, 0.8) for k in range(-12, 13)]
+    stem = [(0.05, 0.02 * k - 0.05, 0.8) for k in range(-12, 13)]
+    operator = MidpointFK(SCANS[name], time_axis=AXIS, dtype=F64)
+    front = operator.reconstruct(capture_of(bar + stem, SCANS[name])).amax(0)
+    places = operator.points[0, ..., :2]
+    across = places[:, :, None] - torch.tensor(bar + stem, dtype=F64)[:, :2]
+    truth = torch.exp(-across.square().sum(-1) / (2 * 0.03**2)).sum(-1)
+    assert float((front * truth).sum() / (front.norm() * truth.norm())) > least
+
+
+def test_captures():
+    scan = SCANS["single"]
+    light = capture_of([(0.0, 0.0, 0.8)], scan)
+    volume = midpoint_fk(Capture(light[None].float(), AXIS, scan), floor=1e-4)
+    assert volume.shape == (1, 192, 48, 48) and volume.dtype == torch.float32
+    with pytest.raises(ShapeError, match="Make an operator"):
+        MidpointFK(SCANS["single, aside"], time_axis=AXIS).reconstruct(Capture(light[None], AXIS, scan))
+
+
+def test_what_it_cannot_take_is_refused():
+    with pytest.raises(ShapeError, match="Use FK"):
+        MidpointFK(Scan.grid(WALL, 8, kind="confocal"), time_axis=AXIS)
+    with pytest.raises(ShapeError, match="first and last"):
+        MidpointFK(Scan.grid(WALL, 8, kind="single", first_and_last_leg=True), time_axis=AXIS)
+    with pytest.raises(ShapeError, match="within their rectangle"):
+        MidpointFK(Scan.grid(WALL, 8, kind="single", laser=(0.9, 0.9), extent=(0, 0, 0.5, 0.5)), time_axis=AXIS)
+    with pytest.raises(UnitError, match="from zero on"):
+        MidpointFK(SCANS["single"], time_axis=TimeAxis(-0.1, 0.02, 32))
+    with pytest.raises(UnitError, match="dtype"):
+        MidpointFK(SCANS["single"], time_axis=AXIS, dtype=torch.float16)

@@ -1,0 +1,292 @@
+"""What every operator between volumes and captures owes: an exact adjoint, derivatives in both modes, batches, places
+of its voxels, captures as data, typed errors.
+"""
+
+import copy
+import inspect
+import pickle
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torchtransient.reconstruction as room
+from support import grid_operators, scan_operators
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import DeviceError, ShapeError, UnitError
+from torchtransient.reconstruction import LinearOperator, PlanarScan, confocal_operator
+from torchtransient.reconstruction.confocal_operator import InverseOperator
+
+ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
+OPERATORS = ON_GRIDS | ANYWHERE
+every = pytest.mark.parametrize("name", OPERATORS)
+on_grids = pytest.mark.parametrize("name", ON_GRIDS)
+with_pictures = pytest.mark.parametrize("name", [name for name in OPERATORS if hasattr(OPERATORS[name], "reconstruct")])
+CLASSES = [
+    kind for kind in vars(room).values()
+    if inspect.isclass(kind) and issubclass(kind, LinearOperator) and kind is not LinearOperator
+]  # fmt: skip
+# Function -> class, by what their documentation says.
+TWINS = {name: twin for name, twin in vars(room).items() if (twin.__doc__ or "").startswith(":meth:`")}
+
+
+def drawn(shape, real, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64 if real else torch.complex128)
+
+
+def volume_of(operator, *lead, seed=0):
+    return drawn((*lead, *operator.volume_shape), operator.real_volume, seed)
+
+
+def data_of(operator, *lead, seed=1):
+    return drawn((*lead, *operator.data_shape), operator.real_data, seed)
+
+
+def product(a, b):
+    """Re <a, b>."""
+    return (a.conj() * b).sum().real
+
+
+def as_real(function):
+    """A function whose complex results are pairs of reals: random checks of derivatives want those."""
+    return lambda x: torch.view_as_real(y) if (y := function(x)).is_complex() else y
+
+
+def test_nothing_is_left_out():
+    listed = {type(operator) for operator in OPERATORS.values()}
+    assert len(ON_GRIDS) + len(ANYWHERE) == len(OPERATORS)
+    assert set(CLASSES) <= listed
+    assert len(TWINS) == 7
+
+
+@every
+def test_adjoint_is_exact(name):
+    operator = OPERATORS[name]
+    x, y = volume_of(operator, 2, 3), data_of(operator, 2, 3)
+    forward, backward = product(operator(x), y), product(x, operator.adjoint(y))
+    scale = operator(x).norm() * y.norm()
+    assert scale > 0
+    assert abs(forward - backward) < 1e-13 * scale
+    assert abs(forward - backward) < 1e-10 * abs(forward)
+
+
+@every
+@pytest.mark.parametrize("way", ["forward", "adjoint"])
+def test_derivatives_of_first_and_second_order_in_both_modes(name, way):
+    operator = OPERATORS[name]
+    function = getattr(operator, way)
+    x = (volume_of if way == "forward" else data_of)(operator)
+    # Inverses are steep: small operands keep rounding below the checks' tolerance.
+    scale = 1 / float(function(x).abs().max())
+    scaled = as_real(lambda v: function(scale * v))
+    assert torch.autograd.gradcheck(scaled, x.clone().requires_grad_(), check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradgradcheck(scaled, x.clone().requires_grad_(), fast_mode=True)
+    _, tangent = torch.func.jvp(function, (x,), (x,))
+    torch.testing.assert_close(tangent, function(x), rtol=0, atol=0)
+
+
+@every
+def test_batches_and_channels_are_items_on_their_own(name):
+    operator = OPERATORS[name]
+    # Grids take items one at a time; the others may add up in another order.
+    close = {"rtol": 0, "atol": 0} if name in ON_GRIDS else {"rtol": 1e-12, "atol": 1e-12}
+    for function, x in ((operator, volume_of(operator, 2, 3)), (operator.adjoint, data_of(operator, 2, 3))):
+        together = function(x)
+        assert together.shape[:2] == (2, 3)
+        torch.testing.assert_close(function(x[1, 2]), together[1, 2], **close)
+        torch.testing.assert_close(torch.vmap(function)(x), together, **close)
+        torch.testing.assert_close(torch.vmap(function, in_dims=1, out_dims=1)(x), together, **close)
+
+
+@every
+def test_linear(name):
+    operator = OPERATORS[name]
+    for function, make in ((operator, volume_of), (operator.adjoint, data_of)):
+        a, b = make(operator, seed=2), make(operator, seed=3)
+        expected = 2 * function(a) - 3 * function(b)
+        slack = 1e-11 * max(1.0, float(expected.abs().max()))
+        torch.testing.assert_close(function(2 * a - 3 * b), expected, rtol=1e-11, atol=slack)
+
+
+@on_grids
+def test_pieces_do_not_show(name, monkeypatch):
+    operator = OPERATORS[name]
+    x, y = volume_of(operator), data_of(operator)
+    whole = operator(x), operator.adjoint(y)
+    for elements in (1, 400, 1 << 30):
+        monkeypatch.setattr(confocal_operator, "CPU_CHUNK", elements)
+        for found, expected in zip((operator(x), operator.adjoint(y)), whole, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12 * float(expected.abs().max()))
+
+
+@every
+def test_single_precision_has_its_digits(name):
+    double = OPERATORS[name]
+    single = copy.deepcopy(double).float()
+    assert single.dtype == torch.float32
+    # Arrivals anywhere are exact to some 1e-6 bins of 24, and what they are interpolated between varies by its own
+    # size.
+    most = 1e-5 if name in ON_GRIDS else 2e-5
+    for function, twin, x in ((single, double, volume_of(double)), (single.adjoint, double.adjoint, data_of(double))):
+        expected, found = twin(x), function(x.to(torch.complex64 if x.is_complex() else torch.float32))
+        assert found.dtype == (torch.complex64 if expected.is_complex() else torch.float32)
+        assert (found - expected).norm() < most * expected.norm()
+
+
+@every
+def test_back_in_double_precision_all_digits_are_there(name):
+    operator = OPERATORS[name]
+    again = copy.deepcopy(operator).float().double()
+    torch.testing.assert_close(again.adjoint(data_of(operator)), operator.adjoint(data_of(operator)), rtol=0, atol=0)
+
+
+@every
+def test_other_precisions_are_refused(name):
+    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
+        copy.deepcopy(OPERATORS[name]).half()
+
+
+@every
+def test_copies_and_pickles_are_the_same_operator(name):
+    operator = OPERATORS[name]
+    y = data_of(operator)
+    for other in (copy.deepcopy(operator), pickle.loads(pickle.dumps(operator))):
+        torch.testing.assert_close(other.adjoint(y), operator.adjoint(y), rtol=0, atol=0)
+        torch.testing.assert_close(other.points, operator.points, rtol=0, atol=0)
+    assert not operator.state_dict()
+    assert "voxels" in repr(operator)
+
+
+@every
+def test_nothing_is_kept_for_the_backward_pass(name):
+    operator = OPERATORS[name]
+    kept = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: kept.append(t) or t, lambda t: t):
+        operator(volume_of(operator).requires_grad_())
+        operator.adjoint(data_of(operator).requires_grad_())
+    assert not kept
+
+
+@every
+def test_wrong_operands_are_refused(name):
+    operator = OPERATORS[name]
+    with pytest.raises(ShapeError, match="expected data"):
+        operator.adjoint(torch.zeros(3, 3))
+    with pytest.raises(ShapeError, match="expected volume"):
+        operator(torch.zeros(3))
+    with pytest.raises(ShapeError, match="real numbers"):
+        operator.adjoint(data_of(operator).to(torch.complex128))
+    with pytest.raises(ShapeError, match="as a tensor"):
+        operator(None)
+    with pytest.raises(DeviceError, match="expected volume on cpu"):
+        operator(volume_of(operator).to("meta"))
+
+
+@every
+def test_works_where_its_tables_are(name):
+    # The meta device refuses everything that stays on the CPU.
+    operator = copy.deepcopy(OPERATORS[name]).to("meta")
+    assert str(operator.device) == "meta" and operator.dtype == torch.float64
+    assert operator(volume_of(operator, 2).to("meta")).shape == (2, *operator.data_shape)
+    assert operator.adjoint(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
+    if hasattr(operator, "reconstruct"):
+        assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
+
+
+# ----------------------------------------------------------------------------------------- places, captures, arguments
+
+
+@every
+def test_voxels_have_places(name):
+    operator = OPERATORS[name]
+    points = operator.points
+    assert points.dtype == torch.float64 and points.shape[-1] == 3 and str(points.device) == "cpu"
+    # Those of the result of an inverse.
+    volume = operator.data_shape if isinstance(operator, InverseOperator) else operator.volume_shape
+    assert volume[len(volume) - points.ndim + 1 :] == points.shape[:-1]
+    assert isinstance(operator.axis, TimeAxis)
+    if operator.grid is None:
+        assert operator.depths is None
+        return
+    torch.testing.assert_close(operator.grid.points, points, rtol=0, atol=0)
+    assert operator.depths.shape == (points.shape[0],) and operator.depths.dtype == torch.float64
+    from_wall = (points - points[:1]).norm(dim=-1)
+    torch.testing.assert_close(from_wall, (operator.depths - operator.depths[0])[:, None, None].expand_as(from_wall))
+
+
+@with_pictures
+def test_pictures_are_real_and_differentiable(name):
+    operator = OPERATORS[name]
+    y = data_of(operator).requires_grad_()
+    picture = operator.reconstruct(y)
+    assert picture.shape == operator.volume_shape
+    assert not picture.is_complex()
+    (gradient,) = torch.autograd.grad(picture.square().sum(), y)
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().max() > 0
+    zero = torch.zeros_like(y, requires_grad=True)
+    (gradient,) = torch.autograd.grad(operator.reconstruct(zero).sum(), zero)
+    assert torch.isfinite(gradient).all()
+    with pytest.raises(ShapeError, match="expected transient"):
+        operator.reconstruct(torch.zeros(2))
+
+
+@with_pictures
+def test_captures_are_taken_as_their_transients(name):
+    operator = OPERATORS[name]
+    light = data_of(operator, 2)
+    expected = operator.reconstruct(light)
+    for scan in (operator.scan, copy.deepcopy(operator.scan)):
+        found = operator.reconstruct(Capture(light, operator.axis, scan))
+        torch.testing.assert_close(found, expected, rtol=0, atol=0)
+
+
+@with_pictures
+def test_captures_of_something_else_are_refused(name):
+    operator = OPERATORS[name]
+    light, scan = data_of(operator, 2), operator.scan
+    later = replace(operator.axis, start_opl=operator.axis.start_opl + 0.01)
+    moved = replace(scan, sensor_points=scan.sensor_points + 0.01, laser_points=scan.laser_points + 0.01)
+    for other, words in (
+        (Capture(light, later, scan), "as the operator has"),
+        (Capture(light, operator.axis, moved), "own scan"),
+        (Capture(light, operator.axis, replace(scan, first_and_last_leg=not scan.first_and_last_leg)), "leg"),
+        (Capture(light[:1].expand(4, 2, *operator.data_shape), operator.axis, scan, polarized=True), "Stokes"),
+    ):
+        with pytest.raises(ShapeError, match=words):
+            operator.reconstruct(other)
+
+
+@pytest.mark.parametrize("kind", CLASSES)
+def test_arguments_come_in_one_order(kind):
+    parameters = inspect.signature(kind).parameters
+    by_place = [name for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    assert by_place in (["scan"], ["scan", "points"])
+    assert {"time_axis", "dtype"} <= {name for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+    assert parameters["time_axis"].default is inspect.Parameter.empty
+    assert parameters["dtype"].default is torch.float32
+
+
+@pytest.mark.parametrize("twin", TWINS.values(), ids=TWINS)
+def test_function_twins_take_a_capture_first(twin):
+    parameters = inspect.signature(twin).parameters.values()
+    by_place = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    assert by_place in (["capture"], ["capture", "points"])
+    with pytest.raises(ShapeError, match=rf"^{twin.__name__}: expected a tt\.nlos\.Capture"):
+        # Options that have no default are not looked at before.
+        twin(torch.zeros(3), *[None] * (len(by_place) - 1), **{
+            p.name: None for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty
+        })  # fmt: skip
+
+
+def test_grids_of_the_same_wall_are_told_from_others():
+    scan = grid_operators.SCAN
+    wall = PlanarScan.of_scan(scan, "test")
+    assert wall.matches(PlanarScan.of_scan(copy.deepcopy(scan), "test"))
+    assert wall.matches(PlanarScan.of(scan.sensor_points.float(), scan.sensor_normals, who="test"))
+    assert not wall.matches(PlanarScan.of(1.01 * scan.sensor_points, scan.sensor_normals, who="test"))
+    assert not wall.matches(PlanarScan.of(scan.sensor_points, -scan.sensor_normals, who="test"))
+    assert not wall.matches(PlanarScan.of(scan.sensor_points[:, 1:], scan.sensor_normals[:, 1:], who="test"))
+    assert not isinstance(wall, Scan) and "5 x 6 points" in repr(wall)

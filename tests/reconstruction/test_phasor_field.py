@@ -1,0 +1,194 @@
+"""Phasor fields against sums that are written out, against filtered backprojection, and in time."""
+
+import math
+
+import pytest
+import torch
+
+from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Scan
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.reconstruction import (
+    ConfocalCamera,
+    FilteredBackprojection,
+    PhasorField,
+    PhasorFilter,
+    TransientCamera,
+    VoxelGrid,
+    phasor_field,
+    phasor_image,
+)
+from torchtransient.testing.point_captures import point_capture
+
+F64 = torch.float64
+
+
+def noise(*shape, seed=0):
+    return torch.randn(shape, dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def written_out(scan, points, light, operator, falloff, moments=None):
+    """Sum over frequencies and pairs of phasor times wave, at points (V, 3); light (T, *scan.shape)."""
+    spots, sensors = scan.laser_points.reshape(-1, 3), scan.sensor_points.reshape(-1, 3)
+    legs = scan.first_and_last_leg
+    first, last = scan.laser_legs.reshape(-1) * legs, scan.sensor_legs.reshape(-1) * legs
+    to_spot, to_sensor = (torch.cdist(points, p) for p in (spots, sensors))
+    if scan.kind == "exhaustive":
+        lengths = to_spot[:, :, None] + to_sensor[:, None, :]
+        weights = (to_spot[:, :, None] * to_sensor[:, None, :]) ** -falloff
+        offsets = first[:, None] + last
+    else:
+        lengths, weights, offsets = to_spot + to_sensor, (to_spot * to_sensor) ** -falloff, first + last
+    if moments is not None:
+        lengths, weights = to_sensor, to_sensor**-falloff
+    lengths, weights = lengths.reshape(len(points), -1), weights.reshape(len(points), -1)
+    found = 0
+    for f, w in zip(operator.frequencies, operator.band_weights, strict=True):
+        arrivals = operator.axis.centers_opl[:, None] - offsets.reshape(-1)
+        phasors = (light.flatten(1) * torch.exp(-2j * math.pi * f * arrivals)).sum(0)
+        field = (weights * phasors * torch.exp(2j * math.pi * f * lengths)).sum(1)
+        if moments is not None:
+            field = torch.exp(2j * math.pi * f * moments)[:, None] * field
+        found = found + w * field
+    return found
+
+
+@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("falloff", [0.0, 1.0])
+def test_is_the_sum_that_is_written_out(name, falloff):
+    scan = SCANS[name]
+    grid = VoxelGrid.before(scan, DEPTHS)
+    operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, falloff=falloff, dtype=F64)
+    light = noise(*operator.data_shape)
+    expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, falloff).reshape(grid.shape)
+    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
+
+
+def test_planes_of_other_sizes_elsewhere():
+    # Rows and columns of the scan's pitch, more of them, beside it and behind each other as they like.
+    scan = SCANS["single"]
+    pitch = (0.06, 0.2 / 3)
+    grid = VoxelGrid.before(scan, [0.12, 0.13, 0.31], size=(7, 2), extent=(7 * pitch[0], 2 * pitch[1]))
+    operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, dtype=F64)
+    light = noise(*operator.data_shape)
+    expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, 0.0).reshape(grid.shape)
+    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
+
+
+def test_transient_camera_is_the_sum_that_is_written_out():
+    scan, moments = SCANS["single"], torch.tensor([0.1, 0.2, 0.35], dtype=F64)
+    grid = VoxelGrid.before(scan, DEPTHS)
+    operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, camera=TransientCamera(moments), dtype=F64)
+    light = noise(*operator.data_shape)
+    expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, 0.0, moments).reshape(3, *grid.shape)
+    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_pieces_do_not_show(name, monkeypatch):
+    scan = SCANS[name]
+    operator = PhasorField(scan, VoxelGrid.before(scan, DEPTHS), time_axis=AXIS, pulse=PULSE, dtype=F64)
+    light = noise(2, *operator.data_shape)
+    whole = operator.adjoint(light)
+    forward = operator(whole)
+    for budget in (1, 2 * math.prod(operator.shape_fft) * (len(operator.frequencies) + 1)):
+        monkeypatch.setattr(phasor_field, "CPU_CHUNK", budget)
+        torch.testing.assert_close(operator.adjoint(light), whole, rtol=1e-11, atol=1e-11)
+        torch.testing.assert_close(operator(whole), forward, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_without_falloff_it_is_filtered_backprojection(kind):
+    # Linear interpolation between bins loses (pi bin / wavelength)^2 / 3 of a wave at most; ours knows its phase.
+    scan = Scan.grid(WALL, (6, 5), kind=kind, **({"laser_grid": 2} if kind == "exhaustive" else {}))
+    grid = VoxelGrid.before(scan, DEPTHS)
+    pulse = PhasorFilter(0.12, 4.0)
+    errors = []
+    for bins in (50, 100):
+        axis = TimeAxis(-0.4, 1.5 / bins, bins)
+        capture = point_capture(scan, [(0.02, 0.01, 0.15), (-0.05, 0.04, 0.2)], time_axis=axis, pulse_sigma_opl=0.03)
+        light = capture.transient[0]
+        field = PhasorField(scan, grid, time_axis=axis, pulse=pulse, falloff=0.0, dtype=F64).adjoint(light)
+        summed = FilteredBackprojection(scan, grid, time_axis=axis, filter=pulse, dtype=F64).adjoint(light)
+        errors.append(float((field - summed).norm() / summed.norm()))
+        assert errors[-1] < (math.pi * axis.bin_width_opl / pulse.wavelength) ** 2 / 3
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_records_do_not_wrap():
+    # Light at the very end of a record, planes at whose lengths it has begun: nothing comes around. The band ends at
+    # 3e-4 of its height, which is what is left far from a pulse, in 1 of 14 parts.
+    scan = SCANS["confocal"]
+    axis = TimeAxis(0.2, 0.01, 200)
+    light = torch.zeros(200, *scan.shape, dtype=F64)
+    light[-1] = 1.0
+    of = {"time_axis": axis, "pulse": PhasorFilter(0.1), "dtype": F64}
+    operator = PhasorField(scan, VoxelGrid.before(scan, [0.1, 0.11]), **of)
+    late = PhasorField(scan, VoxelGrid.before(scan, [1.08]), **of)
+    assert operator.adjoint(light).abs().max() < 3e-4 * late.adjoint(light).abs().max()
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_a_point_is_brightest_where_it_is(kind):
+    wall_scan = Scan.grid(WALL, 12, kind=kind, **({"laser_grid": 3} if kind == "exhaustive" else {}))
+    grid = VoxelGrid.before(wall_scan, torch.linspace(0.1, 0.2, 11))
+    capture = point_capture(wall_scan, grid.points[6, 4, 7][None], time_axis=TimeAxis(0.1, 0.01, 50))
+    picture = phasor_image(capture, grid, pulse=PhasorFilter(0.04, 3.0))
+    assert picture.shape == (1, 11, 12, 12)
+    assert int(picture.argmax()) == (6 * 12 + 4) * 12 + 7
+
+
+def test_transient_camera_sees_the_pulse_arrive():
+    # A hidden point lights up when the light of the spot reaches it: at its distance, to a tenth of a wavelength.
+    scan = Scan.grid(WALL, 12, kind="single", laser=(0.25, 0.5))
+    point = torch.tensor([0.03, -0.02, 0.16], dtype=F64)
+    capture = point_capture(scan, point[None], time_axis=TimeAxis(0.1, 0.005, 120), pulse_sigma_opl=0.005)
+    times = torch.arange(0.1, 0.25, 0.004, dtype=F64)
+    grid = VoxelGrid.before(scan, [0.16])
+    camera = TransientCamera(times)
+    video = phasor_image(capture, grid, pulse=PhasorFilter(0.06, 3.0), camera=camera)[0]
+    assert video.shape == (len(times), 1, 12, 12)
+    j, i = divmod(int((grid.points[0] - point).norm(dim=-1).argmin()), 12)
+    seen = float(times[video[:, 0, j, i].argmax()])
+    assert seen == pytest.approx(float((scan.laser_points - point).norm()), abs=0.006)
+
+
+def test_confocal_camera_begins_with_direct_light():
+    scan = SCANS["exhaustive, legs"]
+    grid = VoxelGrid.before(scan, DEPTHS)
+    of = {"time_axis": AXIS, "pulse": PULSE, "dtype": F64}
+    still = PhasorField(scan, grid, **of)
+    video = PhasorField(scan, grid, camera=ConfocalCamera([0.0, 0.05]), **of)
+    # Longer videos need denser frequencies: the same field by another quadrature.
+    light = noise(*still.data_shape)
+    first = video.adjoint(light)[0]
+    assert (first - still.adjoint(light)).norm() < 1e-3 * first.norm()
+
+
+def test_what_cannot_be_taken():
+    scan, grid = SCANS["confocal"], VoxelGrid.before(SCANS["confocal"], DEPTHS)
+    of = {"time_axis": AXIS, "pulse": PULSE}
+    with pytest.raises(ShapeError, match="FilteredBackprojection takes points"):
+        PhasorField(scan, grid.points, **of)
+    with pytest.raises(ShapeError, match="pulse as a PhasorFilter"):
+        PhasorField(scan, grid, time_axis=AXIS, pulse=0.1)
+    with pytest.raises(ShapeError, match="ConfocalCamera"):
+        PhasorField(scan, grid, camera="transient", **of)
+    with pytest.raises(SceneError, match="one laser spot"):
+        PhasorField(scan, grid, camera=TransientCamera([0.1]), **of)
+    with pytest.raises(ShapeError, match="with its pitch"):
+        PhasorField(scan, VoxelGrid.before(scan, DEPTHS, size=5), **of)
+    with pytest.raises(ShapeError, match="with its pitch"):
+        PhasorField(scan, VoxelGrid.bounds([[-1, -1, 0.1], [1, 1, 0.3]], 3), **of)
+    with pytest.raises(ShapeError, match="regular, rectangular grid"):
+        PhasorField(bent_scan(), grid, **of)
+    with pytest.raises(ShapeError, match="the wall itself"):
+        PhasorField(scan, grid.at_depths([0.0, 0.1]), **of)
+    with pytest.raises(UnitError, match="two bins"):
+        PhasorField(scan, grid, time_axis=AXIS, pulse=PhasorFilter(0.03))
+    for camera in (ConfocalCamera, TransientCamera):
+        with pytest.raises(ShapeError, match="times"):
+            camera([])
+        with pytest.raises(UnitError, match="finite times"):
+            camera([math.inf])

@@ -1,0 +1,153 @@
+"""Depths and normals of volumes whose surfaces are known."""
+
+import math
+
+import pytest
+import torch
+
+from torchtransient.capture import Scan, Wall
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.reconstruction import (
+    VoxelGrid,
+    depth_map,
+    normals_from_depth,
+    normals_from_volume,
+    soft_depth,
+)
+
+F64 = torch.float64
+UNEVEN = torch.tensor([0.5, 0.52, 0.55, 0.6, 0.62, 0.66, 0.7, 0.75], dtype=F64)
+
+
+def grid_of(depths, size=9):
+    """On a wall that does not stand along the axes of the world."""
+    wall = Wall.plane(1.0, 0.8, center=(1.0, 2.0, 3.0), normal=(0.6, 0.0, 0.8))
+    return VoxelGrid.before(Scan.grid(wall, size, kind="confocal"), depths)
+
+
+def slanted(grid, slope_x, slope_y, width):
+    """A plane's brightness (Z, Y, X) under a Gaussian profile along depth, and its depth (Y, X)."""
+    y, x = (torch.arange(n, dtype=F64) - (n - 1) / 2 for n in grid.size)
+    depth = 0.6 + slope_x * grid.pitch[1] * x + slope_y * grid.pitch[0] * y[:, None]
+    return torch.exp(-((grid.depths[:, None, None] - depth) ** 2) / (2 * width**2)), depth
+
+
+def test_depth_of_a_parabola_is_exact_on_uneven_planes():
+    truth = torch.linspace(0.511, 0.72, 40, dtype=F64).reshape(5, 8)
+    volume = 1 - (UNEVEN[:, None, None] - truth) ** 2
+    found = depth_map(volume, UNEVEN)
+    # The highest plane is the nearest one to the top of a parabola: the top is within half a step.
+    torch.testing.assert_close(found.depth, truth, rtol=0, atol=1e-12)
+
+
+def test_tops_beyond_the_planes_stay_on_them():
+    volume = 2 - (UNEVEN[:, None, None] - torch.tensor([[0.3, 0.9]], dtype=F64)) ** 2
+    torch.testing.assert_close(depth_map(volume, UNEVEN).depth, torch.tensor([[0.5, 0.75]], dtype=F64))
+
+
+def test_confidence_and_mask():
+    volume = torch.zeros(2, 3, 1, 4)
+    volume[0, 1, 0] = torch.tensor([1.0, 0.5, 0.09, 0.0])
+    found = depth_map(volume, [0.1, 0.2, 0.3])
+    assert torch.equal(found.confidence[0, 0], volume[0, 1, 0])
+    assert found.mask[0, 0].tolist() == [True, True, False, False]
+    assert not found.mask[1].any()
+    assert torch.isfinite(found.depth).all()
+    assert depth_map(volume, [0.1, 0.2, 0.3], threshold=0.01).mask[0, 0].tolist() == [True, True, True, False]
+    assert not depth_map(-volume - 1, [0.1, 0.2, 0.3]).mask.any()
+
+
+def test_one_plane_and_two():
+    assert depth_map(torch.ones(1, 2, 2), [0.4]).depth.tolist() == [[pytest.approx(0.4)] * 2] * 2
+    assert depth_map(torch.tensor([[[1.0]], [[2.0]]]), [0.4, 0.5]).depth.item() == pytest.approx(0.5)
+
+
+def test_derivatives_of_depth():
+    generator = torch.Generator().manual_seed(3)
+    bumps = 1 - 20 * (UNEVEN[:, None, None] - (0.56 + 0.1 * torch.rand(2, 3, dtype=F64, generator=generator))) ** 2
+    volume = bumps.requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: depth_map(v, UNEVEN).depth, volume)
+    assert torch.autograd.gradcheck(lambda v: soft_depth(v, UNEVEN), volume)
+    grid = grid_of(UNEVEN, 3)
+    surface = slanted(grid, 0.05, -0.02, 0.05)[0].requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: normals_from_volume(v, grid), surface)
+    assert torch.autograd.gradcheck(
+        lambda d: normals_from_depth(d, grid), slanted(grid, 0.3, 0.2, 1.0)[1].requires_grad_()
+    )
+
+
+def test_gradients_of_empty_volumes_are_finite():
+    grid = grid_of(UNEVEN, 3)
+    volume = torch.zeros(2, *grid.shape, requires_grad=True)
+    for function in (
+        lambda v: depth_map(v, grid).depth,
+        lambda v: soft_depth(v, grid),
+        lambda v: normals_from_volume(v, grid),
+    ):
+        result = function(volume)
+        assert torch.isfinite(result).all()
+        (gradient,) = torch.autograd.grad(result.sum(), volume)
+        assert torch.isfinite(gradient).all()
+
+
+def test_soft_depth_goes_to_the_planes_of_the_maximum():
+    grid = grid_of(torch.linspace(0.4, 0.8, 81, dtype=F64))
+    volume, depth = slanted(grid, 0.1, 0.05, 0.02)
+    # A symmetric peak has its mean at its top.
+    assert (soft_depth(volume, grid) - depth).abs().max() < 1e-3
+    assert (soft_depth(1e-12 * volume, grid) - soft_depth(volume, grid)).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (0.25, 0.2)])
+def test_normals_of_planes(slopes):
+    grid = grid_of(torch.linspace(0.3, 0.9, 61, dtype=F64))
+    volume, depth = slanted(grid, *slopes, 0.06)
+    length = math.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
+    expected = (slopes[0] * grid.along_x + slopes[1] * grid.along_y - grid.normal) / length
+    exact = normals_from_depth(depth, grid)
+    assert exact.shape == (3, 9, 9)
+    torch.testing.assert_close(exact, expected[:, None, None].expand(3, 9, 9), rtol=0, atol=1e-12)
+    # Depth by interpolation of a Gaussian: the parabola's error is a few thousandths of a step.
+    found = normals_from_depth(depth_map(volume, grid).depth, grid)
+    assert (found - exact).norm(dim=0).max() < 1e-3
+    # Differences over a pitch of 0.11 m, where the profile is 0.06 m wide: (slope pitch / width)^2 / 6 of the slope.
+    inside = normals_from_volume(volume, grid)[:, 1:-1, 1:-1]
+    error = max(abs(s) * (s * p / 0.06) ** 2 / 6 for s, p in zip(slopes, reversed(grid.pitch), strict=True))
+    assert (inside - exact[:, 1:-1, 1:-1]).norm(dim=0).max() < 1.5 * error + 2e-2 * max(map(abs, slopes)) + 1e-9
+
+
+def test_batches_are_items_on_their_own():
+    grid = grid_of(UNEVEN)
+    volume = torch.rand(2, 3, *grid.shape, generator=torch.Generator().manual_seed(0))
+    for function in (
+        lambda v: depth_map(v, grid).depth,
+        lambda v: depth_map(v, grid).confidence,
+        lambda v: soft_depth(v, grid),
+        lambda v: normals_from_volume(v, grid),
+        lambda v: normals_from_depth(v[..., 0, :, :], grid),
+    ):
+        torch.testing.assert_close(function(volume)[1, 2], function(volume[1, 2]))
+        torch.testing.assert_close(torch.vmap(function)(volume), function(volume))
+
+
+def test_what_cannot_be_taken():
+    grid = grid_of(UNEVEN)
+    for function in (depth_map, soft_depth, normals_from_volume):
+        with pytest.raises(ShapeError, match="expected a volume"):
+            function(torch.zeros(3, 3, 3), grid)
+        with pytest.raises(ShapeError, match="squared modulus"):
+            function(torch.zeros(grid.shape, dtype=torch.complex64), grid)
+    with pytest.raises(ShapeError, match="expected depths"):
+        depth_map(torch.zeros(grid.shape), None)
+    with pytest.raises(UnitError, match="increase"):
+        depth_map(torch.zeros(2, 2, 2), [0.2, 0.1])
+    with pytest.raises(UnitError, match="threshold"):
+        depth_map(torch.zeros(grid.shape), grid, threshold=2.0)
+    with pytest.raises(UnitError, match="sharpness"):
+        soft_depth(torch.zeros(grid.shape), grid, sharpness=0.0)
+    with pytest.raises(ShapeError, match="knows its axes"):
+        normals_from_depth(torch.zeros(9, 9), UNEVEN)
+    with pytest.raises(ShapeError, match="expected depths"):
+        normals_from_depth(torch.zeros(8, 9), grid)
+    with pytest.raises(ShapeError, match="two planes"):
+        normals_from_volume(torch.zeros(1, 9, 9), grid.at_depths([0.5]))

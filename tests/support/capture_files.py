@@ -1,0 +1,91 @@
+"""Captures that each layout can hold, and files with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Capture, Scan, Wall
+
+AXIS = TimeAxis(1.1, 0.003, 7)
+FROM_ZERO = TimeAxis(0.0, 0.003, 7)
+FREQUENCIES = FrequencyAxis((1.0, 2.1, 30.3), 0.7)
+WALL = Wall.plane(2.0, 1.6)
+SQUARE = Wall.plane(2.0, 2.0)
+ORIGINS = {"sensor_origin": (0.1, 0.2, 0.9), "laser_origin": (-0.3, 0.0, 1.1)}
+LIST = torch.tensor([[0.0, 0.1, 0.0], [0.1, 0.3, 0.0], [0.2, -0.1, 0.0]], dtype=torch.float64)
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def listed(kind, legs=True):
+    spots = {"single": LIST[1], "confocal": LIST, "exhaustive": LIST[:2]}[kind]
+    up = UP.expand(3, 3)
+    return Scan(
+        kind, LIST, spots, *(torch.tensor(ORIGINS[f"{who}_origin"]) for who in ("sensor", "laser")),
+        sensor_normals=up, laser_normals=up[: len(spots)] if spots.ndim == 2 else UP, first_and_last_leg=legs,
+    )  # fmt: skip
+
+
+def grids(legs=True, wall=WALL, size=(4, 3)):
+    settings = {**ORIGINS, "first_and_last_leg": legs}
+    scans = {
+        "single": Scan.grid(wall, size, kind="single", laser=(0.625, 0.5), **settings),
+        "confocal": Scan.grid(wall, size, kind="confocal", **settings),
+        "exhaustive": Scan.grid(wall, size, kind="exhaustive", laser_grid=(2, 5), **settings),
+    }
+    return {kind: replace(scan, wall=None) for kind, scan in scans.items()}
+
+
+def made(scan, axis=AXIS, polarized=False, phasor=False, **settings):
+    """A capture of one channel whose numbers are all different, its points first in memory as films have them."""
+    generator = torch.Generator().manual_seed(0)
+    front = (*((4,) if polarized else ()), 1)
+    count = FREQUENCIES.num_frequencies if phasor else axis.num_bins
+    values = torch.rand(*scan.shape, *front, count, generator=generator)
+    dims = len(scan.shape)
+    values = values.permute(*range(dims, values.ndim), *range(dims))
+    if phasor:
+        values = torch.complex(values, values.flip(-1))
+        settings |= {"phasor": values, "frequencies": FREQUENCIES, "transient": None, "axis": None}
+    return Capture(**{"transient": values, "axis": axis, "scan": scan, "polarized": polarized, **settings})
+
+
+def holdable():
+    """Captures by layout and name that the layout holds without loss (but metadata)."""
+    with_legs, without = grids(), grids(legs=False)
+    yield "torchtransient", "confocal", made(with_legs["confocal"])
+    for kind in with_legs:
+        yield "tal", kind, made(with_legs[kind])
+        yield "tal", f"{kind} from wall to wall", made(without[kind])
+        yield "tal", f"{kind} list", made(listed(kind))
+        yield "tal", f"{kind} phasor", made(with_legs[kind], phasor=True)
+        yield "tal", f"{kind} phasor list", made(listed(kind), phasor=True)
+        yield "tal", f"{kind} polarized", made(with_legs[kind], polarized=True)
+        yield "zaragoza", kind, made(with_legs[kind])
+    whole = made(replace(with_legs["confocal"], wall=dict(WALL.shape)), channels=("y",), metadata={"a": [1, 0.1]})
+    yield "tal", "all of it", replace(whole, steady=torch.rand(1, 3, 4))
+    yield "zaragoza", "confocal square", made(grids(wall=SQUARE, size=(4, 4))["confocal"])
+    yield "dirac", "confocal from wall to wall", made(without["confocal"])
+    yield "dirac", "confocal", made(with_legs["confocal"])
+    yield "phasor_field", "single", made(listed("single"))
+    yield "phasor_field", "exhaustive", made(listed("exhaustive"))
+    square = grids(legs=False, wall=SQUARE, size=(4, 4))
+    square["single"] = replace(square["single"], laser_points=square["single"].sensor_points[1, 2])
+    for kind in ("single", "confocal"):
+        yield "rect_data", kind, made(square[kind], axis=FROM_ZERO)
+
+
+def read_only():
+    """Arrays by name of files that are only read, each with the name of its layout."""
+    rng = np.random.default_rng(0)
+    yield "cdt", {"meas": rng.poisson(3.0, (4, 4, 9)).astype(np.float32)}
+    yield "cdt", {"out": rng.poisson(3.0, (9, 1)).astype(np.float64)}
+    yield "keyhole", {
+        "data": rng.poisson(3.0, (5, 9)).astype(np.float64), "xpos": np.linspace(1, 0, 5)[:, None],
+        "zpos": np.linspace(0.15, 0, 5)[:, None],
+    }  # fmt: skip
+    yield "keyhole", {"direct_before": rng.poisson(3.0, (9, 1)).astype(np.uint32)}
+    yield "rect_data", {"meas": rng.poisson(3.0, (9, 4, 4)).astype(np.uint16)}

@@ -1,0 +1,136 @@
+"""The list of losses that `tests/losses/test_every_loss.py` runs over: one entry brings all of its tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from torchtransient import FrequencyAxis, TimeAxis, losses
+
+BINS = 8
+AXIS = TimeAxis(1.0, 0.05, BINS)
+BAND = FrequencyAxis.uniform(1.0, 0.7, 5)
+TRANSIENT, VOLUME, PICTURE = (2, 1, BINS, 4, 5), (2, 1, 6, 5, 7), (2, 2, 9, 8)
+PIXELS, ALL = (..., slice(1, 3), slice(1, 4)), (..., slice(2, 6), slice(1, 4), slice(1, 4))
+CYCLES = 400
+# What a scan point sees of the planes behind it: a light-weight linear operator that mixes no points.
+_PLANES_TO_BINS = torch.rand(BINS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+
+
+def operator(volume):
+    return torch.einsum("tz,...zyx->...tyx", _PLANES_TO_BINS.to(volume), volume)
+
+
+def positive(shape, generator, dtype=torch.float64):
+    return 0.1 + torch.rand(shape, generator=generator, dtype=torch.float64).to(dtype)
+
+
+def complex_numbers(shape, generator, dtype=torch.float64):
+    return torch.complex(*(torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype) for _ in range(2)))
+
+
+def counts(shape, generator, dtype=torch.float64):
+    return torch.randint(0, 6, shape, generator=generator).to(dtype)
+
+
+@dataclass(frozen=True)
+class LossCase:
+    """`function(input, target, mask=, reduction=)`, the module of the same options, and what is claimed of both."""
+
+    name: str
+    function: Callable[..., torch.Tensor]
+    module: Callable[..., torch.nn.Module]
+    options: dict[str, Any] = field(default_factory=dict)
+    input_shape: tuple[int, ...] = TRANSIENT
+    target_shape: tuple[int, ...] | None = None
+    draw: Callable[..., torch.Tensor] = positive
+    draw_target: Callable[..., torch.Tensor] | None = None
+    crop: tuple[Any, ...] | None = ALL  # what a mask may leave over as if nothing else had been there; None: nothing
+    symmetric: bool = True
+    zero_at_equality: bool = True
+    pair: bool = True
+    mapped: bool = True  # torch.vmap
+    floors_detached: bool = False  # the scale of an item goes in without gradient
+
+    def tensors(self, seed=0, dtype=torch.float64):
+        generator = torch.Generator().manual_seed(seed)
+        x = self.draw(self.input_shape, generator, dtype)
+        return x, (self.draw_target or self.draw)(self.target_shape or self.input_shape, generator, dtype)
+
+    def __call__(self, input, target, mask=None, reduction="mean"):
+        arguments = (input, target) if self.pair else (input,)
+        return self.function(*arguments, **self.options, mask=mask, reduction=reduction)
+
+    def as_module(self, input, target, mask=None, reduction="mean"):
+        module = self.module(**self.options, reduction=reduction)
+        return module(*((input, target) if self.pair else (input,)), mask=mask)
+
+    def __str__(self):
+        return self.name
+
+
+def _measurement(name, **options):
+    return LossCase(
+        name, losses.measurement_consistency, losses.MeasurementConsistency, {"operator": operator, **options},
+        input_shape=VOLUME, target_shape=(2, 1, BINS, 5, 7), crop=PIXELS, symmetric=False, zero_at_equality=False,
+    )  # fmt: skip
+
+
+def _phasors(name, **options):
+    return LossCase(
+        name, losses.transient_phasor_loss, losses.TransientPhasorLoss, {"axis": AXIS, "frequencies": BAND, **options},
+        crop=PIXELS, floors_detached=options == {"phase_only": True},
+    )  # fmt: skip
+
+
+def _likelihood(name, function, module, **options):
+    return LossCase(
+        name, function, module, {"floor": 1e-3, **options}, draw_target=counts, crop=PIXELS, symmetric=False,
+        zero_at_equality=False, mapped=False,
+    )  # fmt: skip
+
+
+WIDTH = {"bin_width_opl": 0.05}
+VOLUMES = {"input_shape": VOLUME}
+CASES = [
+    LossCase("squared", losses.squared_loss, losses.SquaredLoss),
+    LossCase("squared, complex", losses.squared_loss, losses.SquaredLoss, draw=complex_numbers),
+    _measurement("measurement"),
+    _measurement("measurement, scale invariant", scale_invariant=True),
+    _measurement("measurement, roots", compare=losses.root_loss),
+    LossCase("phasor", losses.phasor_loss, losses.PhasorLoss, draw=complex_numbers),
+    LossCase("phasor, phase only", losses.phasor_loss, losses.PhasorLoss, {"phase_only": True, "floor": 0.1},
+             draw=complex_numbers),
+    _phasors("transient phasor"),
+    _phasors("transient phasor, phase only", phase_only=True, floor=0.1),
+    _phasors("transient phasor, phase only, own floor", phase_only=True),
+    LossCase("Wasserstein", losses.wasserstein_loss, losses.WassersteinLoss, {**WIDTH, "floor": 1e-2}),
+    LossCase("Wasserstein, own floor", losses.wasserstein_loss, losses.WassersteinLoss, WIDTH, floors_detached=True),
+    LossCase("Wasserstein, unbalanced", losses.wasserstein_loss, losses.WassersteinLoss,
+             {**WIDTH, "creation_cost_opl": 0.3}),
+    LossCase("Anscombe", losses.root_loss, losses.RootLoss),
+    LossCase("log ratio", losses.log_ratio_loss, losses.LogRatioLoss, {"background": 0.05}),
+    LossCase("log ratio, own background", losses.log_ratio_loss, losses.LogRatioLoss, symmetric=False,
+             floors_detached=True),
+    LossCase("total variation", losses.total_variation, losses.TotalVariation, {"smoothing": 0.01}, pair=False,
+             zero_at_equality=False, **VOLUMES),
+    LossCase("total variation, along the axes", losses.total_variation, losses.TotalVariation,
+             {"isotropic": False, "spacing": (0.1, 0.2, 0.2)}, pair=False, zero_at_equality=False, floors_detached=True,
+             **VOLUMES),
+    LossCase("total variation, complex, not smoothed", losses.total_variation, losses.TotalVariation,
+             {"smoothing": 0.0}, pair=False, zero_at_equality=False, draw=complex_numbers, **VOLUMES),
+    LossCase("depth", losses.depth_loss, losses.DepthLoss, input_shape=PICTURE, crop=PIXELS),
+    LossCase("SSIM", losses.ssim_loss, losses.SSIMLoss, {"window": 5, "value_range": 1.1}, input_shape=PICTURE,
+             crop=None),
+    LossCase("SSIM, own range", losses.ssim_loss, losses.SSIMLoss, {"window": 3}, input_shape=PICTURE, crop=None,
+             symmetric=False, floors_detached=True),
+    LossCase("SSIM of projections", losses.projection_ssim_loss, losses.ProjectionSSIMLoss,
+             {"window": 3, "value_range": 1.1}, crop=None, **VOLUMES),
+    _likelihood("Poisson", losses.poisson_loss, losses.PoissonLoss),
+    _likelihood("first photon", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES),
+    _likelihood("first photon, dead time", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES,
+                dead_bins=2.0),
+]  # fmt: skip

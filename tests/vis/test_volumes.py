@@ -1,0 +1,76 @@
+"""Pictures of volumes: what they show stands where it is, and what cannot be drawn is a typed error."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchtransient import vis
+from torchtransient.errors import ShapeError, StorageError, UnitError
+
+
+def volume():
+    """One bright voxel: far, low, left."""
+    found = torch.zeros(4, 5, 6)
+    found[3, 1, 0] = 2.0
+    return found
+
+
+def test_three_views_show_the_voxel_from_their_sides(tmp_path):
+    figure = vis.volume_views(volume(), tmp_path / "views.png", depths=[0.5, 0.6, 0.7, 0.8], extent=(1.2, 1.0))
+    front, top, side = (axes.images[0] for axes in figure.axes)
+    assert np.argwhere(front.get_array()).tolist() == [[1, 0]]
+    assert np.argwhere(top.get_array()).tolist() == [[3, 0]]
+    assert np.argwhere(side.get_array()).tolist() == [[1, 3]]
+    assert front.get_extent() == pytest.approx([-0.6, 0.6, -0.5, 0.5])
+    assert top.get_extent() == pytest.approx([-0.6, 0.6, 0.45, 0.85])
+    assert side.get_extent() == pytest.approx([0.45, 0.85, -0.5, 0.5])
+    assert front.origin == top.origin == side.origin == "lower"
+    assert (tmp_path / "views.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_brightness():
+    values = torch.tensor([0.0, 0.25, 1.0, -3.0]).reshape(1, 1, 4)
+    figure = vis.volume_views(values, gamma=0.5)
+    np.testing.assert_allclose(figure.axes[0].images[0].get_array(), [[0.0, 0.5, 1.0, 0.0]], atol=1e-7)
+    complex_values = torch.complex(torch.tensor([[[3.0, 0.0]]]), torch.tensor([[[4.0, 5.0]]]))
+    figure = vis.volume_views(complex_values)
+    np.testing.assert_allclose(figure.axes[0].images[0].get_array(), [[1.0, 1.0]])
+    vis.volume_views(torch.zeros(2, 2, 2))
+    vis.volume_views(torch.full((2, 2, 2), torch.nan))
+
+
+def test_depth_and_normals_beside_them(tmp_path):
+    depth, mask = torch.full((5, 6), 0.7), torch.zeros(5, 6, dtype=torch.bool)
+    mask[1, 0] = True
+    normals = torch.zeros(3, 5, 6)
+    normals[2] = -1.0
+    figure = vis.volume_views(volume(), depth=depth, mask=mask, normals=normals, title="one voxel")
+    drawn = figure.axes[3].images[0].get_array()
+    assert np.argwhere(np.isfinite(np.ma.filled(drawn, np.nan))).tolist() == [[1, 0]]
+    np.testing.assert_allclose(figure.axes[4].images[0].get_array()[1, 0], [0.5, 0.5, 0.0])
+    for function, values in ((vis.depth_picture, depth), (vis.normals_picture, normals)):
+        function(values, tmp_path / "map.png", mask=mask, extent=(1, 1), title="map")
+        assert (tmp_path / "map.png").stat().st_size > 1000
+        function(values)
+    vis.depth_picture(depth, mask=~mask & mask)
+
+
+def test_what_cannot_be_drawn(tmp_path):
+    with pytest.raises(ShapeError, match=r"\(Z, Y, X\)"):
+        vis.volume_views(torch.zeros(1, 2, 3, 4))
+    with pytest.raises(ShapeError, match="numbers"):
+        vis.volume_views("volume")
+    with pytest.raises(ShapeError, match="one for each plane"):
+        vis.volume_views(volume(), depths=[0.1])
+    with pytest.raises(UnitError, match="extent"):
+        vis.volume_views(volume(), extent=(1.0, 0.0))
+    with pytest.raises(UnitError, match="gamma"):
+        vis.volume_views(volume(), gamma=0.0)
+    with pytest.raises(ShapeError, match="depth"):
+        vis.volume_views(volume(), depth=torch.zeros(6, 5))
+    with pytest.raises(ShapeError, match="mask"):
+        vis.volume_views(volume(), mask=torch.zeros(6))
+    with pytest.raises(ShapeError, match="normals"):
+        vis.volume_views(volume(), normals=torch.zeros(5, 6, 3))
+    with pytest.raises(StorageError, match="volume_views"):
+        vis.volume_views(volume(), tmp_path / "nowhere" / "views.png")

@@ -1,0 +1,255 @@
+"""`torchtransient reconstruct capture.h5 --method fk`"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+METHODS = ("fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor")
+CAMERAS = ("direct", "confocal", "transient")
+_XYZ = (float, float, float)
+_SIX = (float,) * 6
+# Arguments of read_capture that a file may leave open.
+_OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin")
+# What methods are asked for by the options of the same names.
+_SETTINGS = ("target", "floor", "snr", "wavelength", "cycles", "falloff", "filter")
+_FREE = ("bp", "fbp", "phasor")
+
+
+class Numbers(click.ParamType):
+    """One to some numbers with commas between them."""
+
+    def __init__(self, kind: Callable[[str], Any], most: int, metavar: str) -> None:
+        self.kind, self.most, self.name = kind, most, metavar
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """(...,) of a text."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(self.kind(part) for part in value.split(","))
+        except ValueError:
+            numbers = ()
+        if not 1 <= len(numbers) <= self.most or not all(number > 0 for number in numbers):
+            self.fail(f"expected {self.name}, greater than zero, got '{value}'", param, ctx)
+        return numbers
+
+
+def file_options(command: Command) -> Command:
+    """What a file of another program leaves open."""
+    options = (
+        click.option("--format", "layout", help="Layout of CAPTURE (docs/capture_files.md).  [default: found]"),
+        click.option("--wall-size", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the scanned area, metres."),
+        click.option("--bin-width-s", type=float, help="Seconds."),
+        click.option("--start-s", type=float, help="When the first bin begins, seconds."),
+        click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+        click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def capture_options(command: Command) -> Command:
+    """What is done to a capture before a method sees it."""
+    options = (
+        click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
+        click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
+        click.option("--slab", type=float, metavar="METRES", help="Take off a slab of foam so thick (confocal scans)."),
+        click.option(
+            "--slab-snr", type=float, help="Light over noise in power where the slab lost none.  [default: 1e4]"
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@click.command()
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Volume, .h5 or .npz.  [default: CAPTURE_METHOD.h5]"
+)
+@click.option("--picture", type=click.Path(path_type=Path), help="Front, top, side, depth.  [default: OUTPUT.png]")
+@click.option("--no-picture", is_flag=True, help="The volume alone.")
+@click.option("--gamma", type=float, default=1.0, show_default=True, help="Below one lightens what is dim.")
+@click.option(
+    "--flip", type=click.Choice(("x", "y", "xy")), help="Turn the picture over; files may count rows downwards."
+)
+@click.option("--threshold", type=float, default=0.1, show_default=True, help="Least brightness that has a depth.")
+@click.option("--method", type=click.Choice(METHODS), help="[default: what suits the capture]")
+@click.option("--depths", type=(float, float), metavar="NEAR FAR", help="Before the wall, metres.  [default: all]")
+@click.option(
+    "--voxels", type=Numbers(int, 3, "N or X,Y[,Z]"), help="bp, fbp; Z of phasor.  [default: as the scan, 64]"
+)
+@click.option("--extent", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the planes, metres (bp, fbp).")
+@click.option("--bounds", type=_SIX, metavar="X Y Z X Y Z", help="Lowest and highest corner of the voxels (bp, fbp).")
+@click.option(
+    "--target", type=click.Choice(("diffuse", "retroreflective")), help="f-k and light-cone.  [default: diffuse]"
+)
+@click.option("--floor", type=float, help="Of the root of f-k: 0.25 for counts.  [default: 0]")
+@click.option("--snr", type=float, help="Of the light-cone transforms; larger is sharper.  [default: 10]")
+@click.option("--wavelength", type=float, help="Metres (fbp, phasor).  [default: the shortest without ghosts]")
+@click.option("--cycles", type=float, help="Waves of a pulse (fbp, phasor).  [default: 4]")
+@click.option("--falloff", type=float, help="-2 makes up for distance (bp, fbp, phasor).  [default: 0]")
+@click.option("--filter", "filter", type=click.Choice(("phasor", "laplacian")), help="Of fbp.  [default: phasor]")
+@click.option("--camera", type=click.Choice(CAMERAS), help="Of phasor: one picture, or films.  [default: direct]")
+@click.option("--times", type=(float, float, int), metavar="START STOP N", help="Of a film, metres after the focus.")
+@capture_options
+@file_options
+@click.option("--device", default="cpu", show_default=True, help="Where to compute, such as cuda.")
+@click.option("--quiet", is_flag=True, help="No reasons and no progress bar.")
+def command(capture: Path, **options: Any) -> None:
+    """Reconstruct what CAPTURE, a file of any known layout, has seen around the corner, and draw it.
+
+    fk, lct, directional-lct: confocal scans of a flat grid. midpoint-fk: single and exhaustive ones. phasor: all three.
+    bp, fbp: any points. Which loses what: docs/nlos_reconstruction.md. The volume's file holds values (C, Z, Y, X),
+    depths and axes; tt.nlos.read_volume reads it.
+    """
+    from torchtransient.cli.words import arguments_as_options
+    from torchtransient.errors import TorchTransientError
+
+    _check_together(options)
+    try:
+        _run(capture, options)
+    except TorchTransientError as error:
+        raise type(error)(arguments_as_options(str(error), (*_OPEN, *_SETTINGS, "format", "camera"))) from error
+
+
+def _run(capture: Path, options: dict[str, Any]) -> None:
+    import torchtransient as tt
+    from torchtransient.data.volume_file import check_volume_target
+
+    told = {name: options[name] for name in _OPEN if options[name] is not None}
+    measured = tt.nlos.read_capture(capture, options["layout"], **{**told, **_wall_size(told)})
+    choice = _choice(measured, options["method"])
+    if not options["quiet"]:
+        click.echo(f"--method {choice.name}: {choice.reason}", err=True)
+    target = check_volume_target(options["output"] or capture.with_name(f"{capture.stem}_{choice.name}.h5"))
+    picture = _picture(options, target)
+    prepared = _prepared(measured, options)
+    settings: dict[str, Any] = {name: options[name] for name in _SETTINGS}
+    if options["camera"] is not None:
+        settings["camera"] = _camera(options)
+    grid = _grid(prepared, choice.name, options)
+    volume = tt.nlos.reconstruct(
+        prepared, choice.name, grid=grid, depths=options["depths"] if grid is None else None,
+        progress=not options["quiet"], **settings,
+    )  # fmt: skip
+    volume = _noted(volume, capture, measured, choice.reason, options)
+    tt.nlos.write_volume(target, volume)
+    sizes = " x ".join(map(str, volume.values.shape))
+    near, far = volume.grid.depths[0], volume.grid.depths[-1]
+    click.echo(f"{target}: {sizes} voxels, {near:.3g} to {far:.3g} m before the wall")
+    if picture is not None:
+        _draw(volume, picture, options)
+        click.echo(f"{picture}: front, top, side and depth")
+
+
+def _check_together(options: dict[str, Any]) -> None:
+    """Usage errors that need no file."""
+    if options["no_picture"] and options["picture"]:
+        raise click.UsageError("--no-picture writes none; leave out --picture, or --no-picture.")
+    if options["bounds"] and (options["depths"] or options["extent"]):
+        raise click.UsageError("--bounds says where voxels are; leave out --depths and --extent, or --bounds.")
+    if options["times"] and options["camera"] in (None, "direct"):
+        raise click.UsageError("--times is for --camera confocal and --camera transient.")
+    if options["slab_snr"] is not None and options["slab"] is None:
+        raise click.UsageError("--slab-snr needs --slab.")
+
+
+def _wall_size(told: dict[str, Any]) -> dict[str, Any]:
+    size = told.get("wall_size")
+    return {} if size is None else {"wall_size": size[0] if len(size) == 1 else size}
+
+
+def _choice(capture: Any, method: str | None) -> Any:
+    from torchtransient.nlos.methods import Choice, choose_method
+
+    return choose_method(capture) if method is None else Choice(method, "asked for")
+
+
+def _picture(options: dict[str, Any], target: Path) -> Path | None:
+    from torchtransient.vis.overview import check_picture
+
+    if options["no_picture"]:
+        return None
+    picture: Path = options["picture"] or target.with_suffix(".png")
+    check_picture(picture, "--picture")
+    return picture
+
+
+def _prepared(capture: Any, options: dict[str, Any]) -> Any:
+    """The capture as the method gets it: cut, summed, without its slab, on its device."""
+    from torchtransient.nlos.preparation import moved_to, sum_bins, without_slab
+
+    if options["record"] is not None:
+        capture = capture.crop(*options["record"])
+    capture = moved_to(sum_bins(capture, options["sum_bins"]), options["device"])
+    if options["slab"] is not None:
+        capture = without_slab(capture, options["slab"], options["slab_snr"] or 1e4)
+    return capture
+
+
+def _camera(options: dict[str, Any]) -> Any:
+    from torchtransient.nlos.reconstruct import camera_of
+
+    if options["camera"] != "direct" and options["times"] is None:
+        raise click.UsageError(f"--camera {options['camera']} films: give --times START STOP N.")
+    return camera_of(options["camera"], options["times"])
+
+
+def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
+    """The voxels that are asked for; None for those of the method."""
+    from torchtransient.nlos.reconstruct import default_grid
+    from torchtransient.reconstruction import VoxelGrid
+
+    given = [f"--{name}" for name in ("voxels", "extent", "bounds") if options[name] is not None]
+    if not given:
+        return None
+    if method not in _FREE:
+        raise click.UsageError(
+            f"--method {method} has a voxel behind each point and a plane for each bin; leave out "
+            f"{' and '.join(given)}, or take bp or fbp."
+        )
+    voxels = options["voxels"] or ()
+    if options["bounds"] is not None:
+        if len(voxels) not in (1, 3):
+            raise click.UsageError("--bounds needs --voxels N or X,Y,Z.")
+        bounds = (options["bounds"][:3], options["bounds"][3:])
+        return VoxelGrid.bounds(bounds, voxels if len(voxels) == 3 else voxels[0])
+    extent = options["extent"]
+    size = None if not voxels else (voxels[:2] if len(voxels) > 1 else voxels[0])
+    planes = voxels[2] if len(voxels) == 3 else None
+    extent = extent if extent is None or len(extent) == 2 else extent[0]
+    return default_grid(capture, depths=options["depths"], size=size, extent=extent, planes=planes)
+
+
+def _noted(volume: Any, path: Path, measured: Any, reason: str, options: dict[str, Any]) -> Any:
+    """With what the file and the command line said, as far as it is plain data."""
+    from dataclasses import replace
+
+    said = {name: options[name] for name in ("record", "sum_bins", "slab", "slab_snr") if options[name] is not None}
+    notes = {"capture": path.name, "reason": reason, "prepared": said}
+    assumed = measured.metadata.get("assumed")
+    return replace(volume, metadata={**volume.metadata, **notes, **({"assumed": assumed} if assumed else {})})
+
+
+def _draw(volume: Any, path: Path, options: dict[str, Any]) -> None:
+    import torchtransient as tt
+
+    # Axes of pictures (..., Y, X), from behind.
+    over = [-1 - "xy".index(axis) for axis in options["flip"] or ""]
+    found = volume.picture()
+    surface = tt.nlos.depth_map(found.clamp_min(0), volume.grid, threshold=options["threshold"])
+    normals = None if volume.directions is None else tt.nlos.normals_of(volume).flip(over)
+    tt.vis.volume_views(
+        found.flip(over), path, depths=volume.grid.depths, extent=volume.grid.extent, depth=surface.depth.flip(over),
+        mask=surface.mask.flip(over), normals=normals, gamma=options["gamma"],
+        title=f"{volume.metadata['capture']}, {volume.method}",
+    )  # fmt: skip

@@ -1,0 +1,187 @@
+"""Datasets of HDF5 files that anyone may have written: numbers and texts of the file itself, no more than it can hold.
+
+A file may declare terabytes that nobody stored, point to other files of the machine, or be damaged where the library
+that reads it does not look. What is declared is compared with what is stored before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import re
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import StorageError
+from torchtransient.render.memory import available_bytes
+
+# Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
+MOST_BYTES_OF_ONE = 1032
+# Never written, and small enough to be made of fill values.
+_FREE_BYTES = 2**20
+# Below, memory is not asked about: files are read in a moment.
+_LARGE_BYTES = 2**26
+# Chunks hold a header, and their last ones more than the array.
+_SLACK = 2
+# What HDF5 writes of a text before the type of its letters: of the encoding, of the text, and the letters' version.
+_KIND_HEAD = 2 + 8 + 1
+_HEAP_HEADER = 16
+# An attribute's parts may be filled up to eight bytes; then a shape of version 1 or 2, and the length.
+_NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{16})", re.DOTALL)
+
+
+def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
+    """A dataset of an open file or group, or ``part`` of it; None for one that is missing or empty. Texts are `str`.
+
+    Raises StorageError for links to other files, for objects and records, and for more numbers than the file, or the
+    memory that is left, can hold.
+    """
+    dataset = dataset_of(parent, name, what)
+    # MATLAB writes the size of an empty array in its place.
+    if dataset is None or dataset.shape is None or "MATLAB_empty" in dataset.attrs:
+        return None
+    if is_text(dataset):
+        return _text(dataset, what)
+    if dataset.dtype.kind not in "biufc":
+        raise StorageError(f"{what}: '{name}' holds {dataset.dtype}; expected numbers.")
+    left = [n for axis, n in enumerate(dataset.shape) if axis >= len(part) or not isinstance(part[axis], int)]
+    wanted = math.prod(left) * dataset.dtype.itemsize
+    check_size(wanted, dataset.id.get_storage_size(), f"{what}: '{name}' {dataset.shape}")
+    if part == () and dataset.shape:
+        # Into memory of its own: h5py would fill what it allocates with zeros first.
+        array: NDArray[Any] = np.empty(dataset.shape, dataset.dtype)
+        if array.size:
+            dataset.read_direct(array)
+        return array
+    return np.asarray(dataset[part])
+
+
+def dataset_of(parent: Any, name: str, what: str) -> Any:
+    """The dataset at a path of the file itself, None where there is nothing. Raises StorageError for groups, and for
+    links to elsewhere, which are not looked at.
+    """
+    import h5py
+
+    found = parent
+    for step in name.split("/"):
+        link = found.get(step, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            raise StorageError(f"{what}: '{name}' is a link to elsewhere, which is not followed.")
+        found = found[step]
+    if not isinstance(found, h5py.Dataset):
+        raise StorageError(f"{what}: expected '{name}' to be a dataset, got a {type(found).__name__.lower()}.")
+    if found.is_virtual or found.external:
+        raise StorageError(f"{what}: '{name}' lies in other files, which are not read.")
+    return found
+
+
+def is_text(dataset: Any) -> bool:
+    """Whether a dataset holds one text."""
+    import h5py
+
+    return h5py.check_string_dtype(dataset.dtype) is not None and math.prod(dataset.shape or ()) == 1
+
+
+def check_size(declared: int, stored: int, what: str) -> None:
+    """Raise StorageError where an array of ``declared`` bytes cannot come from ``stored`` ones, or does not fit."""
+    if declared > max(_FREE_BYTES, _SLACK * MOST_BYTES_OF_ONE * stored):
+        raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: the file is damaged.")
+    if declared < _LARGE_BYTES:
+        return
+    available = available_bytes("scalar_rgb")
+    if available is not None and declared > available:
+        raise StorageError(
+            f"{what} takes {declared / 1e9:.3g} GB, and {available / 1e9:.3g} GB of memory are left. Free some memory, "
+            "or cut the file into parts with h5py."
+        )
+
+
+def _text(dataset: Any, what: str) -> str:
+    import h5py
+
+    if h5py.check_string_dtype(dataset.dtype).length is None:
+        _check_length(dataset, what)
+    else:
+        check_size(dataset.nbytes, dataset.id.get_storage_size(), f"{what}: the text '{dataset.name}'")
+    try:
+        value = dataset.asstr()[()]
+    except UnicodeDecodeError as error:
+        raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
+    return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)
+
+
+def read_attributes(file: Any, what: str, names: Iterable[str] | None = None) -> dict[str, Any]:
+    """The attributes of an open file, or those of ``names`` that are there: numbers, and texts as `str`.
+
+    Raises StorageError for others, and for texts that say they are longer than the file.
+    """
+    import h5py
+
+    found: dict[str, Any] = {}
+    for name in file.attrs if names is None else [name for name in names if name in file.attrs]:
+        attribute = h5py.h5a.open(file.id, name.encode("utf-8"))
+        text = h5py.check_string_dtype(attribute.dtype)
+        if text is not None and text.length is None:
+            _check_attribute(attribute, file.filename, f"{what}: the attribute '{name}'")
+        elif attribute.dtype.kind not in "biufcS":
+            raise StorageError(f"{what}: the attribute '{name}' holds {attribute.dtype}; expected numbers or a text.")
+        value = file.attrs[name]
+        found[name] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    return found
+
+
+def _check_attribute(attribute: Any, path: str, what: str) -> None:
+    """Find the lengths of texts in the raw file by what stands before them: the kind of text, and no shape."""
+    # The letters' type behind its version, as HDF5 writes it in all of them: one byte, 8 bits.
+    letters = attribute.get_type().encode()[_KIND_HEAD:]
+    found = False
+    if attribute.shape == () and letters:
+        with open(path, "rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            place = data.find(letters)
+            while place >= 0:
+                match = _NO_SHAPE_AND_LENGTH.match(data[place + len(letters) : place + len(letters) + 40])
+                if match:
+                    found = True
+                    _check_heap(data, match[1], what)
+                place = data.find(letters, place + 1)
+    if not found:
+        raise StorageError(f"{what} is a text that is stored in an unknown way.")
+
+
+def _check_length(dataset: Any, what: str) -> None:
+    """As :func:`_check_attribute`, of a dataset, which says where it lies."""
+    offset = dataset.id.get_offset()
+    if offset is None or dataset.file.userblock_size:
+        raise StorageError(
+            f"{what}: expected the text '{dataset.name}' in one piece, got one that is stored otherwise."
+        )
+    with open(dataset.file.filename, "rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        _check_heap(data, data[offset : offset + 16], f"{what}: the text '{dataset.name}'")
+
+
+def _check_heap(data: mmap.mmap, reference: bytes, what: str) -> None:
+    """Walk through the heap that a text refers to by its length, the heap's place and its number there.
+
+    HDF5 fills as much memory as a text says it is long, up to 4 GB, before it looks for it, and does not come to an end
+    in some damaged heaps.
+    """
+    length, place = int.from_bytes(reference[:4], "little"), int.from_bytes(reference[4:12], "little")
+    if length == 0:
+        return
+    end = place + int.from_bytes(data[place + 8 : place + 16], "little")
+    if length > len(data) or data[place : place + 5] != b"GCOL\x01" or end > len(data):
+        raise StorageError(f"{what} says it has {length:,} bytes, the file {len(data):,}, or its place is damaged.")
+    place += 16
+    while end - place >= _HEAP_HEADER:
+        number, size = int.from_bytes(data[place : place + 2], "little"), data[place + 8 : place + 16]
+        count = int.from_bytes(size, "little")
+        # What is free counts with its header, the others without, filled up to eight bytes.
+        step = count if number == 0 else _HEAP_HEADER + -(-count // 8) * 8
+        if step < _HEAP_HEADER or place + step > end:
+            raise StorageError(f"{what} lies in a heap that is damaged.")
+        place += step

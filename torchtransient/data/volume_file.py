@@ -1,0 +1,116 @@
+"""A reconstructed volume on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Both hold the same names: `values` (..., C, Z, Y, X), or (..., C, N, Z, Y, X) with `times` (N,) where a camera filmed;
+`directions` (..., C, 3, Z, Y, X) of methods that find normals, in world coordinates. The grid is float64, in metres:
+`depths` (Z,), `pitch` (2,) as (dy, dx), and the vectors (3,) `first`, `along_x`, `along_y`, `normal`; voxel (k, j, i)
+stands at ``first + j dy along_y + i dx along_x + depths[k] normal``. `method` is a text, `metadata` one of JSON; texts
+are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchtransient.data import array_file
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.errors import ShapeError, StorageError
+from torchtransient.quantities import shown
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+FORMAT = "torchtransient volume 1"
+_WHAT = "volume file"
+_VECTORS = ("first", "along_x", "along_y", "normal")
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenVolume:
+    """What a method found behind a corner.
+
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
+    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
+    data. Raises ShapeError where tensors and grid do not fit.
+    """
+
+    values: Tensor
+    grid: VoxelGrid
+    method: str
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    times: Tensor | None = None
+    directions: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, VoxelGrid):
+            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
+        frames = () if self.times is None else (len(self.times),)
+        self._check("values", self.values, (*frames, *self.grid.shape))
+        if self.directions is not None:
+            self._check("directions", self.directions, (3, *self.grid.shape))
+
+    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
+        if not fits or tensor.is_complex():
+            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
+            sizes = ", ".join(map(str, shape))
+            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
+
+    def picture(self) -> Tensor:
+        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
+        per_item = 4 if self.times is None else 5
+        values = self.values.detach()
+        while values.ndim > per_item:
+            values = values[0]
+        summed = values.sum(0)
+        return summed if self.times is None else summed.amax(0)
+
+
+def check_volume_target(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when a volume could not be written there. For before long computations."""
+    return array_file.check_target(path, _WHAT)
+
+
+def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
+    """Write a volume; an existing file is replaced once the new one is complete. Returns the path.
+
+    Gradients are not stored. Raises StorageError for an unknown ending, a folder that is missing, a full disk, and
+    metadata that is not plain data.
+    """
+    target = check_volume_target(path)
+    if not isinstance(volume, HiddenVolume):
+        raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
+    try:
+        note = json.dumps(dict(volume.metadata))
+    except (TypeError, ValueError) as error:
+        raise StorageError(f"volume file: metadata must be plain data ({error}).") from error
+    grid = volume.grid
+    given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
+    given |= {name: getattr(grid, name) for name in _VECTORS}
+    arrays = {name: array_of(tensor, _WHAT) for name, tensor in given.items() if tensor is not None}
+    arrays["pitch"] = np.array(grid.pitch, np.float64)
+    write_arrays(target, arrays, {"format": FORMAT, "method": volume.method, "metadata": note}, _WHAT)
+    return target
+
+
+def read_volume(path: str | Path) -> HiddenVolume:
+    """Read what `write_volume` wrote, as tensors on the CPU.
+
+    Raises StorageError when the file is missing, damaged or not a volume.
+    """
+    found = read_arrays(path, FORMAT, _WHAT)
+    with damage_said(Path(path), _WHAT):
+        values = {name: torch.from_numpy(np.asarray(found[name])) for name in ("values", "depths", "pitch", *_VECTORS)}
+        more = {name: torch.from_numpy(np.asarray(found[name])) for name in ("times", "directions") if name in found}
+        rows, columns = values["values"].shape[-2:]
+        dy, dx = values["pitch"].tolist()
+        vectors = {name: values[name] for name in _VECTORS}
+        grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
+        metadata = json.loads(str(found["metadata"]))
+        return HiddenVolume(values["values"], grid, str(found["method"]), metadata, **more)

@@ -1,0 +1,170 @@
+"""Losses of phasors: the oscillations that a band of frequencies makes of a transient, compared without a branch cut.
+
+The phasor of a record is the sum of its bins times `exp(-2 pi i nu (opl - start))`, `nu` in cycles per metre of optical
+path and `opl` at the middle of the bin. A delay by `d` turns it by `2 pi nu d`. Squares of differences of phasors
+see `2 - 2 cos` of that angle, which is smooth where the angle itself jumps by a whole turn. Frequencies that are low
+against one over the delay see it from afar; high ones resolve it and repeat.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_mask,
+    check_pair,
+    counted,
+    item_scale,
+    reduce,
+    working_dtype,
+)
+from torchtransient.quantities import positive
+from torchtransient.sensing.layout import without_autocast
+
+# The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
+_PHASE_FLOOR = 1e-3
+
+
+@without_autocast
+def transient_phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, *, dim: int = -3) -> Tensor:
+    """Phasors (..., C, F, Y, X), complex, of transients (..., C, T, Y, X): a dense transform to F frequencies.
+
+    `dim`: where time is, and frequency then (-5 of exhaustive captures (C, T, Ly, Lx, Sy, Sx)). As from a renderer with
+    `frequencies=`, but for the bins: those count as at their middles, which lacks a factor `sinc(nu bin_width_opl)`.
+    Phases are computed in double precision. Raises ShapeError where T is not that of the axis, UnitError.
+    """
+    where = "transient_phasors"
+    if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
+        raise UnitError(
+            f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
+            f"{type(frequencies).__name__}."
+        )
+    if not isinstance(transient, Tensor) or not -transient.ndim <= dim < transient.ndim:
+        got = tuple(transient.shape) if isinstance(transient, Tensor) else type(transient).__name__
+        raise ShapeError(f"{where}: expected a tensor with time as its dimension {dim}, got {got}.")
+    place = dim % transient.ndim
+    lead, bins, trail = transient.shape[:place], transient.shape[place], transient.shape[place + 1 :]
+    if bins != axis.num_bins:
+        raise ShapeError(f"{where}: expected T = {axis.num_bins} bins in dimension {dim}, got {bins}.")
+    dtype = working_dtype(transient.dtype, where)
+    turns = torch.outer(frequencies.per_metre, axis.centers_opl - frequencies.start_opl)
+    angle = -2 * math.pi * (turns - turns.round())
+    cos, sin = (table.to(transient.device, dtype) for table in (angle.cos(), angle.sin()))
+    record = transient.to(dtype).reshape(*lead, bins, -1)
+    return torch.complex(cos @ record, sin @ record).reshape(*lead, frequencies.num_frequencies, *trail)
+
+
+def phasor_loss(
+    input: Tensor,
+    target: Tensor,
+    *,
+    phase_only: bool = False,
+    floor: Tensor | float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`|P - Q|^2` of each element of two complex tensors, such as phasors (..., C, F, Y, X). Symmetric.
+
+    `phase_only`: of `P / sqrt(|P|^2 + floor^2)` and Q likewise, each between 0 and 1, so that brightness has no part:
+    `2 - 2 cos` of the angle between them where both are bright, 1 where one is dark. `floor`, in the unit of the
+    phasors, says what is dark and bounds the gradient by 4/floor; None: 1e-3 of the mean modulus of each item of each.
+    Raises ShapeError for two shapes, UnitError for real numbers.
+    """
+    where = "phasor_loss"
+    input, target = check_pair(input, target, where, complex_too=True)
+    if not input.is_complex():
+        raise UnitError(f"{where}: expected complex phasors, got {input.dtype}. See transient_phasor_loss.")
+    mask = check_mask(mask, input.shape, where)
+    input, target = counted(input, mask), counted(target, mask)
+    if phase_only:
+        ours = _PHASE_FLOOR * item_scale(input, target, mask) if floor is None else _floor(floor, input)
+        theirs = _PHASE_FLOOR * item_scale(target, input, mask) if floor is None else ours
+        input, target = _phase(input, ours), _phase(target, theirs)
+    difference = input - target
+    return reduce(difference.real.square() + difference.imag.square(), reduction, where, mask)
+
+
+def _floor(floor: Tensor | float, phasor: Tensor) -> Tensor:
+    if not isinstance(floor, Tensor):
+        floor = torch.tensor(positive("phasor_loss: floor", floor), dtype=torch.float64)
+    return floor.to(phasor.device, phasor.real.dtype)
+
+
+def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
+    """`P / sqrt(|P|^2 + floor^2)`, by numbers near one: squares of bright phasors exceed single precision."""
+    size = torch.maximum(phasor.detach().abs(), floor)
+    scaled = phasor / size
+    return scaled / (scaled.real.square() + scaled.imag.square() + (floor / size) ** 2).sqrt()
+
+
+def transient_phasor_loss(
+    input: Tensor,
+    target: Tensor,
+    axis: TimeAxis,
+    frequencies: FrequencyAxis,
+    *,
+    phase_only: bool = False,
+    floor: Tensor | float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`phasor_loss` of the phasors of two transients (..., C, T, Y, X), for each pixel and frequency.
+
+    Parseval: over all frequencies of a discrete transform its mean is that of the squared difference times T; over a
+    band it forgets what the band does not see. `mask` (..., C, T, Y, X): bins that do not count are empty in both,
+    pixels of which none does are left out. `reduction="none"`: (..., C, F, Y, X). Errors as those of
+    `transient_phasors` and `phasor_loss`.
+    """
+    where = "transient_phasor_loss"
+    input, target = check_pair(input, target, where)
+    mask = check_mask(mask, input.shape, where)
+    ours, theirs = (transient_phasors(counted(x, mask), axis, frequencies) for x in (input, target))
+    pixels = None if mask is None else mask.any(-3, keepdim=True)
+    return phasor_loss(ours, theirs, phase_only=phase_only, floor=floor, mask=pixels, reduction=reduction)
+
+
+class PhasorLoss(nn.Module):
+    """`phasor_loss(input, target)` with its options held."""
+
+    def __init__(self, phase_only: bool = False, floor: float | None = None, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        self.phase_only, self.floor, self.reduction = phase_only, floor, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return phasor_loss(
+            input, target, phase_only=self.phase_only, floor=self.floor, mask=mask, reduction=self.reduction
+        )
+
+
+class TransientPhasorLoss(nn.Module):
+    """`transient_phasor_loss(input, target, axis, frequencies)` with its axes and options held."""
+
+    def __init__(
+        self,
+        axis: TimeAxis,
+        frequencies: FrequencyAxis,
+        phase_only: bool = False,
+        floor: float | None = None,
+        reduction: Reduction = "mean",
+    ) -> None:
+        super().__init__()
+        self.axis, self.frequencies = axis, frequencies
+        self.phase_only, self.floor, self.reduction = phase_only, floor, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return transient_phasor_loss(
+            input,
+            target,
+            self.axis,
+            self.frequencies,
+            phase_only=self.phase_only,
+            floor=self.floor,
+            mask=mask,
+            reduction=self.reduction,
+        )

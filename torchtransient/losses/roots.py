@@ -1,0 +1,113 @@
+"""Losses of photon counts on scales where bright and dark bins have a say: roots, and logarithms of ratios."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses.comparison import Reduction, check_mask, check_pair, counted, item_scale, reduce
+from torchtransient.quantities import positive
+from torchtransient.sensing.layout import check_number
+
+_OFFSET = 3 / 8
+_BACKGROUND = 1e-3
+
+
+def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
+    """`2 sqrt(n + 3/8 + read_noise^2)`: photon counts on a scale where their noise has variance one. Any shape.
+
+    Anscombe 1948; with read noise, in counts, the generalised transform of Starck, Murtagh and Bijaoui 1998 for gain
+    one. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below
+    zero, of a record less its background, continue the tangent at zero, so that values and gradients are finite.
+    Raises UnitError for a read noise below zero.
+    """
+    read_noise = check_number(read_noise, "read_noise", "anscombe")
+    offset = _OFFSET + read_noise**2
+    negative = counts < 0
+    root = (torch.where(negative, torch.zeros_like(counts), counts) + offset).sqrt()
+    return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / math.sqrt(offset)
+
+
+def root_loss(
+    input: Tensor,
+    target: Tensor,
+    *,
+    root: Callable[[Tensor], Tensor] = anscombe,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`(root(input) - root(target))^2` of each element, any shape, in photon counts. Symmetric.
+
+    With `anscombe` about 1 on average where `input` is the mean that `target` was drawn of: a fit is as good as the
+    noise lets it be when its loss is. Take `tt.nlos.stabilised_root`, `H / sqrt(|H| + 1/4)`, for what f-k migration
+    sees of counts, or `functools.partial` of either. Raises ShapeError, UnitError.
+    """
+    input, target = check_pair(input, target, "root_loss")
+    mask = check_mask(mask, input.shape, "root_loss")
+    value = (root(counted(input, mask)) - root(counted(target, mask))).square()
+    if value.shape != input.shape:
+        raise ShapeError(f"root_loss: expected a root that keeps the shape, got {tuple(value.shape)}.")
+    return reduce(value, reduction, "root_loss", mask)
+
+
+def log_ratio_loss(
+    input: Tensor,
+    target: Tensor,
+    *,
+    background: Tensor | float | None = None,
+    mask: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """`log((input + background) / (target + background))^2` of each element, any shape. Symmetric in what it is given.
+
+    Relative errors of bins that are brighter than `background`, in the unit of the transient; errors of darker ones
+    count as shares of it: put it where noise begins. None: 1e-3 of the mean of each item of the target (of the input,
+    where that is dark), which is not symmetric. Values below zero continue the tangent of the logarithm at zero, so
+    that values are finite and gradients at most of the size of a logarithm over the background. Raises ShapeError;
+    UnitError for a background that is not above zero.
+    """
+    where = "log_ratio_loss"
+    input, target = check_pair(input, target, where)
+    mask = check_mask(mask, input.shape, where)
+    input, target = counted(input, mask), counted(target, mask)
+    if background is None:
+        level = _BACKGROUND * item_scale(target, input, mask)
+    elif isinstance(background, Tensor):
+        if not bool((background.detach() > 0).all()):
+            raise UnitError(f"{where}: expected a background above zero, got some that is not.")
+        level = background.to(input)
+    else:
+        level = torch.tensor(positive(f"{where}: background", background), dtype=torch.float64).to(input)
+    return reduce((_log(input, level) - _log(target, level)).square(), reduction, where, mask)
+
+
+def _log(x: Tensor, level: Tensor) -> Tensor:
+    """`log(x + level)`, and its tangent at zero below zero."""
+    negative, zero = x < 0, torch.zeros_like(x)
+    return (torch.where(negative, zero, x) + level).log() + torch.where(negative, x, zero) / level
+
+
+class RootLoss(nn.Module):
+    """`root_loss(input, target)` with its options held."""
+
+    def __init__(self, root: Callable[[Tensor], Tensor] = anscombe, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        self.root, self.reduction = root, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return root_loss(input, target, root=self.root, mask=mask, reduction=self.reduction)
+
+
+class LogRatioLoss(nn.Module):
+    """`log_ratio_loss(input, target)` with its options held."""
+
+    def __init__(self, background: float | None = None, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        self.background, self.reduction = background, reduction
+
+    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+        return log_ratio_loss(input, target, background=self.background, mask=mask, reduction=self.reduction)

@@ -1,0 +1,122 @@
+"""Which methods there are for hidden volumes, which captures each takes, and which one suits a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.quantities import shown
+from torchtransient.reconstruction.planar_scan import PlanarScan
+
+# Sensor points whose neighbours are looked for where points are no grid.
+_LOOKED_AT = 256
+
+
+@dataclass(frozen=True)
+class Method:
+    """``kinds`` of scan that it takes, ``planar``: only regular grids of flat walls; ``options`` of its own; whether
+    voxels stand where whoever calls wants them (``free_grid``), and whether lengths may count first and last legs.
+    """
+
+    title: str
+    kinds: tuple[str, ...]
+    options: tuple[str, ...]
+    planar: bool = True
+    free_grid: bool = False
+
+    @property
+    def takes_legs(self) -> bool:
+        return self.free_grid
+
+
+_ALL = ("single", "confocal", "exhaustive")
+_BAND = ("wavelength", "cycles", "falloff")
+METHODS = {
+    "fk": Method("f-k migration", ("confocal",), ("target", "floor", "taps")),
+    "midpoint-fk": Method("f-k migration by midpoints", ("single", "exhaustive"), ("target", "floor", "taps")),
+    "lct": Method("light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
+    "directional-lct": Method("directional light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
+    "bp": Method("backprojection", _ALL, ("falloff",), planar=False, free_grid=True),
+    "fbp": Method("filtered backprojection", _ALL, (*_BAND, "filter"), planar=False, free_grid=True),
+    "phasor": Method("phasor field", _ALL, (*_BAND, "camera"), free_grid=True),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The ``name`` of a method, and the ``reason`` for it."""
+
+    name: str
+    reason: str
+
+
+def choose_method(capture: Capture) -> Choice:
+    """The method that suits a capture. Raises ShapeError for what is none."""
+    if not isinstance(capture, Capture):
+        raise ShapeError(f"choose_method: expected a tt.nlos.Capture, got {shown(capture)}.")
+    kind = capture.scan.kind
+    if not is_planar(capture.scan):
+        reason = f"a {kind} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
+        return Choice("fbp", f"{reason}; the filter removes its haze")
+    if kind == "confocal":
+        return Choice("fk", "a confocal scan of a regular grid on a flat wall: the sharpest for it, in seconds")
+    more = "midpoint-fk is quicker, and approximate"
+    return Choice("phasor", f"a {kind} scan of a regular grid on a flat wall, from plane to plane; {more}")
+
+
+def check_method(name: str, capture: Capture) -> Method:
+    """The method of a name. Raises SceneError for unknown ones and for scans that it does not take."""
+    if name not in METHODS:
+        raise SceneError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
+    method, kind = METHODS[name], capture.scan.kind
+    if kind not in method.kinds:
+        others = ", ".join(other for other, entry in METHODS.items() if kind in entry.kinds)
+        raise SceneError(
+            f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, and this one is {kind}. "
+            f"Take one of {others}."
+        )
+    if method.planar and not is_planar(capture.scan):
+        raise SceneError(
+            f"reconstruct: method '{name}' takes regular grids of points on a flat wall, and this scan is none "
+            f"({capture.scan!r}). Take bp or fbp."
+        )
+    return method
+
+
+def is_planar(scan: Scan) -> bool:
+    """Whether the sensor points are a regular grid of a flat wall."""
+    try:
+        PlanarScan.of_scan(scan, "choose_method")
+    except ShapeError:
+        return False
+    return True
+
+
+def pitch_of(scan: Scan) -> float:
+    """How far sensor points are from their neighbours, metres: that of a grid, or the mean over a list's points. Zero
+    for one point.
+    """
+    if is_planar(scan):
+        return max(PlanarScan.of_scan(scan, "pitch_of").pitch)
+    points = scan.sensor_points.detach().cpu().reshape(-1, 3)
+    some = points[:: max(1, len(points) // _LOOKED_AT)]
+    distances = torch.cdist(some, points)
+    # A point is no neighbour of itself, nor of another visit.
+    apart = torch.where(distances > 0, distances, torch.inf).amin(1)
+    apart = apart[torch.isfinite(apart)]
+    return float(apart.mean()) if len(apart) else 0.0
+
+
+def default_wavelength(capture: Capture) -> float:
+    """The shortest wavelength, metres of optical path, that shows no ghosts and that the bins hold: two pitches of
+    the sensor points, four of a confocal scan, where laser and sensor move together, and four bins at least.
+
+    Raises ShapeError for a capture without a transient.
+    """
+    if capture.axis is None:
+        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    turns = 4.0 if capture.scan.kind == "confocal" else 2.0
+    return max(turns * pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)

@@ -1,0 +1,57 @@
+"""What is done to captures before a method sees them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture
+from torchtransient.errors import DeviceError, ShapeError
+from torchtransient.quantities import count, shown
+from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
+
+
+def sum_bins(capture: Capture, number: int) -> Capture:
+    """The capture with so many neighbouring bins added up; what is left over at the record's end is dropped.
+
+    Phasors beside a transient stay. Raises ShapeError without a transient and for more bins than there are, UnitError
+    for a number that is none.
+    """
+    number = count("sum_bins: number", number)
+    transient, axis = capture.transient, capture.axis
+    if transient is None or axis is None:
+        raise ShapeError("sum_bins: expected a capture with a transient, got phasors alone.")
+    if number == 1:
+        return capture
+    bins = axis.num_bins // number
+    if bins < 1:
+        raise ShapeError(f"sum_bins: expected {axis.num_bins} bins at most, got {number}.")
+    dim = transient.ndim - len(capture.scan.shape) - 1
+    summed = transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)).sum(dim + 1)
+    return replace(capture, transient=summed, axis=TimeAxis(axis.start_opl, axis.bin_width_opl * number, bins))
+
+
+def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
+    """A confocal capture without the foam slab on its wall, ``thickness`` metres, by :class:`DiffusionDeconvolution`
+    with the foam of Lindell and Wetzstein (2020); what falls below zero is zero. Without legs. Raises as it does.
+    """
+    capture = subtract_legs(capture)
+    transient, axis = capture.transient, capture.axis
+    if transient is None or axis is None:
+        raise ShapeError("without_slab: expected a capture with a transient, got phasors alone.")
+    # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
+    slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
+    clear = slab.to(transient.device).reconstruct(transient.double())
+    return replace(capture, transient=clear.clamp_min(0).float(), phasor=None, frequencies=None, steady=None)
+
+
+def moved_to(capture: Capture, device: Any) -> Capture:
+    """The capture on a device. Raises DeviceError where there is none of that name."""
+    try:
+        return capture.to(device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DeviceError(f"reconstruct: expected a device that torch has, got {shown(device)}: {reason}") from None

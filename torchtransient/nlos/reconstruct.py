@@ -1,0 +1,295 @@
+"""From a capture to a hidden volume in one call, by a method that is given or that suits the capture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture
+from torchtransient.data.volume_file import HiddenVolume
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
+from torchtransient.quantities import finite, shown
+from torchtransient.reconstruction import (
+    Backprojection,
+    ConfocalCamera,
+    DirectLight,
+    FilteredBackprojection,
+    LaplacianFilter,
+    PhasorField,
+    PhasorFilter,
+    PlanarScan,
+    TransientCamera,
+    VoxelGrid,
+    directional_lct,
+    fk,
+    lct,
+    midpoint_fk,
+    subtract_legs,
+)
+from torchtransient.reconstruction.midpoint_fk import Midpoints
+
+# Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
+MOST_PLANES, NEAREST = 64, 0.02
+# Planes that are found at once by backprojection, between two steps of the progress bar. Phasor fields share their
+# spectra over all planes.
+_AT_ONCE = 4
+FILTERS = ("phasor", "laplacian")
+
+
+def reconstruct(
+    capture: Capture,
+    method: str | None = None,
+    *,
+    grid: VoxelGrid | None = None,
+    depths: Sequence[float] | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> HiddenVolume:
+    """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
+
+    ``method``: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
+    capture, and ``metadata["reason"]`` says why. ``grid``: voxels of bp, fbp and phasor, None for
+    :func:`default_grid`; the other methods have a plane for each bin and a voxel behind each point. ``depths`` (near,
+    far), metres: what to look at; planes of the other methods outside of it are left out. ``progress``: show a bar.
+
+    ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
+    directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the shortest without ghosts, and
+    ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera`` (phasor). First and last legs are
+    taken off where a method cannot count them, light before time zero and phasors beside a transient are left out, and
+    of polarized captures the intensity is taken.
+
+    Raises SceneError for a method or an option that does not fit the capture or each other, ShapeError, UnitError and
+    DeviceError as the operators.
+    """
+    if not isinstance(capture, Capture):
+        raise ShapeError(f"reconstruct: expected a tt.nlos.Capture, got {shown(capture)}.")
+    if capture.transient is None:
+        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    choice = choose_method(capture) if method is None else Choice(method, "asked for")
+    entry = check_method(choice.name, capture)
+    options = {name: value for name, value in options.items() if value is not None}
+    _check_options(choice.name, entry.options, options)
+    if grid is not None and (depths is not None or not entry.free_grid):
+        why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
+        raise SceneError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
+    capture = _intensities(capture)
+    if not entry.takes_legs:
+        capture = _from_zero(subtract_legs(capture))
+    near_far = None if depths is None else checked_depths(depths)
+    with torch.no_grad():
+        if entry.free_grid:
+            voxels = default_grid(capture, depths=near_far) if grid is None else grid
+            values, directions, times, used = _on_grid(choice.name, capture, voxels, options, progress)
+        else:
+            values, directions, voxels = _on_own_grid(choice.name, capture, near_far, options, progress)
+            times, used = None, options
+    metadata = {"reason": choice.reason, "settings": _told(used)}
+    return HiddenVolume(values, voxels, choice.name, metadata, times, directions)
+
+
+def default_grid(
+    capture: Capture,
+    *,
+    depths: Sequence[float] | None = None,
+    size: int | Sequence[int] | None = None,
+    extent: float | Sequence[float] | None = None,
+    planes: int | None = None,
+) -> VoxelGrid:
+    """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
+    ``depths`` (near, far) in metres, None for all that a record reaches, and ``planes`` between them, None for one a
+    bin and 64 at most. Raises ShapeError, UnitError.
+    """
+    axis = capture.axis
+    if axis is None:
+        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    legs = float(capture.scan.legs.detach().min()) if capture.scan.first_and_last_leg else 0.0
+    far = (axis.end_opl - legs) / 2
+    if depths is None:
+        if far <= 0:
+            raise UnitError(
+                f"reconstruct: expected a record that is longer than its legs, {legs:.4g} m, got {axis.end_opl:.4g} m."
+            )
+        near = max((axis.start_opl - legs) / 2, NEAREST * far)
+    else:
+        near, far = checked_depths(depths)
+    if planes is None:
+        planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
+    middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64) + 0.5) / planes
+    if size is None and extent is None and not is_planar(capture.scan):
+        # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
+        shape = capture.scan.sensor_shape
+        size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
+    return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
+
+
+def checked_depths(depths: Any) -> tuple[float, float]:
+    """(near, far), metres. Raises UnitError."""
+    if not isinstance(depths, Sequence) or len(depths) != 2:
+        raise UnitError(f"reconstruct: expected depths as (near, far) in metres, got {shown(depths)}.")
+    near, far = (finite("reconstruct: depths", value) for value in depths)
+    if not 0 <= near < far:
+        raise UnitError(f"reconstruct: expected depths with 0 <= near < far in metres, got {near:g} to {far:g}.")
+    return near, far
+
+
+def normals_of(volume: HiddenVolume) -> Tensor:
+    """Unit normals (3, Y, X) in world coordinates where a volume with directions is brightest behind each pixel: of the
+    first item of a batch, summed over its channels. Raises ShapeError for a volume without directions.
+    """
+    if not isinstance(volume, HiddenVolume) or volume.directions is None:
+        raise ShapeError(
+            f"normals_of: expected a volume with directions (method directional-lct), got {shown(volume)}."
+        )
+    vectors = volume.directions
+    while vectors.ndim > 5:
+        vectors = vectors[0]
+    vectors = vectors.sum(0)
+    index = vectors.norm(dim=0).argmax(0).expand(3, 1, *vectors.shape[-2:])
+    brightest = vectors.gather(1, index)[:, 0]
+    return brightest / brightest.norm(dim=0).clamp_min(torch.finfo(brightest.dtype).tiny)
+
+
+# ------------------------------------------------------------------------------------------------------------- parts
+
+
+def _check_options(name: str, known: tuple[str, ...], options: dict[str, Any]) -> None:
+    for option in options:
+        if option not in known:
+            raise SceneError(
+                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
+                "Leave it out, or take another method."
+            )
+    if options.get("filter", FILTERS[0]) not in FILTERS:
+        raise SceneError(f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}.")
+    if options.get("filter") == "laplacian" and ("wavelength" in options or "cycles" in options):
+        raise SceneError("reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out.")
+
+
+def _told(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value if isinstance(value, int | float | str) else repr(value) for name, value in options.items()}
+
+
+def _intensities(capture: Capture) -> Capture:
+    transient, steady = capture.transient, capture.steady
+    assert transient is not None  # a capture without one has been refused
+    if capture.polarized:
+        dims = len(capture.scan.shape)
+        transient = transient.select(transient.ndim - dims - 3, 0)
+        steady = None if steady is None else steady.select(steady.ndim - dims - 2, 0)
+    return replace(capture, transient=transient, steady=steady, polarized=False, phasor=None, frequencies=None)
+
+
+def _from_zero(capture: Capture) -> Capture:
+    """Without the bins that begin before time zero."""
+    axis = capture.axis
+    assert axis is not None
+    early = math.ceil(-axis.start_opl / axis.bin_width_opl - 1e-6)
+    if early <= 0:
+        return capture
+    if early >= axis.num_bins:
+        raise UnitError(f"reconstruct: expected light after time zero, got {axis}. Does the record begin too early?")
+    return capture.crop(axis.start_opl + early * axis.bin_width_opl, axis.end_opl)
+
+
+def _bar(total: int, progress: bool) -> Any:
+    from tqdm.auto import tqdm
+
+    return tqdm(total=total, desc="volume", disable=not progress)
+
+
+def _on_own_grid(
+    name: str, capture: Capture, depths: tuple[float, float] | None, options: dict[str, Any], progress: bool
+) -> tuple[Tensor, Tensor | None, VoxelGrid]:
+    """By a method with a plane for each bin, a channel at a time."""
+    function = {"fk": fk, "midpoint-fk": midpoint_fk, "lct": lct, "directional-lct": directional_lct}[name]
+    axis, transient = capture.axis, capture.transient
+    assert axis is not None and transient is not None
+    dim = transient.ndim - len(capture.scan.shape) - 2
+    wall = (
+        Midpoints(capture.scan, time_axis=axis).wall
+        if name == "midpoint-fk"
+        else PlanarScan.of_scan(capture.scan, "reconstruct")
+    )
+    found, z = [], axis.centers_opl / 2
+    seen = torch.ones_like(z, dtype=torch.bool) if depths is None else (z >= depths[0]) & (z <= depths[1])
+    if not bool(seen.any()):
+        raise UnitError(
+            f"reconstruct: expected depths within the record's, {float(z[0]):.4g} to {float(z[-1]):.4g} m, got "
+            f"{shown(depths)}."
+        )
+    kept = seen.nonzero()[:, 0]
+    with _bar(transient.shape[dim], progress) as bar:
+        for channel in range(transient.shape[dim]):
+            one = replace(capture, transient=transient.narrow(dim, channel, 1), steady=None, channels=())
+            found.append(function(one, **options).index_select(-3, kept.to(transient.device)))
+            bar.update()
+    grid = VoxelGrid.of_wall(wall, z[kept])
+    together = torch.cat(found, dim)
+    return (together.norm(dim=-4), together, grid) if name == "directional-lct" else (together, None, grid)
+
+
+def _on_grid(
+    name: str, capture: Capture, grid: VoxelGrid, options: dict[str, Any], progress: bool
+) -> tuple[Tensor, Tensor | None, Tensor | None, dict[str, Any]]:
+    """By a method that takes any planes, some of them at a time."""
+    axis, transient = capture.axis, capture.transient
+    assert axis is not None and transient is not None
+    used = dict(options)
+    laplacian = used.get("filter") == "laplacian"
+    if name != "bp" and not laplacian:
+        used.setdefault("wavelength", default_wavelength(capture))
+    make = _maker(name, capture, axis, used)
+    found = []
+    at_once = len(grid.depths) if name == "phasor" else _AT_ONCE
+    with _bar(len(grid.depths), progress) as bar:
+        for first in range(0, len(grid.depths), at_once):
+            part = grid.depths[first : first + at_once]
+            found.append(make(grid.at_depths(part)).to(transient.device).reconstruct(capture))
+            bar.update(len(part))
+    values = torch.cat(found, -3)
+    if laplacian:
+        negative_laplacian = LaplacianFilter()
+        negative_laplacian.check(grid, axis.bin_width_opl, "reconstruct")
+        values = negative_laplacian.image(negative_laplacian.volume(values))
+    camera = used.get("camera", DirectLight())
+    return values, None, camera.times, used
+
+
+def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any]) -> Callable[[VoxelGrid], Any]:
+    """The operator of a method on some planes."""
+    transient = capture.transient
+    assert transient is not None
+    dtype = torch.float64 if transient.dtype == torch.float64 else torch.float32
+    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": dtype}
+    if name == "bp" or options.get("filter") == "laplacian":
+        return lambda grid: Backprojection(capture.scan, grid, **common)
+    pulse = PhasorFilter(options["wavelength"], options.get("cycles", 4.0))
+    if name == "fbp":
+        return lambda grid: FilteredBackprojection(capture.scan, grid, filter=pulse, **common)
+    camera = options.get("camera")
+    return lambda grid: PhasorField(capture.scan, grid, pulse=pulse, camera=camera, **common)
+
+
+def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
+    """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
+
+    Raises SceneError for unknown names and where times are missing or have no meaning.
+    """
+    if name == "direct":
+        if times is not None:
+            raise SceneError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
+        return DirectLight()
+    cameras = {"confocal": ConfocalCamera, "transient": TransientCamera}
+    if name not in cameras:
+        raise SceneError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
+    if times is None:
+        raise SceneError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
+    start, stop, number = times
+    return cameras[name](torch.linspace(float(start), float(stop), int(number), dtype=torch.float64))

@@ -1,0 +1,103 @@
+"""What operators ask of their arguments and of captures; what is refused, in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import shown
+from torchtransient.reconstruction.planar_scan import PlanarScan
+
+PRECISIONS = (torch.float32, torch.float64)
+
+
+def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
+    """A precision that tables are kept in. Raises UnitError for others."""
+    if dtype not in PRECISIONS:
+        raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {shown(dtype)}.")
+    return dtype
+
+
+def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
+    """A time axis. Raises ShapeError for anything else."""
+    if not isinstance(time_axis, TimeAxis):
+        raise ShapeError(f"{who}: expected time_axis as a tt.TimeAxis, got {shown(time_axis)}.")
+    return time_axis
+
+
+def checked_scan(scan: Scan, who: str) -> Scan:
+    """A scan. Raises ShapeError for anything else."""
+    if not isinstance(scan, Scan):
+        raise ShapeError(f"{who}: expected a tt.nlos.Scan, got {shown(scan)}.")
+    return scan
+
+
+def checked_points(points: Any, who: str) -> Tensor:
+    """Points (..., 3), float64 on the CPU, detached. Raises ShapeError, and UnitError for some that are not finite."""
+    if not isinstance(points, Tensor) or points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
+        got = tuple(points.shape) if isinstance(points, Tensor) else shown(points)
+        raise ShapeError(f"{who}: expected a VoxelGrid or points (..., 3) as a tensor, got {got}.")
+    plain = points.detach().to("cpu", torch.float64)
+    if not bool(torch.isfinite(plain).all()):
+        raise UnitError(f"{who}: expected finite points in metres, got some that are not.")
+    return plain
+
+
+def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
+    """The grid of a confocal scan of a flat wall that counts no legs. Raises ShapeError for others."""
+    if isinstance(scan, PlanarScan):
+        return scan
+    if not isinstance(scan, Scan):
+        raise ShapeError(f"{who}: expected a tt.nlos.Scan or a PlanarScan, got {shown(scan)}.")
+    if scan.kind != "confocal":
+        raise ShapeError(
+            f"{who}: expected a confocal scan, got a {scan.kind} one. Take the diagonal of an exhaustive capture with "
+            "capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or PhasorField."
+        )
+    refuse_legs(scan, who)
+    return PlanarScan.of_scan(scan, who)
+
+
+def refuse_legs(scan: Scan, who: str) -> None:
+    """Raises ShapeError for a scan that counts the first and last leg."""
+    if scan.first_and_last_leg:
+        raise ShapeError(
+            f"{who}: expected lengths from the spot to the sensor point, got a scan that counts the first and last leg "
+            "too. Take the capture that subtract_legs(capture) gives, with its scan and axis."
+        )
+
+
+def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
+    """Transient and axis of a capture. Raises ShapeError for what is none, or has none."""
+    if not isinstance(capture, Capture):
+        raise ShapeError(f"{who}: expected a tt.nlos.Capture, got {shown(capture)}. Tensors go to an operator.")
+    if capture.transient is None or capture.axis is None:
+        raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
+    return capture.transient, capture.axis
+
+
+def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tensor:
+    """The transient of a capture with the axis of an operator. Raises ShapeError for another axis, polarized light and
+    captures without a transient.
+    """
+    transient, axis = checked_capture(capture, who)
+    if capture.polarized:
+        raise ShapeError(f"{who}: expected a capture of intensities, got Stokes components. Give its transient[0].")
+    if axis != time_axis:
+        raise ShapeError(f"{who}: expected a capture with {time_axis}, as the operator has, got {axis}.")
+    return transient
+
+
+def same_light(a: Scan, b: Scan) -> bool:
+    """Whether two scans measure the same: kind, points and, where they count, legs."""
+    if a is b:
+        return True
+    if (a.kind, a.shape, a.first_and_last_leg) != (b.kind, b.shape, b.first_and_last_leg):
+        return False
+    names = ["sensor_points", "laser_points"] + ["sensor_origin", "laser_origin"] * a.first_and_last_leg
+    return all(torch.equal(getattr(a, name).detach().cpu(), getattr(b, name).detach().cpu()) for name in names)

@@ -1,0 +1,56 @@
+"""Roots of transients: the wavefield that f-k migration takes is one of a measured intensity.
+
+The square root has no derivative at zero, where most bins of a capture are. H / sqrt(|H| + floor) has one: it is H /
+sqrt(floor) near zero, its slope is nowhere more than 1 / sqrt(floor), and far above the floor it is the root.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import UnitError
+from torchtransient.quantities import finite
+
+COUNTS_FLOOR = 0.25
+"""Floor for photon counts: the slope is at most 2, the root of one count 0.89, that of none zero."""
+
+
+def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
+    """``H / sqrt(|H| + floor)`` of every value, odd in H: what background leaves below zero keeps its sign.
+
+    ``floor``: in the unit of the transient, 1/4 for photon counts; a small part of the brightest bin for radiance. With
+    0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero there.
+    Differentiable any number of times, in both modes. Whole numbers become float32. Raises UnitError for a floor below
+    zero.
+    """
+    floor = checked_floor(floor)
+    h = transient if transient.is_floating_point() else transient.to(torch.float32)
+    if floor:
+        return h * torch.rsqrt(h.abs() + floor)
+    empty = h == 0
+    # The inner `where` keeps the infinite slope at zero out of products with zero, which would be NaN.
+    magnitude = torch.where(empty, torch.ones_like(h), h.abs())
+    return torch.where(empty, torch.zeros_like(h), torch.sign(h) * magnitude.sqrt())
+
+
+class StabilisedRoot(nn.Module):
+    """:func:`stabilised_root` as a layer."""
+
+    def __init__(self, floor: float = COUNTS_FLOOR) -> None:
+        super().__init__()
+        self.floor = checked_floor(floor)
+
+    def forward(self, transient: Tensor) -> Tensor:
+        return stabilised_root(transient, self.floor)
+
+    def extra_repr(self) -> str:
+        return f"floor={self.floor:g}"
+
+
+def checked_floor(value: float) -> float:
+    """A floor of :func:`stabilised_root`. Raises UnitError."""
+    floor = finite("stabilised_root: floor", value)
+    if floor < 0:
+        raise UnitError(f"stabilised_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
+    return floor

@@ -1,0 +1,96 @@
+"""What operators of confocal captures on a flat, regular grid share: a plane of voxels for each bin; inverses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Scan
+from torchtransient.errors import ShapeError
+from torchtransient.reconstruction.capture_checks import checked_axis, confocal_wall
+from torchtransient.reconstruction.linear import LinearOperator
+from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.transient_operator import TransientOperator
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+LEAST_BINS = 4
+# Complex numbers that are worked on at once: a piece that the caches of a CPU hold, and one that fills a GPU.
+CPU_CHUNK, GPU_CHUNK = 1 << 17, 1 << 24
+
+
+def chunk_rows(elements: int, device: torch.device) -> int:
+    """How many rows of ``elements`` complex numbers to work on at once."""
+    return max(1, (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK) // max(1, elements))
+
+
+class ConfocalOperator(TransientOperator):
+    """A linear operator between a volume (..., Z, Y, X) before a flat wall and confocal transients (..., T, Y, X).
+
+    ``scan``: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
+    from the spot to the sensor point (``first_and_last_leg=False``). ``time_axis``: of the transients. Voxels stand
+    behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path length.
+
+    Raises ShapeError for other scans and axes, UnitError for a dtype other than float32 and float64.
+    """
+
+    grid: VoxelGrid
+
+    def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
+        who = type(self).__name__
+        wall, bins = confocal_wall(scan, who), checked_axis(time_axis, who).num_bins
+        if bins < LEAST_BINS:
+            raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        self.wall = wall
+        self.grid = VoxelGrid.of_wall(wall, time_axis.centers_opl / 2)
+        self.data_shape = (bins, *wall.size)
+        self.volume_shape = self.data_shape
+
+    @property
+    def depths(self) -> Tensor:
+        """(Z,) float64: distances of the planes from the wall, metres. Half bins count: half the middle of each bin."""
+        return self.grid.depths
+
+    def _takes(self, scan: Scan) -> bool:
+        return scan is self.scan or self.wall.matches(confocal_wall(scan, type(self).__name__))
+
+
+class InverseOperator(LinearOperator):
+    """A regularised inverse of an operator, itself a linear operator: from its data to its volume, whose
+    ``points``, ``depths`` and ``grid`` it has.
+    """
+
+    def __init__(self, operator: ConfocalOperator) -> None:
+        super().__init__()
+        self.operator = operator
+        self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
+        self.dtype = operator.dtype
+
+    @property
+    def axis(self) -> TimeAxis:
+        """Of the transients."""
+        return self.operator.axis
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The voxels that it finds values of."""
+        return self.operator.grid
+
+    @property
+    def points(self) -> Tensor:
+        """(Z, Y, X, 3) float64 on the CPU: these voxels in world coordinates, metres."""
+        return self.operator.points
+
+    @property
+    def depths(self) -> Tensor:
+        """(Z,) float64: distances of their planes from the wall, metres."""
+        return self.operator.depths
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self.dtype = self.operator.dtype
+        return self

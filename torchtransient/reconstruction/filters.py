@@ -1,0 +1,183 @@
+"""Filters of filtered backprojection: what happens to transients before it, or to the volume after it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import positive
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+
+class ReconstructionFilter(Protocol):
+    """A linear filter of rows (..., T) in time and of volumes (..., Z, Y, X), each with its adjoint.
+
+    ``complex_volume``: whether filtered rows are complex. ``check`` raises for volumes that it cannot filter, before
+    anything is computed; ``image`` makes a picture of a filtered volume.
+    """
+
+    @property
+    def complex_volume(self) -> bool: ...
+
+    def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None: ...
+
+    def rows(self, rows: Tensor, bin_width_opl: float) -> Tensor: ...
+
+    def rows_adjoint(self, rows: Tensor, bin_width_opl: float) -> Tensor: ...
+
+    def volume(self, volume: Tensor) -> Tensor: ...
+
+    def volume_adjoint(self, volume: Tensor) -> Tensor: ...
+
+    def image(self, volume: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class PhasorFilter:
+    """The virtual illumination of phasor fields (Liu et al. 2019): a pulse of a ``wavelength`` in metres under a
+    Gaussian that holds ``cycles`` of them within three standard deviations to both sides.
+
+    Transients are convolved with exp(2 pi i t / wavelength) exp(-t^2 / 2 sigma^2), sigma = cycles wavelength / 6, whose
+    transform is a Gaussian of height one; light before and behind the record counts as none. The picture is the squared
+    modulus. Wavelengths of twice the scan's pitch and more are free of ghosts. Raises UnitError, for wavelengths below
+    two bins as well.
+    """
+
+    wavelength: float
+    cycles: float = 4.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "wavelength", positive("PhasorFilter: wavelength", self.wavelength))
+        object.__setattr__(self, "cycles", positive("PhasorFilter: cycles", self.cycles))
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the pulse's envelope, metres."""
+        return self.cycles * self.wavelength / 6
+
+    @property
+    def complex_volume(self) -> bool:
+        return True
+
+    def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
+        check_sampling(self.wavelength, bin_width_opl, who)
+
+    def rows(self, rows: Tensor, bin_width_opl: float) -> Tensor:
+        bins = rows.shape[-1]
+        padded = _padded_length(bins)
+        spectrum = torch.fft.fft(rows, n=padded).mul_(self._response(rows, padded, bin_width_opl))
+        filtered: Tensor = torch.fft.ifft(spectrum)[..., :bins]
+        return filtered
+
+    def rows_adjoint(self, rows: Tensor, bin_width_opl: float) -> Tensor:
+        # The response is real: the filter is its own adjoint, up to the imaginary part that real rows do not have.
+        return self.rows(rows, bin_width_opl).real
+
+    def volume(self, volume: Tensor) -> Tensor:
+        return volume
+
+    def volume_adjoint(self, volume: Tensor) -> Tensor:
+        return volume
+
+    def image(self, volume: Tensor) -> Tensor:
+        return volume.real.square() + volume.imag.square()
+
+    def _response(self, rows: Tensor, count: int, bin_width_opl: float) -> Tensor:
+        frequency = torch.fft.fftfreq(count, bin_width_opl, dtype=torch.float64)
+        offset = (frequency - 1 / self.wavelength) * (2 * math.pi * self.sigma)
+        return torch.exp(-offset.square() / 2).to(rows.device, rows.real.dtype)
+
+
+@dataclass(frozen=True)
+class LaplacianFilter:
+    """The negative Laplacian of a Gaussian, on the volume (Velten et al. 2012; Laurenzis and Velten 2014).
+
+    -(d^2/dz^2 + d^2/dy^2 + d^2/dx^2) of the volume smoothed by a Gaussian of ``sigma`` voxels in each direction; the
+    derivatives are per voxel. What is outside of the volume counts as zero. The picture is what comes out, with its
+    negative lobes. Needs a :class:`VoxelGrid` of evenly spaced planes. Raises UnitError; ShapeError for other volumes.
+    """
+
+    sigma: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sigma", positive("LaplacianFilter: sigma", self.sigma))
+
+    @property
+    def complex_volume(self) -> bool:
+        return False
+
+    def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
+        if grid is None:
+            raise ShapeError(
+                f"{who}: expected a VoxelGrid for a LaplacianFilter, whose neighbours are those of a grid, got points."
+            )
+        steps = grid.depths.diff()
+        # Depths of single precision are even enough.
+        if len(steps) and float(steps.max() - steps.min()) > 1e-3 * float(steps.max()):
+            raise ShapeError(
+                f"{who}: expected evenly spaced planes for a LaplacianFilter, got steps of {float(steps.min()):.4g} to "
+                f"{float(steps.max()):.4g} m."
+            )
+
+    def rows(self, rows: Tensor, bin_width_opl: float) -> Tensor:
+        return rows
+
+    def rows_adjoint(self, rows: Tensor, bin_width_opl: float) -> Tensor:
+        return rows
+
+    def volume(self, volume: Tensor) -> Tensor:
+        smooth, curved = self._kernels(volume)
+        dims = (-3, -2, -1)
+        once = {dim: _convolved(volume, smooth, dim) for dim in dims}
+        total = torch.zeros_like(volume)
+        for dim in dims:
+            # Smoothed along one of the other two already; convolutions along different axes commute.
+            other, last = (d for d in dims if d != dim)
+            total += _convolved(_convolved(once[other], smooth, last), curved, dim)
+        return total
+
+    def volume_adjoint(self, volume: Tensor) -> Tensor:
+        # Symmetric kernels between zeros: a symmetric matrix.
+        return self.volume(volume)
+
+    def image(self, volume: Tensor) -> Tensor:
+        return volume
+
+    def _kernels(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Gaussian of sum one, and minus its second derivative, of sum zero and second moment -2."""
+        reach = max(1, math.ceil(4 * self.sigma))
+        t = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        smooth = torch.exp(-(t**2) / (2 * self.sigma**2))
+        smooth = smooth / smooth.sum()
+        curved = (1 - (t / self.sigma) ** 2) * smooth
+        # Sampling and cutting off leave a sum and a moment that are slightly off: planes of constant and of quadratic
+        # brightness must come out exactly.
+        curved = curved - smooth * curved.sum()
+        curved = curved * (-2 / (curved * t**2).sum())
+        return smooth.to(like.device, like.dtype), curved.to(like.device, like.dtype)
+
+
+def check_sampling(wavelength: float, bin_width_opl: float, who: str) -> None:
+    """Raises UnitError for wavelengths that the bins cannot hold."""
+    if wavelength < 2 * bin_width_opl:
+        raise UnitError(
+            f"{who}: expected a wavelength of two bins at least, {2 * bin_width_opl:.4g} m, got {wavelength:.4g} m."
+        )
+
+
+def _padded_length(bins: int) -> int:
+    """A power of two that a row and the pulse fit into without wrapping around."""
+    return 1 << (2 * bins - 1).bit_length()
+
+
+def _convolved(volume: Tensor, kernel: Tensor, dim: int) -> Tensor:
+    lines = volume.movedim(dim, -1)
+    flat = lines.reshape(-1, 1, lines.shape[-1])
+    done = functional.conv1d(flat, kernel[None, None], padding=len(kernel) // 2)
+    return done.reshape(lines.shape).movedim(-1, dim)

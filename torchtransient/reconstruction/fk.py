@@ -1,0 +1,243 @@
+"""f-k migration of confocal captures (Lindell, Wetzstein, O'Toole, "Wave-based non-line-of-sight imaging using fast f-k
+migration", SIGGRAPH 2019), after R. H. Stolt, "Migration by Fourier transform", Geophysics 43 (1978).
+
+A confocal scan is taken for the wavefield u(x, y, t) of hidden points that light up at t = 0 and are seen through a
+medium of half the speed of light. Its field at t = 0 has the transform
+
+    psi(kx, ky, kz) = J U(kx, ky, k),    k^2 = kx^2 + ky^2 + kz^2,    J = kz / k,
+
+with k per metre of optical path over 2, that is, along the record. In bins of the transforms of twice the length,
+
+    jt^2 = jz^2 + (T dt / (2 Y dy))^2 jy^2 + (T dt / (2 X dx))^2 jx^2 .
+
+U is interpolated along jt. Three things make that exact to 1e-3 of the field: the record's middle is moved to t = 0,
+where its transform varies least; the taps are those of a Kaiser-Bessel window, whose transform the data are divided by
+beforehand; the place of the samples is in the phase: bin k at start + (k + 1/2) dt, plane k at half of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import SceneError
+from torchtransient.quantities import shown
+from torchtransient.reconstruction.capture_roots import checked_floor, stabilised_root
+from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
+from torchtransient.reconstruction.linear import each
+from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.transient_operator import reconstructed
+
+TARGETS = ("diffuse", "retroreflective")
+TAPS = (2, 4)
+
+
+class FK(ConfocalOperator):
+    """f-k migration as a linear operator, for confocal captures of a flat wall.
+
+    ``operator(field)``: complex (..., Z, Y, X) at time zero to the real wavefield (..., T, Y, X) on the wall, the
+    exploding-reflector model; ``operator.adjoint(wavefield)``: the migration. They are each other's adjoints exactly,
+    and nearly inverses: migration of the model is J / 2 times the field, J being the cosine of each wave's direction.
+    ``operator.reconstruct(transient)``: from measured light to the squared field.
+
+    ``target``: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
+    with the second and psi = sqrt(H), where z is half the optical path length. ``floor``: of the root, see
+    :func:`stabilised_root`, in the unit of the transient; 0, the default, is the root itself, with no derivative at
+    empty bins. Take 1/4 for photon counts and wherever gradients go through. ``taps``: 4 interpolate to 3e-4 of the
+    field, 2 linearly to some percent.
+
+    Wall, time and depth are padded to twice their length. Memory: two complex cubes of the wavefield for each call, and
+    tables of 4 + 8 taps bytes (float32) for each quarter of a voxel of the padded spectrum. Not supported: scans that
+    are not confocal (:class:`MidpointFK`), curved walls, cosines of wall and hidden surfaces. Raises ShapeError for
+    scans that it cannot take, SceneError for an unknown target and other taps, UnitError for a negative floor.
+    """
+
+    real_volume = False
+    place: Tensor
+    weights: Tensor
+    taper: Tensor
+
+    def __init__(
+        self,
+        scan: Scan | PlanarScan,
+        *,
+        time_axis: TimeAxis,
+        target: str = "diffuse",
+        floor: float = 0.0,
+        taps: int = 4,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        if target not in TARGETS:
+            raise SceneError(f"FK: expected target to be one of {', '.join(TARGETS)}, got {shown(target)}.")
+        if taps not in TAPS:
+            raise SceneError(f"FK: expected 2 or 4 taps, got {shown(taps)}.")
+        self.target, self.taps, self.floor = target, int(taps), checked_floor(floor)
+        self._set_tables()
+
+    def tables(self) -> dict[str, Tensor]:
+        """``place`` (X + 1, Y + 1, T): the first bin to interpolate from; ``weights`` (X + 1, taps, Y + 1, T, 2): of
+        the bins from there on, real and imaginary; ``taper`` (T,): what the data are multiplied by. Frequencies below
+        zero are mirrors of these.
+        """
+        bins, rows, columns = self.data_shape
+        width = self.axis.bin_width_opl
+        depth = bins * width
+        jz = torch.arange(bins, dtype=torch.float64)
+        ky = torch.arange(rows + 1, dtype=torch.float64)[:, None] * (depth / (2 * rows * self.grid.pitch[0]))
+        kx = torch.arange(columns + 1, dtype=torch.float64)[:, None, None]
+        kx = kx * (depth / (2 * columns * self.grid.pitch[1]))
+        jt = torch.sqrt(jz**2 + ky**2 + kx**2)
+        # Waves along the wall (kz = 0) never came from the volume; at the origin the quotient is 0 / 0.
+        jacobian = torch.where(jz > 0, jz / jt.clamp_min(1.0), 0.0)
+        middle, first = bins // 2, (self.axis.start_opl + width / 2) / width
+        phase = -(math.pi / bins) * ((jt - jz) * first + jt * middle)
+        # Moved into the record where it ends; the window says which bins count. Above the highest frequency there is
+        # nothing, and below zero come only waves whose J is 0.
+        place = (torch.floor(jt) - (self.taps // 2 - 1)).clamp_(0, bins + 1 - self.taps)
+        weights = torch.empty(columns + 1, self.taps, rows + 1, bins, 2, dtype=torch.float64)
+        for tap in range(self.taps):
+            j = place + tap
+            size, angle = _window(jt - j, self.taps) * jacobian, phase + (math.pi * middle / bins) * j
+            weights[:, tap, ..., 0], weights[:, tap, ..., 1] = size * angle.cos(), size * angle.sin()
+        offset = (torch.arange(bins, dtype=torch.float64) - middle) / (2 * bins)
+        return {"place": place.to(torch.int32), "weights": weights, "taper": 1 / _window_transform(offset, self.taps)}
+
+    def adjoint_(self, y: Tensor) -> Tensor:
+        return each(self._migrate, y, 3)
+
+    def map_(self, x: Tensor) -> Tensor:
+        return each(self._model, x, 3)
+
+    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
+        """The squared modulus of the migrated field, (..., Z, Y, X) of (..., T, Y, X) or of a capture's (C, T, Y, X).
+
+        Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
+        """
+        field = self.adjoint(self.wavefield(transient))
+        return field.real.square() + field.imag.square()
+
+    def wavefield(self, transient: Tensor | Capture) -> Tensor:
+        """psi (..., T, Y, X) of a transient: z sqrt(H) of a diffuse target, sqrt(H) of a retroreflective one."""
+        data = self.transients(transient)
+        psi = stabilised_root(data, self.floor)
+        return psi * self._falloff().to(psi) if self.target == "diffuse" else psi
+
+    def _falloff(self) -> Tensor:
+        # Nothing comes from behind the wall: bins before zero are noise.
+        return self.depths.clamp_min(0)[:, None, None]
+
+    # ---------------------------------------------------------------------------------------------------- the two maps
+
+    def _migrate(self, wavefield: Tensor) -> Tensor:
+        bins, rows, columns = self.data_shape
+        spectrum = wavefield.new_empty(2 * columns, rows, bins + 1, dtype=self.dtype.to_complex())
+        tapered = wavefield * self.taper[:, None, None]
+        step = chunk_rows(2 * columns * (bins + 1), wavefield.device)
+        for y in range(0, rows, step):
+            of_time = torch.fft.rfft(tapered[:, y : y + step].permute(1, 2, 0).contiguous(), n=2 * bins)
+            spectrum[:, y : y + step] = torch.fft.fft(of_time, n=2 * columns, dim=1).transpose(0, 1)
+        for part, table in self._blocks(spectrum):
+            place, weights = self._mirrored(table)
+            over_y = torch.fft.fft(part, n=2 * rows, dim=1)
+            field = torch.gather(over_y, 2, place).mul_(weights[:, 0])
+            for tap in range(1, self.taps):
+                field.addcmul_(torch.gather(over_y, 2, place.add_(1)), weights[:, tap])
+            part[..., :bins] = torch.fft.ifft(field, dim=1)[:, :rows]
+        out = torch.empty(bins, rows, columns, dtype=spectrum.dtype, device=spectrum.device)
+        for y in range(0, rows, step):
+            over_x = torch.fft.ifft(spectrum[:, y : y + step, :bins], dim=0)[:columns]
+            out[:, y : y + step] = torch.fft.ifft(over_x, n=2 * bins)[..., :bins].permute(2, 1, 0)
+        return out
+
+    def _model(self, field: Tensor) -> Tensor:
+        bins, rows, columns = self.data_shape
+        spectrum = field.new_empty(2 * columns, rows, bins + 1, dtype=self.dtype.to_complex())
+        step = chunk_rows(2 * columns * (bins + 1), field.device)
+        for y in range(0, rows, step):
+            of_depth = torch.fft.fft(field[:, y : y + step].permute(2, 1, 0).contiguous(), n=2 * bins)[..., :bins]
+            spectrum[:, y : y + step, :bins] = torch.fft.fft(of_depth, n=2 * columns, dim=0)
+        for part, table in self._blocks(spectrum):
+            place, weights = self._mirrored(table)
+            over_y = torch.fft.fft(part[..., :bins], n=2 * rows, dim=1)
+            found = torch.zeros(*over_y.shape[:2], bins + 1, dtype=over_y.dtype, device=over_y.device)
+            for tap in range(self.taps):
+                found.scatter_add_(2, place, over_y * weights[:, tap].conj())
+                place.add_(1)
+            part.copy_(torch.fft.ifft(found, dim=1)[:, :rows])
+        out = torch.empty(bins, rows, columns, dtype=self.dtype, device=field.device)
+        # irfft counts all frequencies but the first and the last twice, the adjoint of rfft none.
+        half = torch.full((bins + 1,), 0.5, dtype=self.dtype, device=field.device)
+        half[0] = half[-1] = 1.0
+        for y in range(0, rows, step):
+            over_x = torch.fft.ifft(spectrum[:, y : y + step], dim=0)[:columns] * half
+            out[:, y : y + step] = torch.fft.irfft(over_x, n=2 * bins)[..., :bins].permute(2, 1, 0)
+        return out.mul_(self.taper[:, None, None])
+
+    def _blocks(self, spectrum: Tensor) -> Iterator[tuple[Tensor, slice]]:
+        """Parts (kx, Y, T + 1) of a spectrum to be changed in place, with the slice of the tables that they need; the
+        frequencies below zero in the order of their mirrors.
+        """
+        bins, rows, columns = self.data_shape
+        step = chunk_rows(2 * rows * (bins + 1), spectrum.device)
+        for first in range(0, columns + 1, step):
+            last = min(first + step, columns + 1)
+            yield spectrum[first:last], slice(first, last)
+            low, high = max(first, 1), min(last, columns)
+            if low < high:
+                mirrored = spectrum[2 * columns - high + 1 : 2 * columns - low + 1]
+                if high - low == 1:
+                    yield mirrored, slice(low, high)
+                else:
+                    part = mirrored.flip(0)
+                    yield part, slice(low, high)
+                    mirrored.copy_(part.flip(0))
+
+    def _mirrored(self, rows: slice) -> tuple[Tensor, Tensor]:
+        """Tables of some kx for all ky, those below zero too."""
+        height = self.place.shape[1]
+        order = torch.arange(2 * height - 2, device=self.place.device)
+        order = torch.minimum(order, 2 * height - 2 - order)
+        place = self.place[rows].index_select(1, order).to(torch.int64)
+        return place, torch.view_as_complex(self.weights[rows].index_select(2, order))
+
+
+def fk(capture: Capture, **options: Any) -> Tensor:
+    """:meth:`FK.reconstruct` of a capture: the volume (C, Z, Y, X), on the device of its transient.
+
+    ``options``: of :class:`FK`. Raises as it does.
+    """
+    return reconstructed(capture, FK, who="fk", **options)
+
+
+# ------------------------------------------------------------------------------------------------ interpolation windows
+
+
+def _window(distance: Tensor, taps: int) -> Tensor:
+    """The interpolation window at a distance in bins: a triangle, or Kaiser and Bessel's."""
+    if taps == 2:
+        return (1 - distance.abs()).clamp_min(0)
+    inside = (1 - (2 * distance / taps) ** 2).clamp_min(0)
+    window: Tensor = torch.special.i0(_beta(taps) * torch.sqrt(inside))
+    return window * (distance.abs() < taps / 2)
+
+
+def _window_transform(time: Tensor, taps: int) -> Tensor:
+    """The factor that interpolation puts on a record at ``time``, in units of the padded record."""
+    if taps == 2:
+        return torch.sinc(time) ** 2
+    root = torch.sqrt(_beta(taps) ** 2 - (math.pi * taps * time) ** 2)
+    return taps * torch.sinh(root) / root
+
+
+def _beta(taps: int, oversampling: float = 2.0) -> float:
+    """The window's shape for a record that is padded ``oversampling`` times (Beatty, Nishimura, Pauly, "Rapid gridding
+    reconstruction with a minimal oversampling ratio", IEEE Trans. Medical Imaging 24, 2005, equation 5).
+    """
+    return math.pi * math.sqrt((taps / oversampling) ** 2 * (oversampling - 0.5) ** 2 - 0.8)

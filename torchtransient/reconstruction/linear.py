@@ -1,0 +1,129 @@
+"""Linear maps between hidden volumes and captures, with exact adjoints and derivatives that save nothing.
+
+A map is two plain functions that run without autograd, a piece at a time. What torch differentiates is one node: its
+backward pass is the adjoint, that of the adjoint the map again, and forward mode the map of the tangent. No tensor is
+kept for it, so that memory does not grow with what lies between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import DeviceError, ShapeError
+
+
+class _Apply(torch.autograd.Function):
+    """``map_`` or ``adjoint_`` of an operator."""
+
+    @staticmethod
+    def forward(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
+        with torch.no_grad():
+            return (operator.adjoint_ if adjoint else operator.map_)(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        x, ctx.operator, ctx.adjoint = inputs
+        ctx.real = not x.is_complex()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        found = _apply(grad, ctx.operator, not ctx.adjoint)
+        return (found.real if ctx.real and found.is_complex() else found), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return _apply(tangent, ctx.operator, ctx.adjoint)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, operator: LinearOperator, adjoint: bool) -> Any:
+        # Leading dimensions are a batch anyway.
+        dim = in_dims[0]
+        return _apply(x if dim is None else x.movedim(dim, 0), operator, adjoint), None if dim is None else 0
+
+
+def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
+    result: Tensor = _Apply.apply(x, operator, adjoint)  # type: ignore[no-untyped-call]
+    return result
+
+
+class LinearOperator(nn.Module):
+    """A linear map ``A`` from a volume to what a scan measures of it.
+
+    ``forward(volume)`` is ``A volume``, ``adjoint(y)`` is ``A^H y``, both differentiable in both modes, any number of
+    times, for any leading dimensions (batch, channels), under ``torch.vmap``, and on the device of their tables
+    (``operator.to(device)``). ``volume_shape``, ``data_shape``: the trailing dimensions of the two.
+
+    Classes define ``map_(x)`` and ``adjoint_(y)``, which run without autograd, take any leading dimensions, may be
+    called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
+    part of it where one of the two is real by nature (:attr:`real_volume`, :attr:`real_data`). They take tensors of the
+    operator's own precision (:attr:`dtype`, real; complex ones have the matching complex type); others are converted,
+    half precision to float32 tables as well.
+    """
+
+    volume_shape: tuple[int, ...]
+    data_shape: tuple[int, ...]
+    dtype: torch.dtype
+    real_volume = True
+    real_data = True
+
+    def map_(self, x: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def adjoint_(self, y: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def forward(self, volume: Tensor) -> Tensor:
+        """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
+        volume = self._taken("volume", volume, self.volume_shape, real=self.real_volume)
+        return _apply(volume, self, False)
+
+    def adjoint(self, data: Tensor) -> Tensor:
+        """``A^H data``: (..., *data_shape) to (..., *volume_shape). Raises ShapeError, DeviceError."""
+        data = self._taken("data", data, self.data_shape, real=self.real_data)
+        return _apply(data, self, True)
+
+    def _taken(self, name: str, x: Tensor, shape: tuple[int, ...], *, real: bool) -> Tensor:
+        who = type(self).__name__
+        if not isinstance(x, Tensor):
+            raise ShapeError(f"{who}: expected {name} as a tensor (..., {_words(shape)}), got {type(x).__name__}.")
+        if tuple(x.shape[x.ndim - len(shape) :]) != shape or x.ndim < len(shape):
+            raise ShapeError(f"{who}: expected {name} (..., {_words(shape)}), got {tuple(x.shape)}.")
+        if real and x.is_complex():
+            raise ShapeError(f"{who}: expected {name} of real numbers, got {x.dtype}. Give its real part or modulus.")
+        device = self.device
+        if device is not None and x.device != device:
+            raise DeviceError(
+                f"{who}: expected {name} on {device}, where the operator is, got one on {x.device}. Move one of them "
+                "with .to(device)."
+            )
+        return x.to(self.dtype.to_complex() if x.is_complex() or not real else self.dtype)
+
+    @property
+    def device(self) -> torch.device | None:
+        """Where the tables are, None for an operator without any."""
+        table = next((tensor for tensor in (*self.buffers(), *self.parameters())), None)
+        return None if table is None else table.device
+
+
+def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
+    """``function`` of every item of the leading dimensions of ``x``, one at a time; ``dims``: those of an item."""
+    lead = x.shape[: x.ndim - dims]
+    if not lead:
+        return function(x)
+    items = x.reshape(-1, *x.shape[x.ndim - dims :])
+    if len(items) == 0:
+        raise ShapeError(f"expected at least one item in the leading dimensions, got {tuple(lead)}.")
+    first = function(items[0])
+    out = first.new_empty(len(items), *first.shape)
+    out[0] = first
+    for i in range(1, len(items)):
+        out[i] = function(items[i])
+    return out.reshape(*lead, *first.shape)
+
+
+def _words(shape: tuple[int, ...]) -> str:
+    return ", ".join(map(str, shape))

@@ -1,0 +1,160 @@
+"""Surfaces in a reconstructed volume: depth, how sure of it one can be, and normals.
+
+Volumes are (..., Z, Y, X) of real values, higher where something is, on a :class:`VoxelGrid` or on planes at given
+depths. Everything is differentiable by the volume.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import positive, real_array, share, shown
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """``depth`` (..., Y, X) in metres, ``confidence`` (..., Y, X) in [0, 1], and ``mask``, where it suffices.
+
+    The depth is a number everywhere; what is outside of the mask means nothing.
+    """
+
+    depth: Tensor
+    confidence: Tensor
+    mask: Tensor
+
+
+def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1) -> DepthMap:
+    """The depth of the highest value behind each pixel, between planes where its neighbours say so.
+
+    ``volume`` (..., Z, Y, X), ``depths``: a grid, or (Z,) in metres. A parabola through the maximum and the planes next
+    to it has its top within half a step of it, evenly spaced planes or not; on the first and the last plane the depth
+    is the plane's. ``confidence``: the maximum over that of the whole volume, zero where a volume holds nothing above
+    zero; ``mask``: where it reaches ``threshold``. Gradients go through the three values of each parabola. Raises
+    ShapeError, UnitError.
+    """
+    z, volume = _checked(volume, depths, "depth_map")
+    threshold = share("depth_map: threshold", threshold)
+    highest, index = volume.max(-3, keepdim=True)
+    top = highest.amax((-2, -1), keepdim=True)
+    confidence = (highest / top.clamp_min(torch.finfo(volume.dtype).tiny)).clamp(0, 1)
+    count = volume.shape[-3]
+    depth = z[index]
+    if count > 2:
+        middle = index.clamp(1, count - 2)
+        low, mid, high = (volume.gather(-3, middle + step) for step in (-1, 0, 1))
+        before, after = z[middle] - z[middle - 1], z[middle + 1] - z[middle]
+        # Slopes to both sides of the maximum: the top is where the line between them is zero.
+        rise, fall = (mid - low) / before, (mid - high) / after
+        inside = (index == middle) & (rise >= 0) & (fall >= 0) & (rise + fall > 0)
+        curvature = torch.where(inside, rise + fall, torch.ones_like(mid))
+        # f' at the middle is (rise after - fall before) / (before + after), f'' is -2 (rise + fall) / (before + after).
+        offset = (rise * after - fall * before) / (2 * curvature)
+        offset = torch.minimum(torch.maximum(offset, -before / 2), after / 2)
+        depth = torch.where(inside, depth + offset, depth)
+    confidence, depth = confidence.squeeze(-3), depth.squeeze(-3)
+    return DepthMap(depth, confidence, (confidence >= threshold) & (confidence > 0))
+
+
+def soft_depth(volume: Tensor, depths: VoxelGrid | Any, *, sharpness: float = 20.0) -> Tensor:
+    """The mean depth (..., Y, X) behind each pixel under softmax(``sharpness`` times value over the pixel's maximum).
+
+    Smooth in every value, unlike :func:`depth_map`, and independent of the scale of the volume; the higher the
+    sharpness the closer to it, and the less planes next to the maximum have gradients. Pixels with nothing above zero
+    have the mean of all planes. Raises ShapeError, UnitError.
+    """
+    z, volume = _checked(volume, depths, "soft_depth")
+    sharpness = positive("soft_depth: sharpness", sharpness)
+    highest = volume.amax(-3, keepdim=True)
+    scale = torch.where(highest > 0, highest, torch.ones_like(highest))
+    level = torch.where(highest > 0, volume / scale, torch.zeros_like(volume))
+    return (torch.softmax(sharpness * level, -3) * z[:, None, None]).sum(-3)
+
+
+def normals_from_depth(depth: Tensor, grid: VoxelGrid) -> Tensor:
+    """Unit normals (..., 3, Y, X) in world coordinates of a depth map (..., Y, X), towards the wall.
+
+    Central differences, one-sided at the borders. The depth next to the border of a mask is that of nothing: normals
+    there are as little worth. Raises ShapeError.
+    """
+    _check_grid(grid, "normals_from_depth")
+    if not isinstance(depth, Tensor) or depth.ndim < 2 or tuple(depth.shape[-2:]) != grid.size:
+        got = tuple(depth.shape) if isinstance(depth, Tensor) else shown(depth)
+        raise ShapeError(f"normals_from_depth: expected depths (..., {grid.size[0]}, {grid.size[1]}), got {got}.")
+    if not depth.is_floating_point():
+        raise ShapeError(f"normals_from_depth: expected depths of real numbers, got {depth.dtype}.")
+    slope_y, slope_x = _slope(depth, -2, grid.pitch[0]), _slope(depth, -1, grid.pitch[1])
+    return _world(slope_x, slope_y, -torch.ones_like(depth), grid)
+
+
+def normals_from_volume(volume: Tensor, grid: VoxelGrid) -> Tensor:
+    """Unit normals (..., 3, Y, X) in world coordinates, towards the wall, from the gradient of a volume (..., Z, Y, X).
+
+    The gradient is summed from the first plane to the highest value behind each pixel: of a brightness f(z - s(x, y))
+    that sum is f(0) times (-ds/dx, -ds/dy, 1), whatever its profile. More robust than :func:`normals_from_depth`,
+    since it uses all planes. Where nothing is above zero it is the wall's own direction. Raises ShapeError; for fewer
+    than two planes, rows or columns as well.
+    """
+    _check_grid(grid, "normals_from_volume")
+    z, volume = _checked(volume, grid, "normals_from_volume")
+    if min(grid.shape) < 2:
+        raise ShapeError(f"normals_from_volume: expected two planes, rows and columns at least, got {grid.shape}.")
+    front = torch.arange(len(z), device=volume.device)[:, None, None] <= volume.argmax(-3, keepdim=True)
+    steps = torch.gradient(z)[0][:, None, None]
+    gradients = (
+        _slope(volume, -1, grid.pitch[1]),
+        _slope(volume, -2, grid.pitch[0]),
+        torch.gradient(volume, spacing=(z,), dim=-3)[0],
+    )
+    sums = [(gradient * steps * front).sum(-3) for gradient in gradients]
+    # The gradient points into the surface.
+    return _world(-sums[0], -sums[1], -sums[2], grid)
+
+
+# ------------------------------------------------------------------------------------------------------------- parts
+
+
+def _world(x: Tensor, y: Tensor, z: Tensor, grid: VoxelGrid) -> Tensor:
+    axes = torch.stack([grid.along_x, grid.along_y, grid.normal]).to(x.device, x.dtype)
+    local = torch.stack([x, y, z], -3)
+    squares = local.square().sum(-3, keepdim=True)
+    # Where there is no gradient nothing says how the surface lies: it faces the wall. The root has no slope at zero.
+    known = squares > 0
+    facing = torch.tensor([0.0, 0.0, -1.0], device=x.device, dtype=x.dtype)[:, None, None]
+    unit = torch.where(known, local * torch.where(known, squares, torch.ones_like(squares)).rsqrt(), facing)
+    return torch.einsum("...ayx,ab->...byx", unit, axes)
+
+
+def _slope(field: Tensor, dim: int, step: float) -> Tensor:
+    if field.shape[dim] < 2:
+        return torch.zeros_like(field)
+    return torch.gradient(field, spacing=step, dim=dim)[0]
+
+
+def _check_grid(grid: Any, who: str) -> None:
+    if not isinstance(grid, VoxelGrid):
+        raise ShapeError(f"{who}: expected a VoxelGrid, which knows its axes, got {shown(grid)}.")
+
+
+def _checked(volume: Any, depths: Any, who: str) -> tuple[Tensor, Tensor]:
+    """Depths as a tensor like the volume, and the volume, real."""
+    given = depths.depths if isinstance(depths, VoxelGrid) else depths
+    plain = real_array(given)
+    if plain is None or plain.ndim != 1:
+        raise ShapeError(f"{who}: expected depths (Z,) or a VoxelGrid, got {shown(depths)}.")
+    z = torch.from_numpy(plain)
+    if len(z) > 1 and not bool((z.diff() > 0).all()):
+        raise UnitError(f"{who}: expected depths that increase, got {shown(plain.tolist())}.")
+    shape = depths.shape if isinstance(depths, VoxelGrid) else (len(z), "Y", "X")
+    fits = isinstance(volume, Tensor) and volume.ndim >= 3 and volume.shape[-3] == len(z)
+    if not fits or (isinstance(depths, VoxelGrid) and tuple(volume.shape[-3:]) != shape):
+        got = tuple(volume.shape) if isinstance(volume, Tensor) else shown(volume)
+        raise ShapeError(f"{who}: expected a volume (..., {shape[0]}, {shape[1]}, {shape[2]}), got {got}.")
+    if not volume.is_floating_point():
+        raise ShapeError(f"{who}: expected a volume of real numbers, got {volume.dtype}. Give its squared modulus.")
+    return z.to(volume.device, volume.dtype), volume

@@ -1,0 +1,115 @@
+"""What all operators between hidden volumes and transients share: where voxels stand, captures as data, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import ShapeError
+from torchtransient.reconstruction.capture_checks import (
+    checked_axis,
+    checked_capture,
+    checked_intensities,
+    checked_precision,
+    same_light,
+)
+from torchtransient.reconstruction.linear import LinearOperator
+from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+
+class TransientOperator(LinearOperator):
+    """A linear operator between a volume and transients (..., T, *scan points).
+
+    ``scan``, ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes stand on, None for points that stand on
+    none. Tables are built in double precision and kept in ``dtype``; ``operator.double()`` builds them anew.
+
+    Classes say :meth:`tables` and call ``_set_tables()`` once their arguments are there. Raises ShapeError for what is
+    no axis, UnitError for a dtype other than float32 and float64.
+    """
+
+    scan: Scan | PlanarScan
+    grid: VoxelGrid | None
+
+    def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
+        super().__init__()
+        who = type(self).__name__
+        self.scan, self.axis = scan, checked_axis(time_axis, who)
+        self.dtype = checked_precision(dtype, who)
+
+    @property
+    def points(self) -> Tensor:
+        """(..., 3) float64 on the CPU: where the values of a volume stand in world coordinates, metres."""
+        if self.grid is None:
+            raise NotImplementedError
+        return self.grid.points
+
+    @property
+    def depths(self) -> Tensor | None:
+        """(Z,) float64: distances of the planes from the wall, metres; None for points that stand on no planes."""
+        return None if self.grid is None else self.grid.depths
+
+    def tables(self) -> dict[str, Tensor]:
+        """The tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""
+        return {}
+
+    def _set_tables(self, device: torch.device | str = "cpu") -> None:
+        for name, table in self.tables().items():
+            kept = table.to(device, self.dtype if table.is_floating_point() else None)
+            # Not part of the state: the arguments make them.
+            self.register_buffer(name, kept, persistent=False)
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
+        """Moves and conversions of a module. Another precision makes new tables, since converted ones have the digits
+        of the old.
+        """
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point()}
+        if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
+            device = self.device
+            try:
+                self.dtype = checked_precision(dtype, type(self).__name__)
+            finally:
+                self._set_tables(device or "cpu")
+        return self
+
+    def transients(self, data: Tensor | Capture) -> Tensor:
+        """The transient (..., *data_shape) of a tensor or a capture, in the operator's precision.
+
+        Raises ShapeError for a capture of another scan or axis, of polarized light, or without a transient.
+        """
+        if not isinstance(data, Capture):
+            return self._taken("transient", data, self.data_shape, real=True)
+        transient = checked_intensities(data, self.axis, type(self).__name__)
+        if not self._takes(data.scan):
+            raise ShapeError(
+                f"{type(self).__name__}: expected a capture of the operator's own scan, {self.scan!r}, got one of "
+                f"{data.scan!r} with other points or legs. Make an operator for it."
+            )
+        return self._taken("transient", transient, self.data_shape, real=True)
+
+    def _takes(self, scan: Scan) -> bool:
+        """Whether captures of a scan are the operator's data."""
+        return isinstance(self.scan, Scan) and same_light(scan, self.scan)
+
+    def extra_repr(self) -> str:
+        volume = " x ".join(map(str, self.volume_shape))
+        return f"{volume} voxels, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
+
+
+def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:
+    """``reconstruct`` of a capture by an operator of class ``kind`` for its own scan and axis, where its transient is,
+    in double precision for captures of that, else in single, unless ``options`` say ``dtype``.
+
+    Raises ShapeError for what is no capture, or has no transient, and what the class raises.
+    """
+    transient, axis = checked_capture(capture, who)
+    options.setdefault("dtype", torch.float64 if transient.dtype == torch.float64 else torch.float32)
+    operator = kind(capture.scan, *points, time_axis=axis, **options).to(transient.device)
+    volume: Tensor = operator.reconstruct(capture)
+    return volume

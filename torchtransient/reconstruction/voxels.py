@@ -1,0 +1,207 @@
+"""Regular grids of hidden points: where the voxels of a reconstructed volume stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.capture import Scan, Wall
+from torchtransient.capture.distances import bounds_of
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import count, positive, real_array, shown
+from torchtransient.reconstruction.planar_scan import PlanarScan
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGrid:
+    """Planes of voxels, one behind another. Lengths in metres, vectors (3,) and ``depths`` (Z,) float64 on the CPU.
+
+    Voxel (k, j, i) stands at ``first + j pitch[0] along_y + i pitch[1] along_x + depths[k] normal``. ``size``: (Y, X)
+    voxels of a plane, ``pitch``: (dy, dx) between them. ``depths`` increase, not necessarily evenly. Make one with
+    :meth:`before`, :meth:`bounds` or :meth:`of_wall`. Raises ShapeError and UnitError for what is no such grid.
+    """
+
+    depths: Tensor
+    size: tuple[int, int]
+    pitch: tuple[float, float]
+    first: Tensor
+    along_x: Tensor
+    along_y: Tensor
+    normal: Tensor
+
+    def __post_init__(self) -> None:
+        depths = _depths(self.depths, "VoxelGrid")
+        size = tuple(count("VoxelGrid: size", n) for n in self.size)
+        pitch = tuple(positive("VoxelGrid: pitch", p) for p in self.pitch)
+        if len(size) != 2 or len(pitch) != 2:
+            raise ShapeError(f"VoxelGrid: expected two sizes and pitches, got {shown(self.size)}, {shown(self.pitch)}.")
+        for name, value in {"depths": depths, "size": size, "pitch": pitch}.items():
+            object.__setattr__(self, name, value)
+        for name in ("first", "along_x", "along_y", "normal"):
+            plain = real_array(getattr(self, name))
+            if plain is None or plain.shape != (3,):
+                raise ShapeError(f"VoxelGrid: expected {name} as a vector (3,), got {shown(getattr(self, name))}.")
+            object.__setattr__(self, name, torch.from_numpy(plain))
+        axes = torch.stack([self.along_x, self.along_y, self.normal])
+        if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64), atol=1e-6):
+            raise ShapeError(
+                f"VoxelGrid: expected along_x, along_y and normal of length one at right angles, got {axes.tolist()}."
+            )
+
+    @classmethod
+    def before(
+        cls,
+        scan: Scan,
+        depths: Any,
+        *,
+        size: int | Sequence[int] | None = None,
+        extent: float | Sequence[float] | None = None,
+    ) -> VoxelGrid:
+        """Planes at ``depths`` (Z,) metres before the wall of a scan, parallel to it, along its rows and columns.
+
+        Without ``size`` and ``extent`` a voxel stands before each sensor point of a flat, regular grid, which is what
+        :class:`PhasorField` takes at its fastest. ``size``: (X, Y) voxels or one number for both, None for as many as
+        sensor points; ``extent``: (width, height) of the planes in metres from the outer edges of the voxels, or one
+        number for both, around the middle of the sensor points; None for what the sensor points fill, each with a cell
+        of its own around it. The planes of a curved wall are parallel to its mean plane, depths count from the mean of
+        its points.
+
+        Raises ShapeError for a list of points of a scan without a wall, where nothing says which way is up (give
+        :meth:`bounds` or the class its axes), for a wall that is not flat where size and extent are missing, and for
+        sizes that are none; UnitError for depths that do not increase.
+        """
+        if not isinstance(scan, Scan):
+            raise ShapeError(f"VoxelGrid.before: expected a tt.nlos.Scan, got {shown(scan)}.")
+        depths = _depths(depths, "VoxelGrid.before")
+        if size is None and extent is None:
+            wall = PlanarScan.of_scan(scan, "VoxelGrid.before without size and extent")
+            return cls.of_wall(wall, depths)
+        points = scan.sensor_points.detach().to("cpu", torch.float64)
+        along_x, along_y, normal = _wall_axes(scan, points)
+        shape = _pair("VoxelGrid.before: size", size) if size is not None else tuple(reversed(points.shape[:-1]))
+        if len(shape) != 2:
+            raise ShapeError(f"VoxelGrid.before: expected size= for a list of points, got {shown(size)}.")
+        columns, rows = (count("VoxelGrid.before: size", n) for n in shape)
+        flat = points.reshape(-1, 3)
+        spans = []
+        for axis, n in ((along_x, points.shape[-2]), (along_y, points.shape[0] if points.ndim == 3 else 1)):
+            along = flat @ axis
+            spread = float(along.max() - along.min())
+            # Each sensor point of a grid has a cell around it.
+            cells = n / (n - 1) if points.ndim == 3 and n > 1 else 1.0
+            spans.append((float(along.max() + along.min()) / 2, spread * cells))
+        given = (spans[0][1], spans[1][1]) if extent is None else _pair("VoxelGrid.before: extent", extent)
+        width, height = (positive("VoxelGrid.before: extent", value) for value in given)
+        dx, dy = width / columns, height / rows
+        first = (
+            (spans[0][0] - (columns - 1) / 2 * dx) * along_x
+            + (spans[1][0] - (rows - 1) / 2 * dy) * along_y
+            + (flat.mean(0) @ normal) * normal
+        )
+        return cls(depths, (rows, columns), (dy, dx), first, along_x, along_y, normal)
+
+    @classmethod
+    def of_wall(cls, wall: PlanarScan, depths: Any) -> VoxelGrid:
+        """A voxel before each point of a regular grid, at each of ``depths`` (Z,) metres. Raises as the class."""
+        return cls(depths, wall.size, wall.pitch, wall.first, wall.along_x, wall.along_y, wall.normal)
+
+    @classmethod
+    def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
+        """Voxels that fill the box ``bounds`` (2, 3), its lowest and highest corner in world coordinates, metres.
+
+        ``size``: (X, Y, Z) voxels, or one number for the three. Rows run along y, columns along x, planes along z;
+        voxels are the middles of equal cells. Raises ShapeError and UnitError.
+        """
+        low, high = bounds_of(bounds, "VoxelGrid.bounds")
+        given = (size,) * 3 if isinstance(size, int) else tuple(size)
+        if len(given) != 3:
+            raise ShapeError(f"VoxelGrid.bounds: expected size as (X, Y, Z) or one number, got {shown(size)}.")
+        sizes = [count("VoxelGrid.bounds: size", n) for n in given]
+        dx, dy, dz = (
+            positive("VoxelGrid.bounds: a side", (b - a) / n) for a, b, n in zip(low, high, sizes, strict=True)
+        )
+        eye = torch.eye(3, dtype=torch.float64)
+        first = torch.stack([low[0] + dx / 2, low[1] + dy / 2, torch.zeros((), dtype=torch.float64)])
+        depths = low[2] + dz * (torch.arange(sizes[2], dtype=torch.float64) + 0.5)
+        return cls(depths, (sizes[1], sizes[0]), (dy, dx), first, eye[0], eye[1], eye[2])
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(Z, Y, X)."""
+        return (len(self.depths), *self.size)
+
+    @property
+    def points(self) -> Tensor:
+        """(Z, Y, X, 3) float64 on the CPU: the voxels in world coordinates, metres."""
+        j, i = (torch.arange(n, dtype=torch.float64) for n in self.size)
+        plane = self.first + (j[:, None, None] * self.pitch[0]) * self.along_y
+        plane = plane + (i[None, :, None] * self.pitch[1]) * self.along_x
+        return plane + self.depths[:, None, None, None] * self.normal
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """(width, height) of a plane from the outer edges of its voxels, metres."""
+        return self.size[1] * self.pitch[1], self.size[0] * self.pitch[0]
+
+    def at_depths(self, depths: Any) -> VoxelGrid:
+        """The grid with other planes. Raises ShapeError and UnitError."""
+        return replace(self, depths=depths)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, VoxelGrid):
+            return NotImplemented
+        tensors = ("depths", "first", "along_x", "along_y", "normal")
+        same = all(torch.equal(getattr(self, name), getattr(other, name)) for name in tensors)
+        return same and (self.size, self.pitch) == (other.size, other.pitch)
+
+    def __hash__(self) -> int:
+        return hash((self.shape, self.pitch))
+
+    def __repr__(self) -> str:
+        near, far = float(self.depths[0]), float(self.depths[-1])
+        dy, dx = self.pitch
+        return f"VoxelGrid({self.shape}, {dy:.4g} x {dx:.4g} m apart, depths {near:.4g} to {far:.4g} m)"
+
+
+def _depths(values: Any, who: str) -> Tensor:
+    plain = real_array(values)
+    if plain is None or plain.ndim != 1 or len(plain) == 0:
+        raise ShapeError(f"{who}: expected depths (Z,) in metres, got {shown(values)}.")
+    depths = torch.from_numpy(plain)
+    if not bool(torch.isfinite(depths).all()) or not bool((depths.diff() > 0).all()):
+        raise UnitError(f"{who}: expected finite depths that increase, got {shown(plain.tolist())}.")
+    return depths
+
+
+def _pair(name: str, value: Any) -> tuple[Any, Any]:
+    plain = real_array(value)
+    if plain is None or plain.shape not in ((), (2,)):
+        raise ShapeError(f"{name}: expected two numbers or one for both, got {shown(value)}.")
+    pair = plain.tolist() if plain.ndim else [plain.item()] * 2
+    return pair[0], pair[1]
+
+
+def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit vectors along rows, along columns and towards the hidden side, at right angles."""
+    if points.ndim == 3 and min(points.shape[:2]) > 1:
+        x, y = (points[:, -1] - points[:, 0]).mean(0), (points[-1] - points[0]).mean(0)
+    elif scan.wall is not None:
+        surface = Wall.of(scan.wall)
+        x, y = torch.from_numpy(surface.half_u), torch.from_numpy(surface.half_v)
+    else:
+        raise ShapeError(
+            "VoxelGrid.before: expected a grid of sensor points or a scan with a wall, which say where x and y are, "
+            "got a list of points. Use VoxelGrid.bounds, or VoxelGrid with axes of its own."
+        )
+    along_x = x / x.norm()
+    y = y - (y @ along_x) * along_x
+    along_y = y / y.norm()
+    normal = torch.linalg.cross(along_x, along_y)
+    if scan.sensor_normals is not None:
+        mean = scan.sensor_normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+        normal = normal if float(mean @ normal) >= 0 else -normal
+    return along_x, along_y, normal

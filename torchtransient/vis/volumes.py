@@ -1,0 +1,202 @@
+"""Pictures of reconstructed volumes (Z, Y, X): what stands before the wall, seen from three sides, and its surface.
+
+Rows of the volume run upwards, columns to the right, as the sensor points lie on the wall in other pictures; planes
+begin at the wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import positive, real_array, shown
+from torchtransient.vis.files import figure_type, save_figure
+
+_PANEL = 3.4
+# Beside the picture of depth: no colour of the map.
+_NOTHING = "0.85"
+
+
+def volume_views(
+    volume: Any,
+    path: str | Path | None = None,
+    *,
+    depths: Any = None,
+    extent: Sequence[float] | None = None,
+    depth: Any = None,
+    mask: Any = None,
+    normals: Any = None,
+    gamma: float = 1.0,
+    title: str = "",
+) -> Any:
+    """A matplotlib figure of a volume: the highest values seen from the front, from the top and from the side.
+
+    ``volume`` (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, the
+    highest one is white, `gamma` < 1 lightens what is dim. ``depths`` (Z,) and ``extent`` (width, height) in metres
+    scale the axes (those of a voxel grid: `grid.depths`, `grid.extent`), x and y from the middle; without them they
+    count voxels. With ``depth`` (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where
+    ``mask`` (Y, X) is true. Writes the figure when `path` is given. Raises ShapeError, UnitError, StorageError.
+    """
+    values = _volume(volume)
+    gamma = positive("volume_views: gamma", gamma)
+    size = tuple(values.shape)
+    z, (width, height) = _scales(size, depths, extent)
+    kept = None if mask is None else _map("mask", mask, size[1:]).bool()
+    extras = [name for name, given in (("depth", depth), ("normals", normals)) if given is not None]
+    count = 3 + len(extras)
+    figure = figure_type()(figsize=(_PANEL * count + 0.6, _PANEL + 0.6), layout="constrained")
+    panels = figure.subplots(1, count, squeeze=False)[0]
+    across, up, away = (-width / 2, width / 2), (-height / 2, height / 2), (float(z[0]), float(z[-1]))
+    unit = "m" if extent is not None else "voxels"
+    unit_z = "m" if depths is not None else "voxels"
+    light = (values / (float(values.max()) or 1.0)) ** gamma
+    views = (
+        ("front", light.amax(0), (*across, *up), f"x ({unit})", f"y ({unit})"),
+        ("top", light.amax(1), (*across, *away), f"x ({unit})", f"depth ({unit_z})"),
+        ("side", light.amax(2).T, (*away, *up), f"depth ({unit_z})", f"y ({unit})"),
+    )
+    for panel, (name, picture, box, right, upwards) in zip(panels, views, strict=False):
+        aspect = "equal" if name == "front" else "auto"
+        panel.imshow(picture.numpy(), origin="lower", extent=box, cmap="gray", vmin=0, vmax=1, aspect=aspect)
+        _label(panel, name, right, upwards)
+    box = (*across, *up)
+    for panel, name in zip(panels[3:], extras, strict=True):
+        if name == "depth":
+            _depth_panel(figure, panel, _map("depth", depth, size[1:]), kept, box)
+        else:
+            _normals_panel(panel, _normals(normals, size[1:]), kept, box)
+        _label(panel, name, f"x ({unit})", f"y ({unit})")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return save_figure(figure, path, "volume_views")
+
+
+def depth_picture(
+    depth: Any,
+    path: str | Path | None = None,
+    *,
+    mask: Any = None,
+    extent: Sequence[float] | None = None,
+    title: str = "",
+) -> Any:
+    """A matplotlib figure of a depth map (Y, X) in metres, where ``mask`` (Y, X) is true, near dark and far light.
+
+    ``extent`` (width, height) in metres scales the axes. Raises ShapeError, UnitError, StorageError.
+    """
+    plain = _map("depth", depth, None)
+    return _one_panel(plain, mask, extent, title, path, "depth_picture")
+
+
+def normals_picture(
+    normals: Any,
+    path: str | Path | None = None,
+    *,
+    mask: Any = None,
+    extent: Sequence[float] | None = None,
+    title: str = "",
+) -> Any:
+    """A matplotlib figure of unit normals (3, Y, X) as colours, (n + 1) / 2 for red, green and blue, where ``mask``
+    (Y, X) is true.
+
+    ``extent`` (width, height) in metres scales the axes. Raises ShapeError, UnitError, StorageError.
+    """
+    plain = _normals(normals, None)
+    return _one_panel(plain, mask, extent, title, path, "normals_picture")
+
+
+# ------------------------------------------------------------------------------------------------------------- parts
+
+
+def _one_panel(picture: Tensor, mask: Any, extent: Any, title: str, path: str | Path | None, who: str) -> Any:
+    size = (picture.shape[-2], picture.shape[-1])
+    kept = None if mask is None else _map("mask", mask, size).bool()
+    _, (width, height) = _scales((1, *size), None, extent)
+    figure = figure_type()(figsize=(_PANEL + 1.2, _PANEL + 0.4), layout="constrained")
+    panel = figure.subplots()
+    box = (-width / 2, width / 2, -height / 2, height / 2)
+    if picture.ndim == 2:
+        _depth_panel(figure, panel, picture, kept, box)
+    else:
+        _normals_panel(panel, picture, kept, box)
+    unit = "m" if extent is not None else "voxels"
+    _label(panel, title, f"x ({unit})", f"y ({unit})")
+    return save_figure(figure, path, who)
+
+
+def _depth_panel(figure: Any, panel: Any, depth: Tensor, kept: Tensor | None, box: tuple[float, ...]) -> None:
+    shown_ = depth if kept is None else torch.where(kept, depth, torch.nan)
+    panel.set_facecolor(_NOTHING)
+    image = panel.imshow(shown_.numpy(), origin="lower", extent=box, cmap="viridis", aspect="equal")
+    if bool(torch.isfinite(shown_).any()):
+        figure.colorbar(image, ax=panel, label="depth (m)")
+
+
+def _normals_panel(panel: Any, normals: Tensor, kept: Tensor | None, box: tuple[float, ...]) -> None:
+    colours = ((normals + 1) / 2).clamp(0, 1).permute(1, 2, 0)
+    if kept is not None:
+        colours = torch.where(kept[..., None], colours, float(_NOTHING))
+    panel.imshow(colours.numpy(), origin="lower", extent=box, aspect="equal")
+
+
+def _label(panel: Any, title: str, right: str, upwards: str) -> None:
+    panel.set_title(title, fontsize=9)
+    panel.set_xlabel(right, fontsize=8)
+    panel.set_ylabel(upwards, fontsize=8)
+    panel.tick_params(labelsize=7)
+
+
+def _plain(name: str, values: Any) -> Tensor:
+    try:
+        tensor = torch.as_tensor(values).detach().cpu()
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ShapeError(f"{name}: expected a tensor of numbers, got {shown(values)}.") from None
+    if tensor.is_complex():
+        return (tensor.real.square() + tensor.imag.square()).double()
+    return tensor.double()
+
+
+def _volume(volume: Any) -> Tensor:
+    values = _plain("volume", volume)
+    if values.ndim != 3 or values.numel() == 0:
+        raise ShapeError(f"volume: expected (Z, Y, X), got {tuple(values.shape)}; choose an item and a channel.")
+    return torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0).clamp_min(0)
+
+
+def _map(name: str, values: Any, size: tuple[int, ...] | None) -> Tensor:
+    plain = _plain(name, values)
+    if plain.ndim != 2 or plain.numel() == 0 or (size is not None and tuple(plain.shape) != size):
+        expected = "(Y, X)" if size is None else str(size)
+        raise ShapeError(f"{name}: expected {expected}, got {tuple(plain.shape)}; choose an item and a channel.")
+    return plain
+
+
+def _normals(values: Any, size: tuple[int, ...] | None) -> Tensor:
+    plain = _plain("normals", values)
+    if plain.ndim != 3 or plain.shape[0] != 3 or (size is not None and tuple(plain.shape[1:]) != size):
+        expected = "(3, Y, X)" if size is None else str((3, *size))
+        raise ShapeError(f"normals: expected {expected}, got {tuple(plain.shape)}.")
+    return plain
+
+
+def _scales(size: tuple[int, ...], depths: Any, extent: Any) -> tuple[Tensor, tuple[float, float]]:
+    """Outer edges of the planes (2,) or more, and (width, height)."""
+    if depths is None:
+        z = torch.tensor([-0.5, size[0] - 0.5])
+    else:
+        plain = real_array(depths)
+        if plain is None or plain.shape != (size[0],):
+            raise ShapeError(f"depths: expected ({size[0]},), one for each plane, got {shown(depths)}.")
+        first, last = float(plain[0]), float(plain[-1])
+        half = (last - first) / max(2 * (size[0] - 1), 1) or 0.5
+        z = torch.tensor([first - half, last + half])
+    if extent is None:
+        return z, (float(size[2]), float(size[1]))
+    pair = real_array(extent)
+    if pair is None or pair.shape != (2,) or not (pair > 0).all():
+        raise UnitError(f"extent: expected (width, height) in metres, greater than zero, got {shown(extent)}.")
+    return z, (float(pair[0]), float(pair[1]))
