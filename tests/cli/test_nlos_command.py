@@ -208,7 +208,7 @@ def test_yaml_that_is_neither(folder):
 
 # ------------------------------------------------------------------------------------------------------------- kills
 
-MANY = ("nlos", "own.yaml", "-o", "a.h5", "--parts", "6", "--spp", "200000", "--quiet")
+MANY = ("nlos", "own.yaml", "-o", "a.h5", "--parts", "6", "--spp", "600000", "--quiet")
 
 
 def start(folder, *arguments):
@@ -259,7 +259,7 @@ def test_a_killed_simulation_goes_on(folder, signal_name):
     result = run(*MANY[1:])
     assert result.exit_code == 0, result.output
     found = tt.nlos.read_capture(folder / "a.h5")
-    setup = tt.nlos.read_setup(folder / "own.yaml") | {"spp": 200000}
+    setup = tt.nlos.read_setup(folder / "own.yaml") | {"spp": 600000}
     expected = tt.nlos.simulate(**setup, tiles=6, progress=False)
     same(found.transient, expected.transient)
     first = [number for number, count, _ in kept.values() for number in range(number, number + count)]
