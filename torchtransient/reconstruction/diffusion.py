@@ -22,6 +22,7 @@ from torchtransient.quantities import finite, positive
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.volume_methods import SLAB_SNR
 
 IMAGES = 20
 # Room-temperature foam of the paper: reduced scattering and absorption per metre, index, length behind its sides at
@@ -86,7 +87,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         thickness: float = FOAM_THICKNESS,
         properties: tuple[float, float, float, float] = FOAM,
         passes: int = 2,
-        snr: float = 1e4,
+        snr: float = SLAB_SNR,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)

@@ -10,7 +10,8 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
-from torchtransient.reconstruction.filters import ReconstructionFilter
+from torchtransient.reconstruction.filters import PhasorFilter, ReconstructionFilter
+from torchtransient.reconstruction.proportions import check_wavelength
 from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -54,6 +55,8 @@ class FilteredBackprojection(EllipsoidOperator):
                 f"FilteredBackprojection: expected filter as a PhasorFilter or a LaplacianFilter, got {shown(filter)}."
             )
         filter.check(self.grid, time_axis.bin_width_opl, "FilteredBackprojection")
+        if isinstance(filter, PhasorFilter):
+            check_wavelength(filter.wavelength, scan, time_axis, "FilteredBackprojection")
         self.filter = filter
         self.real_volume = not filter.complex_volume
 

@@ -16,10 +16,12 @@ from torchtransient.reconstruction.capture_checks import (
     checked_capture,
     checked_intensities,
     checked_precision,
+    checked_scan,
     same_light,
 )
 from torchtransient.reconstruction.linear import LinearOperator
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.proportions import check_proportions
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 
@@ -41,6 +43,7 @@ class TransientOperator(LinearOperator):
         who = type(self).__name__
         self.scan, self.axis = scan, checked_axis(time_axis, who)
         self.dtype = checked_precision(dtype, who)
+        check_proportions(scan if isinstance(scan, PlanarScan) else checked_scan(scan, who), self.axis, who)
 
     @property
     def points(self) -> Tensor:
