@@ -163,13 +163,14 @@ def test_what_a_file_leaves_open_is_asked_for(folder):
     volume = tt.nlos.read_volume("foam_fk.h5")
     assert volume.metadata["assumed"]["bin_width_s"] == 16e-12 and volume.metadata["prepared"]["slab"] == 0.01
     told = run("foam.mat", "--wall-size", 0.6, "--format", "cdt", "--taps", 2, "--no-picture").stderr
-    assert "assumed, since the file does not say it: " in told and "--start-s 0" in told and "--bin-width-s 1.6e-11" in told
+    assert "assumed, since the file does not say it: " in told
+    assert "--start-s 0" in told and "--bin-width-s 1.6e-11" in told
     assert tt.nlos.read_volume("foam_fk.h5").metadata["settings"]["taps"] == 2
 
 
 def test_the_module_of_the_command_runs():
-    code = "import sys, runpy; sys.argv = ['x', 'reconstruct', '--help']; runpy.run_module('torchtransient.cli.main', run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    words = [sys.executable, "-m", "torchtransient.cli.main", "reconstruct", "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "--method" in done.stdout, done.stderr
 
 

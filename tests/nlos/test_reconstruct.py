@@ -144,3 +144,14 @@ def test_the_page(tmp_path, monkeypatch):
     assert set(re.findall(r"--[a-z][\w-]+", TEXT)) <= options
     for picture in (PAGE.parent / "images" / "reconstruction").iterdir():
         assert picture.stat().st_size < 150_000
+
+
+def test_public_names_in_texts_are_there():
+    """`tt.nlos.X` and `tt.losses.X` of pages, docstrings and messages."""
+    package = Path(tt.__file__).parent
+    files = [*PAGE.parent.glob("*.md"), package.parent / "README.md", *package.rglob("*.py")]
+    named = {name for path in files for name in re.findall(r"\btt\.((?:nlos|losses)\.\w+)", path.read_text("utf-8"))}
+    assert len(named) > 20
+    for name in sorted(named):
+        room, attribute = name.split(".")
+        assert hasattr(getattr(tt, room), attribute), name

@@ -80,11 +80,10 @@ def test_extents_and_points_out_of_proportion_are_told(name):
         N.reconstruct(captured(name), name, grid=grid, progress=False)
     with pytest.raises(UnitError, match="within the record"):
         N.Backprojection(scanned(name), torch.tensor([[0.0, 0.0, 0.5], [0.0, 300.0, 0.5]]), time_axis=AXIS)
-    before = replace(AXIS, start_opl=1.0)
     near = N.VoxelGrid.before(scanned(name), [0.01, 0.02])
+    late = N.Capture(torch.rand(1, 64, 6, 6), replace(AXIS, start_opl=3.5), scanned(name))
     with pytest.raises(UnitError, match="within the record"):
-        small = N.Capture(torch.rand(1, 64, 6, 6), replace(before, start_opl=3.5), scanned(name))
-        N.reconstruct(small, name, grid=near, progress=False)
+        N.reconstruct(late, name, grid=near, progress=False)
 
 
 @pytest.mark.parametrize("name", [name for name, entry in METHODS.items() if "wavelength" in entry.options])

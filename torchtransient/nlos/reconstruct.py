@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.data.volume_file import HiddenVolume
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
@@ -23,6 +22,7 @@ from torchtransient.reconstruction import (
     ConfocalCamera,
     DirectLight,
     FilteredBackprojection,
+    HiddenVolume,
     LaplacianFilter,
     PhasorField,
     PhasorFilter,
