@@ -16,7 +16,8 @@
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
 - `stabilised_root`, `StabilisedRoot`: roots of light, as f-k takes them, with a slope at empty bins
-- `LinearOperator`: what all of these are; `PlanarScan`: a regular grid of a flat wall, which transforms take too
+- `LinearOperator`: what all of these are
+- `PlanarScan`: a regular grid of a flat wall, which transforms take in place of a scan
 - `subtract_legs`: a capture without the first and the last leg of its light
 - `VoxelGrid`: where the points of a hidden volume stand
 - `Backprojection`, `backproject`: linear operator between such a volume and captures of any kind, and of one capture

@@ -68,7 +68,8 @@ class DiffusionDeconvolution(ConfocalOperator):
     ``operator.reconstruct(transient)``: the capture without the slab, whose volume another operator finds. Linear and
     differentiable; results go below zero. ``passes``: how often light crosses the slab, 2 of confocal captures.
 
-    ``thickness``, ``extrapolation`` in metres, ``reduced_scattering``, ``absorption`` per metre; the defaults are those
+    ``thickness`` in metres. ``properties``: (reduced scattering per metre, absorption per metre, index of refraction,
+    extrapolation length in metres, at which behind its sides the fluence vanishes); the defaults of both are those
     of the paper's foam. ``snr``: power of the light over that of the noise where nothing is lost, at frequency zero;
     what the slab takes more than that cannot come back. Light is kept: the kernel's sum is one. Time, height and width
     are padded to twice their size.
