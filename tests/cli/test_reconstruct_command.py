@@ -194,6 +194,8 @@ def test_the_module_of_the_command_runs():
         (("a.h5", "--gamma", 0), "--gamma: expected a finite number greater than zero"),
         (("a.h5", "--gamma", "nan"), "--gamma: expected a finite number"),
         (("a.h5", "--threshold", 5), "--threshold: expected a number between 0 and 1"),
+        (("a.h5", "--slab", 25.4), "--slab: expected a slab that is thinner"),
+        (("a.h5", "--record", 0, 2000), "--record: expected lengths within the record, 0 to 2.56 m"),
         (("a.h5", "--taps", 3), "taps"),
         (("a.h5", "--method", "lct", "--v-bins", 2), "v_bins"),
         (("a.h5", "--method", "bp", "--extent", 600), "within the record"),

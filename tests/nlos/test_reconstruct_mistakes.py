@@ -94,6 +94,14 @@ def test_wavelengths_longer_than_the_record_are_told(name):
         made(name, scanned(name), AXIS, pulse=1.3)
 
 
+@pytest.mark.parametrize("thickness", [2.54 * 2, 25.4])
+def test_slabs_in_other_units_are_told(thickness):
+    with pytest.raises(UnitError, match="centimetres"):
+        N.DiffusionDeconvolution(scanned("fk"), time_axis=AXIS, thickness=thickness)
+    with pytest.raises(UnitError, match="centimetres"):
+        N.without_slab(captured("fk"), thickness, 1e3)
+
+
 def test_unusual_scans_pass():
     """One point, a wide wall before a short record, a record that begins late, planes beyond its end."""
     one = N.Scan.points(torch.zeros(1, 3), kind="confocal", sensor_origin=(0, 0, 1.0), laser_origin=(0, 0, 1.0))

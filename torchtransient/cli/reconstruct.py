@@ -160,8 +160,8 @@ def _tell(measured: Any, choice: Any) -> None:
 
 def _as_words(value: Any) -> str:
     if not isinstance(value, list):
-        return f"{value:g}" if isinstance(value, float) else str(value)
-    return " ".join(map(_as_words, value))
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return " ".join(_as_words(round(part, 9) + 0.0 if isinstance(part, float) else part) for part in value)
 
 
 def _check_together(options: dict[str, Any]) -> None:
@@ -204,8 +204,10 @@ def _picture(options: dict[str, Any], target: Path) -> Path | None:
 def _prepared(capture: Any, options: dict[str, Any]) -> Any:
     """The capture as the method gets it: cut, summed, without its slab, on its device."""
     from torchtransient.nlos.preparation import moved_to, sum_bins, without_slab
+    from torchtransient.reconstruction.proportions import check_record
 
     if options["record"] is not None:
+        check_record(capture.axis, options["record"][1], "--record")
         capture = capture.crop(*options["record"])
     capture = moved_to(sum_bins(capture, options["sum_bins"]), options["device"])
     if options["slab"] is not None:

@@ -22,6 +22,7 @@ from torchtransient.quantities import finite, positive
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.proportions import check_thickness
 from torchtransient.volume_methods import SLAB_SNR
 
 IMAGES = 20
@@ -92,6 +93,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        check_thickness(positive("DiffusionDeconvolution: thickness", thickness), scan, "DiffusionDeconvolution")
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)

@@ -80,7 +80,27 @@ def check_wavelength(wavelength: float, scan: Scan, axis: TimeAxis, who: str) ->
     if wavelength > most:
         raise UnitError(
             f"{who}: expected a wavelength of {most:.4g} m at most, with a record of {record:.4g} m and a wall "
-            f"{side:.4g} m wide, got {wavelength:.4g} m. {_LENGTHS}; {_BINS}."
+            f"{side:.4g} m wide, got {wavelength:.4g} m. {_LENGTHS}."
+        )
+
+
+def check_thickness(thickness: float, scan: Scan | PlanarScan, who: str) -> None:
+    """Raises UnitError for a slab on the wall that is twice as thick as the scan is wide."""
+    low, high = _box(_scanned(scan))
+    side = float((high - low).norm())
+    if thickness > 2 * side:
+        raise UnitError(
+            f"{who}: expected a slab that is thinner than the scan is wide, {side:.4g} m, got {thickness:.4g} m. "
+            f"{_LENGTHS}, centimetres a hundredth."
+        )
+
+
+def check_record(axis: TimeAxis | None, end_opl: float, who: str) -> None:
+    """Raises UnitError for a part of a record that ends ten records behind it."""
+    if axis is not None and end_opl - axis.start_opl > MOST * (axis.end_opl - axis.start_opl):
+        raise UnitError(
+            f"{who}: expected lengths within the record, {axis.start_opl:.4g} to {axis.end_opl:.4g} m, got "
+            f"{end_opl:.4g} m. {_LENGTHS}."
         )
 
 
