@@ -59,7 +59,7 @@ def test_units_that_are_off_are_told(name, wrong):
     side, axis = SIZES[wrong]
     with pytest.raises(UnitError, match=r"metres|first bin begin"):
         N.reconstruct(captured(name, side, axis), name, progress=False)
-    with pytest.raises(UnitError, match=r"metres|first bin begin"):
+    with pytest.raises(UnitError, match=r"metres|first bin begin|two bins at least"):
         made(name, scanned(name, side), axis)
 
 
@@ -110,7 +110,9 @@ def test_unusual_scans_pass():
     N.FK(scanned("fk", 0.05), time_axis=AXIS)
     N.Backprojection(scanned("bp"), torch.tensor([[0.0, 0.0, 5.0]]), time_axis=AXIS)
     N.reconstruct(captured("bp"), "bp", depths=(0.3, 5.0), progress=False)
-    N.FK(scanned("fk"), time_axis=replace(AXIS, start_opl=100.0))
+    for start in (100.0, -3.0):
+        N.FK(scanned("fk"), time_axis=replace(AXIS, start_opl=start))
+        N.Backprojection(scanned("bp"), torch.tensor([[0.0, 0.0, 0.5]]), time_axis=replace(AXIS, start_opl=start))
 
 
 @every
@@ -121,6 +123,9 @@ def test_dead_points_are_counted(name):
     broken = replace(capture, transient=light)
     with pytest.raises(UnitError, match=r"at 2 of 36 points, the first at \[2, 4\].*neighbours"):
         N.reconstruct(broken, name, progress=False)
+    if METHODS[name].kinds == ("confocal",):
+        with pytest.raises(UnitError, match="without_slab: expected finite light"):
+            N.without_slab(broken, 0.02, 1e3)
     pairs = N.Scan.grid(N.Wall.plane(1.0, 1.0), 4, kind="exhaustive", laser_grid=2)
     light = torch.rand(2, 1, 64, *pairs.shape)
     light[1, 0, 0, 1, 0, 3, 2] = -torch.inf

@@ -22,17 +22,18 @@ _BINS = "bins are metres of optical path: TimeAxis.from_seconds takes seconds, a
 
 def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None:
     """Raises UnitError for a wall that is ten times as wide as the record is long, for one that is smaller than a bin,
-    and for records that end before light can be back or begin a thousand walls away.
+    and for records that end far before time zero or begin thousands of walls behind it.
     """
     low, high = _box(_scanned(scan))
     side = float((high - low).norm())
-    reach = axis.end_opl - _legs(scan)[0]
-    if not reach > 0:
+    near, far = _legs(scan)
+    reach, record = axis.end_opl - near, axis.end_opl - axis.start_opl
+    if reach < -MOST * max(side, record):
         raise UnitError(
-            f"{who}: expected a record that goes on after time zero and its legs, got {axis} with legs of "
-            f"{_legs(scan)[0]:.4g} m. When does the first bin begin?"
+            f"{who}: expected a record that goes on after time zero and its legs, got {axis} with legs of {near:.4g} "
+            "m. When does the first bin begin?"
         )
-    if side > MOST * reach:
+    if side > MOST * max(reach, record):
         raise UnitError(
             f"{who}: expected a wall and a record of one size, got points up to {side:.4g} m apart and light of "
             f"{reach:.4g} m of path at most. {_LENGTHS}; {_BINS}."
@@ -42,7 +43,7 @@ def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None
             f"{who}: expected bins that are shorter than the wall is wide, got points {side:.4g} m apart at most and "
             f"bins of {axis.bin_width_opl:.4g} m. {_LENGTHS}; {_BINS}."
         )
-    if axis.start_opl - _legs(scan)[1] > 1e3 * MOST * max(side, axis.bin_width_opl):
+    if axis.start_opl - far > 1e3 * MOST * max(side, axis.bin_width_opl):
         raise UnitError(
             f"{who}: expected a record of things near the wall, got one that begins at {axis.start_opl:.4g} m of path "
             f"for points {side:.4g} m apart at most. {_LENGTHS}; {_BINS}."
@@ -59,10 +60,10 @@ def check_reach(scan: Scan, points: VoxelGrid | Tensor, axis: TimeAxis, who: str
     # Of the nearest point to the farthest one: no point of a box is nearer than the box, none farther than a corner.
     first, last = _between_boxes(scan, corners) + near, float(lengths[1].max()) + far
     longest = float(lengths[0].max()) + near
-    reach = max(axis.end_opl, near)
+    reach = max(axis.end_opl - near, axis.end_opl - axis.start_opl)
     begin, end = (max(0.0, x - near) / 2 for x in (axis.start_opl, axis.end_opl))
     expected = f"expected points within the record, {begin:.4g} to {end:.4g} m before the wall"
-    if longest - near > MOST * (reach - near):
+    if longest - near > MOST * reach:
         raise UnitError(
             f"{who}: {expected}, got some whose light comes after {longest:.4g} m of path. {_LENGTHS}; {_BINS}."
         )
