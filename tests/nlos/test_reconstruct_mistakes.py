@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.nlos import volume_memory
 from torchtransient.nlos.volume_memory import least_bytes
 from torchtransient.reconstruction.cone_operator import FALL
@@ -158,6 +158,14 @@ def test_all_settings_are_told(name):
         **{option: value for option, value in settings.items() if option != "camera"},
     )  # fmt: skip
     assert again.metadata["settings"] == settings
+
+
+@every
+@pytest.mark.parametrize("value", ["x", object()], ids=["a text", "an object"])
+def test_options_of_other_kinds_have_typed_errors(name, value):
+    for option in METHODS[name].options:
+        with pytest.raises(TorchTransientError):
+            N.reconstruct(captured(name), name, progress=False, **{option: value})
 
 
 def test_settings_of_the_laplacian():

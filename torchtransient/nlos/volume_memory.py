@@ -47,8 +47,8 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
     assert light is not None and axis is not None
     number = 8 if light.dtype == torch.float64 else 4
     if grid is not None:
-        camera = options.get("camera")
-        frames = 1 if camera is None or camera.times is None else len(camera.times)
+        times = getattr(options.get("camera"), "times", None)
+        frames = 1 if times is None else len(times)
         items = math.prod(light.shape[: light.ndim - len(capture.scan.shape) - 1])
         volume = frames * items * math.prod(grid.shape)
         if name == "phasor":
@@ -64,7 +64,7 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
         # Tables are made in double precision and kept in single; then come a spectrum and the field.
         tables = (4 + 2 * number * taps) * spectrum
         return max(tables + 16 * taps * spectrum, tables + 2 * number * (2 * plane * (bins + 1) + plane * bins))
-    v_bins = options.get("v_bins") or bins
+    v_bins = count("reconstruct: v_bins", options.get("v_bins", bins), 4)
     components = 3 if name == "directional-lct" else 1
     spectra = (1 + components) * 2 * number * (v_bins + 1) * plane
     return spectra + number * (v_bins + components * bins) * plane
