@@ -102,7 +102,7 @@ def test_says_what_the_operator_did_not_make():
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v[..., :-1])
     with pytest.raises(ShapeError, match="dimension 4"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, scale_invariant=True, dim=4)
-    with pytest.raises(ShapeError, match="list and torch"):
+    with pytest.raises(ShapeError, match="list and Tensor"):
         losses.measurement_consistency([1.0], draw(1, 4, 3, 3), lambda v: v)
     with pytest.raises(ShapeError, match="function of a volume"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), 3)

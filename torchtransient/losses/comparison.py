@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torchtransient.errors import DeviceError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 from torchtransient.quantities import finite, shown
 
 Reduction = Literal["none", "sum", "mean"]
@@ -43,10 +43,12 @@ def check_pair(
 
 def check_dense(tensors: tuple[object, ...], where: str) -> None:
     """Raises ShapeError unless all are tensors, and none a sparse one."""
+    kinds = [
+        str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
+    ]
     if not all(isinstance(x, Tensor) and x.layout == torch.strided for x in tensors):
-        number = {1: "a tensor", 2: "two tensors"}.get(len(tensors), "tensors")
-        got = (str(x.layout) if isinstance(x, Tensor) else type(x).__name__ for x in tensors)
-        raise ShapeError(f"{where}: expected {number} (dense), got {' and '.join(got)}.")
+        number = {1: "a dense tensor", 2: "two dense tensors"}.get(len(tensors), "dense tensors")
+        raise ShapeError(f"{where}: expected {number}, got {' and '.join(kinds)}.")
 
 
 def check_device(x: Tensor, other: Tensor, where: str, names: str) -> None:
@@ -128,11 +130,11 @@ def holds(condition: Tensor) -> bool:
         return True
 
 
-def check_whole(name: str, value: object, where: str) -> int:
-    """A number of things, 1 or more. Raises ShapeError for others; 3.0 is three."""
+def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
+    """A number of things, 1 or more; 3.0 is three. Raises UnitError for no number, `error` for others."""
     number = math.nan if isinstance(value, bool) else finite(f"{where}: {name}", value)
     if not number >= 1 or number != int(number):
-        raise ShapeError(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
+        raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
     return int(number)
 
 

@@ -3,7 +3,8 @@
 Shapes do not say it: (2, 3, 20, 5) is two lists of five points, or two channels of three bins. So there is `dim`, the
 dimension of time (of frequency), with the channels right before it: -3 of images (..., C, T, Y, X), -2 of lists of
 points (..., C, T, N), -5 of exhaustive captures (..., C, T, Ly, Lx, Sy, Sx). An item of a batch is its channels and
-everything behind them. Without `dim`, (C, T, Y, X) and (B, C, T, Y, X) are taken, what may be another layout is refused.
+everything behind them. Without `dim`, (C, T, Y, X) and (B, C, T, Y, X) are taken, of four
+bins or more: fewer may be channels. What is left to say is a batch of lists of as many channels.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ _FEWEST_BINS = 4
 _LAYOUTS = "-3 of (..., C, T, Y, X), -2 of lists (..., C, T, N), -5 of exhaustive captures (..., C, T, Ly, Lx, Sy, Sx)"
 
 
-def time_dim(x: Tensor, dim: int | None, where: str) -> int:
-    """The dimension of time of `x`, below zero. Raises ShapeError where it is not there, or neither said nor clear."""
+def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
+    """The dimension of time of `x`, below zero. Raises ShapeError where it is not there, or neither said nor clear;
+    `instead`: what else a user may say.
+    """
     if dim is None:
         if x.ndim not in (4, 5) or x.shape[_IMAGES] < _FEWEST_BINS:
             raise ShapeError(
-                f"{where}: expected dim=, the dimension of time, for a tensor {tuple(x.shape)}: {_LAYOUTS}. Without it "
-                f"(C, T, Y, X) and (B, C, T, Y, X) of {_FEWEST_BINS} bins or more are taken, no others."
+                f"{where}: expected dim=, the dimension of time,{instead} for a tensor {tuple(x.shape)}: {_LAYOUTS}. "
+                f"Without it (C, T, Y, X) and (B, C, T, Y, X) of {_FEWEST_BINS} bins or more are taken, no others."
             )
         return _IMAGES
     try:
@@ -51,15 +54,15 @@ def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
     return place
 
 
-def item_dims(x: Tensor, dim: int | None, where: str) -> tuple[int, ...]:
-    """Dimensions of an item, from its channels on. Without `dim`, a tensor of up to three dimensions is one item."""
-    if dim is None and x.ndim < 4:
+def item_dims(x: Tensor, dim: int | None, where: str, instead: str = "") -> tuple[int, ...]:
+    """Dimensions of an item, from its channels on. Without `dim`, a tensor of one dimension is one item."""
+    if dim is None and x.ndim < 2:
         return tuple(range(-x.ndim, 0))
-    return tuple(range(max(time_dim(x, dim, where) - 1, -x.ndim), 0))
+    return tuple(range(max(time_dim(x, dim, where, instead) - 1, -x.ndim), 0))
 
 
 def as_columns(x: Tensor, dim: int) -> Tensor:
-    """(..., T, N, 1) of a tensor with time as its dimension `dim` < 0: the layout of the sensors. A view if it can be."""
+    """(..., T, N, 1) of a tensor with time as its dimension `dim` < 0: the layout of the sensors."""
     if dim == _IMAGES:
         return x
     place = dim + x.ndim

@@ -66,7 +66,7 @@ def _floored(
     model: Tensor, floor: Tensor | float | None, dim: int | None, mask: Tensor | None, where: str
 ) -> Tensor:
     if floor is None:
-        return model + relative_floor(model, mask=mask, dim=dim)
+        return model + _relative_floor(model, item_dims(model, dim, where, " or floor="), mask)
     return model + check_level("floor", floor, model, where, zero=True)
 
 
@@ -81,10 +81,15 @@ def relative_floor(
     """
     where = "relative_floor"
     check_dense((model,), where)
-    share = positive(f"{where}: share", share)
     model = model.to(working_dtype((model,), where))
     mask = check_mask(mask, model, where)
-    dims = item_dims(model, dim, where)
+    part = check_level("share", share, model.new_empty(()), where)
+    return _relative_floor(model, item_dims(model, dim, where), mask, part)
+
+
+def _relative_floor(
+    model: Tensor, dims: tuple[int, ...], mask: Tensor | None, share: Tensor | float = _RELATIVE_FLOOR
+) -> Tensor:
     size = counted(model.detach(), mask).abs()
     number = max(1, size.numel()) if mask is None else mask.sum().clamp_min(1)
     whole = size.sum() / number
@@ -143,7 +148,7 @@ def first_photon_nll(
     """
     where = "first_photon_nll"
     measured, rate = counts, _check(counts, rate, where)[1]
-    number = check_whole("cycles", cycles, where)
+    number = check_whole("cycles", cycles, where, UnitError)
     dead = None if dead_bins is None else positive(f"{where}: dead_bins", dead_bins)
     dim = bins_dim(rate, dim, where)
     mask = check_mask(mask, rate, where)
@@ -197,7 +202,7 @@ def free_running_nll(
     """
     where = "free_running_nll"
     measured, rate = counts, _check(counts, rate, where)[1]
-    periods, dead_bins = check_whole("periods", periods, where), positive(f"{where}: dead_bins", dead_bins)
+    periods, dead_bins = check_whole("periods", periods, where, UnitError), positive(f"{where}: dead_bins", dead_bins)
     dim = bins_dim(rate, dim, where)
     mask = check_mask(mask, rate, where)
     rate = counted(rate, mask, 1.0)

@@ -41,11 +41,12 @@ def measurement_consistency(
 
     `operator` is `A`: a `LinearOperator` of `tt.nlos` or any function from `volume` (..., C, Z, Y, X) to the shape of
     `measured` (..., C, T, Y, X); `compare` any loss (input, target) with `mask` and `reduction`, `mask` of the
-    measurement. With `scale_invariant` A volume is first multiplied by the real number that brings each item nearest
-    to the measurement in least squares: powers of lasers and albedos are seldom calibrated. `dim`, where time is in the
-    measurement (`losses.layouts`), says what is an item. That number may be negative, so keep volumes non-negative where their sign matters; it is 1 for a volume
-    that is dark altogether, whose gradient then leads out of the dark. Not symmetric; zero where A volume is the
-    measurement. Raises ShapeError where A volume is no tensor of the measurement's shape.
+    measurement. With `scale_invariant` A volume is first multiplied by the real number that brings each item nearest to
+    the measurement in least squares: powers of lasers and albedos are seldom calibrated. `dim`, where time is in the
+    measurement, then says what is an item (`losses.layouts`). That number may be negative, so keep volumes non-negative
+    where their sign matters; it is 1 for a volume that is dark altogether, whose gradient then leads out of the dark.
+    Not symmetric; zero where A volume is the measurement. Raises ShapeError where A volume is no tensor of the
+    measurement's shape.
     """
     where = "measurement_consistency"
     check_dense((volume, measured), where)

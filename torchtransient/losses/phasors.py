@@ -80,7 +80,8 @@ def phasor_loss(
     `phase_only`: of `P / sqrt(|P|^2 + floor^2)` and Q likewise, each between 0 and 1, so that brightness has no part:
     `2 - 2 cos` of the angle between them where both are bright, 1 where one is dark. `floor`, in the unit of the
     phasors, says what is dark and bounds the gradient by 4/floor; None: 1e-3 of the mean modulus of each item of each;
-    `dim`, where frequency is (`losses.layouts`), then says what is an item. Raises ShapeError for two shapes, UnitError for real numbers.
+    `dim`, where frequency is, then says what is an item (`losses.layouts`). Raises ShapeError for two shapes, UnitError
+    for real numbers.
     """
     where = "phasor_loss"
     input, target = check_pair(input, target, where, complex_too=True)
@@ -90,7 +91,7 @@ def phasor_loss(
     input, target = counted(input, mask), counted(target, mask)
     if phase_only:
         if floor is None:
-            item = item_dims(input, dim, where)
+            item = item_dims(input, dim, where, " or floor=")
             ours, theirs = (_PHASE_FLOOR * item_scale(*x, item, mask) for x in ((input, target), (target, input)))
         else:
             ours = theirs = check_level("floor", floor, input, where)

@@ -21,7 +21,6 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.layouts import item_dims
-from torchtransient.sensing.layout import check_number
 
 _OFFSET = 3 / 8
 _BACKGROUND = 1e-3
@@ -36,11 +35,11 @@ def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
     Whole numbers count in torch's default dtype, half precision in float32. Raises UnitError for a read noise below
     zero and for complex numbers, ShapeError for no tensor.
     """
-    read_noise = check_number(read_noise, "read_noise", "anscombe")
     check_dense((counts,), "anscombe")
     whole = not (counts.is_floating_point() or counts.is_complex())
     counts = counts.to(torch.get_default_dtype() if whole else working_dtype((counts,), "anscombe"))
-    offset = _OFFSET + read_noise**2
+    check_level("read_noise", read_noise, counts.new_empty(()), "anscombe", zero=True, square=True)
+    offset = _OFFSET + float(read_noise) ** 2
     negative = counts < 0
     root = (torch.where(negative, torch.zeros_like(counts), counts) + offset).sqrt()
     return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / math.sqrt(offset)
@@ -91,7 +90,7 @@ def log_ratio_loss(
     mask = check_mask(mask, input, where)
     input, target = counted(input, mask), counted(target, mask)
     if background is None:
-        level = _BACKGROUND * item_scale(target, input, item_dims(input, dim, where), mask)
+        level = _BACKGROUND * item_scale(target, input, item_dims(input, dim, where, " or background="), mask)
     else:
         level = check_level("background", background, input, where)
     return reduce((_log(input, level) - _log(target, level)).square(), reduction, where, mask)

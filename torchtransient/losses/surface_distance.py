@@ -75,9 +75,13 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
 
 
 def _length(x: Tensor) -> Tensor:
-    """Of vectors (..., 3); the root has no slope at zero, where it is taken as zero."""
-    square = x.square().sum(-1)
-    apart = square > 0
+    """Of vectors (..., 3)."""
+    return _root(x.square().sum(-1))
+
+
+def _root(square: Tensor) -> Tensor:
+    """The root has no slope at zero: there it is taken as zero."""
+    apart = square != 0  # NaN is no zero
     return torch.where(apart, torch.where(apart, square, torch.ones_like(square)).sqrt(), 0.0)
 
 
@@ -87,8 +91,8 @@ def _normal(edges: Tensor) -> Tensor:
     edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))[..., None]
     across = torch.linalg.cross(edges[:, 0], edges[:, 1])
     length = _length(across)[:, None]
-    flat = length > 0
-    return torch.where(flat, across / torch.where(flat, length, torch.ones_like(length)), 0.0)
+    upright = length != 0
+    return torch.where(upright, across / torch.where(upright, length, torch.ones_like(length)), 0.0)
 
 
 def _middles(cells: int) -> Tensor:
@@ -111,5 +115,4 @@ def _distance(points: Tensor, triangles: Tensor) -> Tensor:
     # A triangle without area has no normal, and its edges are all of it.
     inside = ((from_corner * inwards).sum(-1) >= 0).all(-1) & (normal.square().sum(-1) > 0)
     nearest = torch.where(inside, height.square(), to_edges).amin(1)
-    apart = nearest > 0
-    return torch.where(apart, torch.where(apart, nearest, torch.ones_like(nearest)).sqrt(), 0.0)
+    return _root(nearest)

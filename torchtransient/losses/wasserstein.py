@@ -21,7 +21,6 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import bins_dim, item_dims
-from torchtransient.quantities import positive
 
 # Pixels below this share of the mean light of a pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3
@@ -51,19 +50,19 @@ def wasserstein_loss(
     pixels. This is the cost of one way to do it, at least that of the cheapest (partial optimal transport).
 
     Light counts as at the middle of its bin; negative bins, of captures less their background, enter the same formula.
-    Computed by cumulative sums of differences. `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins that do not count
-    are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
+    Computed by cumulative sums of differences. `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins
+    that do not count are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "wasserstein_loss"
-    width = positive(f"{where}: bin_width_opl", bin_width_opl)
     check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
+    width = check_level("bin_width_opl", bin_width_opl, input.new_empty(()), where)
     pixels = None if mask is None else mask.any(dim)
     a, b = counted(input, mask), counted(target, mask)
     if creation_cost_opl is not None:
-        cost = positive(f"{where}: creation_cost_opl", creation_cost_opl)
+        cost = check_level("creation_cost_opl", creation_cost_opl, width, where)
         return reduce(_unbalanced(a, b, width, cost, dim), reduction, where, pixels)
     mass_a, mass_b = a.sum(dim, keepdim=True), b.sum(dim, keepdim=True)
     kept = None if pixels is None else pixels.unsqueeze(dim)
@@ -92,7 +91,7 @@ def _moved(difference: Tensor, dim: int) -> Tensor:
     return difference.narrow(dim, 0, bins - 1).cumsum(dim).abs().sum(dim)
 
 
-def _unbalanced(a: Tensor, b: Tensor, width: float, cost: float, dim: int) -> Tensor:
+def _unbalanced(a: Tensor, b: Tensor, width: Tensor, cost: Tensor, dim: int) -> Tensor:
     mass_a, mass_b = a.sum(dim, keepdim=True), b.sum(dim, keepdim=True)
     darker = torch.minimum(mass_a, mass_b).clamp_min(0)
 
