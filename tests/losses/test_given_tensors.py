@@ -146,6 +146,16 @@ def test_targets_of_every_kind(case, dtype):
     torch.testing.assert_close(found, wanted, rtol=0, atol=0)
 
 
+@over(lambda case: case.pair and case.draw_target is None and not case.tensors()[0].is_complex())
+@pytest.mark.parametrize("dtype", [*WHOLE, *FLOATING, torch.bool], ids=str)
+def test_inputs_of_every_kind(case, dtype):
+    if case.function is losses.measurement_consistency:
+        return  # its operator is the user's
+    x, y = case.tensors(dtype=torch.float32)
+    x = (100 * x).to(dtype)
+    torch.testing.assert_close(case(x, y), case(x.to(torch.float32), y), rtol=0, atol=0)
+
+
 @nlls
 @pytest.mark.parametrize("dtype", [*WHOLE, torch.float16, torch.bfloat16, torch.bool], ids=str)
 def test_counts_up_to_the_last_of_their_kind(loss, dtype):
@@ -277,6 +287,19 @@ def test_levels_are_positive_numbers_that_fit(loss):
 def test_levels_of_places(name):
     for shape in ((4, 5), (2, 1, 1, 4, 5), (8, 1, 1)):
         torch.testing.assert_close(LEVELS[name](torch.full(shape, 0.5)), LEVELS[name](0.5))
+
+
+@pytest.mark.parametrize("name", ["Wasserstein", "log ratio", "phasor", "SSIM"])
+def test_levels_in_vmap(name):
+    """Tensors that are mapped over are not looked at, others are."""
+    found = torch.vmap(LEVELS[name])(torch.tensor([0.5, 0.7]))
+    torch.testing.assert_close(found, torch.stack([LEVELS[name](0.5), LEVELS[name](0.7)]))
+
+
+def test_functions_take_their_arguments_by_name():
+    record = torch.rand(1, 8, 2, 2)
+    named = losses.transient_phasors(transient=record, axis=AXIS, frequencies=BAND)
+    torch.testing.assert_close(named, losses.transient_phasors(record, AXIS, BAND))
 
 
 def test_no_floor_is_one_of_likelihoods():

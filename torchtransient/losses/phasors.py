@@ -33,7 +33,6 @@ from torchtransient.sensing.layout import without_autocast
 _PHASE_FLOOR = 1e-3
 
 
-@without_autocast
 def transient_phasors(
     transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, *, dim: int | None = None
 ) -> Tensor:
@@ -62,7 +61,12 @@ def transient_phasors(
     angle = -2 * math.pi * (turns - turns.round())
     cos, sin = (table.to(transient.device, dtype) for table in (angle.cos(), angle.sin()))
     record = transient.to(dtype).reshape(*lead, bins, math.prod(trail))
-    return torch.complex(cos @ record, sin @ record).reshape(*lead, frequencies.num_frequencies, *trail)
+    return _transformed(record, cos, sin).reshape(*lead, frequencies.num_frequencies, *trail)
+
+
+@without_autocast
+def _transformed(record: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    return torch.complex(cos @ record, sin @ record)
 
 
 def phasor_loss(

@@ -13,7 +13,6 @@ from torchtransient.sensing.layout import without_autocast
 _MOST = 1 << 24
 
 
-@without_autocast
 def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, cells: int = 4) -> Tensor:
     """Mean distance of two surfaces, in the unit of the vertices, whatever that is: scalar, differentiable in both.
 
@@ -36,6 +35,11 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
     cells = check_whole("cells", cells, where)
     dtype = working_dtype((vertices, others), where)
     first, second = vertices.to(dtype)[faces.long()], others.to(dtype)[other_faces.long()]
+    return _both_ways(first, second, cells)
+
+
+@without_autocast
+def _both_ways(first: Tensor, second: Tensor, cells: int) -> Tensor:
     return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
 
 
