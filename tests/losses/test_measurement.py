@@ -98,11 +98,16 @@ def test_an_operator_of_the_library_learns_a_volume():
 
 
 def test_says_what_the_operator_did_not_make():
+    with pytest.raises(ShapeError, match="compare to be a function"):
+        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, compare="squared")
+    for root in (3, lambda x: 1.0):
+        with pytest.raises(ShapeError, match="root"):
+            losses.root_loss(draw(1, 4, 3, 3), draw(1, 4, 3, 3), root=root)
     with pytest.raises(ShapeError, match=r"measurement's shape \(1, 4, 3, 3\)"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v[..., :-1])
     with pytest.raises(ShapeError, match="dimension 4"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, scale_invariant=True, dim=4)
     with pytest.raises(ShapeError, match="list and Tensor"):
         losses.measurement_consistency([1.0], draw(1, 4, 3, 3), lambda v: v)
-    with pytest.raises(ShapeError, match="function of a volume"):
+    with pytest.raises(ShapeError, match="the operator to be a function"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), 3)

@@ -138,6 +138,11 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
     return int(number)
 
 
+def check_function(name: str, value: object, where: str) -> None:
+    if not callable(value):
+        raise ShapeError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
+
+
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
     """The mask, expanded to the shape of `like`. Raises ShapeError unless it broadcasts to it, UnitError unless it is
     boolean, DeviceError.

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import Reduction, check_dense, check_mask, check_pair, counted, reduce
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_dense,
+    check_function,
+    check_mask,
+    check_pair,
+    counted,
+    reduce,
+)
 from torchtransient.losses.layouts import item_dims
 
 
@@ -50,8 +58,8 @@ def measurement_consistency(
     """
     where = "measurement_consistency"
     check_dense((volume, measured), where)
-    if not callable(operator):
-        raise ShapeError(f"{where}: expected the operator to be a function of a volume, got {type(operator).__name__}.")
+    check_function("the operator", operator, where)
+    check_function("compare", compare, where)
     prediction = operator(volume)
     if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
         got = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__

@@ -12,6 +12,7 @@ from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_function,
     check_level,
     check_mask,
     check_pair,
@@ -59,12 +60,14 @@ def root_loss(
     noise lets it be when its loss is. Take `tt.nlos.stabilised_root`, `H / sqrt(|H| + 1/4)`, for what f-k migration
     sees of counts, or `functools.partial` of either. Raises ShapeError, UnitError.
     """
+    check_function("root", root, "root_loss")
     input, target = check_pair(input, target, "root_loss")
     mask = check_mask(mask, input, "root_loss")
-    value = (root(counted(input, mask)) - root(counted(target, mask))).square()
-    if value.shape != input.shape:
-        raise ShapeError(f"root_loss: expected a root that keeps the shape, got {tuple(value.shape)}.")
-    return reduce(value, reduction, "root_loss", mask)
+    ours, theirs = root(counted(input, mask)), root(counted(target, mask))
+    check_dense((ours, theirs), "root_loss, of the root")
+    if ours.shape != input.shape:
+        raise ShapeError(f"root_loss: expected a root that keeps the shape, got {tuple(ours.shape)}.")
+    return reduce((ours - theirs).square(), reduction, "root_loss", mask)
 
 
 def log_ratio_loss(
