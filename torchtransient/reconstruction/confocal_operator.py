@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -61,12 +62,16 @@ class ConfocalOperator(TransientOperator):
 
 class InverseOperator(LinearOperator):
     """A regularised inverse of an operator, itself a linear operator: from its data to its volume, whose
-    ``points``, ``depths`` and ``grid`` it has.
+    ``points``, ``depths`` and ``grid`` it has. It shares the operator's tables until one of them is moved or converted,
+    which leaves the other as it was.
     """
 
     def __init__(self, operator: ConfocalOperator) -> None:
         super().__init__()
-        self.operator = operator
+        # Modules that share tables but not the lists of them.
+        self.operator = copy.copy(operator)
+        for name in ("_buffers", "_parameters", "_modules"):
+            setattr(self.operator, name, dict(getattr(operator, name)))
         self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
         self.dtype = operator.dtype
 
