@@ -185,11 +185,14 @@ def test_rows_are_convolved_with_the_whole_pulse_and_do_not_wrap(wavelength, cyc
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("bins", [2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 16.0, 40.0])
+@pytest.mark.parametrize(
+    "bins, cycles",
+    [(2.0, 4.0), (2.5, 4.0), (3.0, 3.0), (4.0, 4.0), (6.0, 0.5), (9.0, 1.0), (16.0, 0.25), (16.0, 4.0), (40.0, 4.0)],
+)
 @pytest.mark.parametrize("scan", ["confocal", "exhaustive, legs"])
-def test_filtered_light_is_the_pulse_at_every_length(scan, bins):
+def test_filtered_light_is_the_pulse_at_every_length(scan, bins, cycles):
     # Lines between samples of a wave lose (pi / n)^2 / 2 of it at most, n of them: 16 and more.
-    axis, scan, pulse = TimeAxis(0.02, 0.01, 90), SCANS[scan], PhasorFilter(0.01 * bins, 4.0)
+    axis, scan, pulse = TimeAxis(0.02, 0.01, 90), SCANS[scan], PhasorFilter(0.01 * bins, cycles)
     operator = FilteredBackprojection(scan, POINTS, time_axis=axis, filter=pulse, dtype=F64)
     light = torch.rand(operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
     lengths = lengths_of(scan, POINTS)
@@ -299,13 +302,17 @@ def test_filters_that_cannot_be_taken():
         Backprojection(scan, grid, falloff=math.nan, **of)
     with pytest.raises(ShapeError, match="PhasorFilter or a LaplacianFilter"):
         FilteredBackprojection(scan, grid, filter="pf", **of)
-    with pytest.raises(UnitError, match="two bins"):
-        FilteredBackprojection(scan, grid, filter=PhasorFilter(0.03), **of)
+    for kind, name in ((FilteredBackprojection, "filter"), (PhasorField, "pulse")):
+        with pytest.raises(UnitError, match="two bins"):
+            kind(scan, grid, **{name: PhasorFilter(0.03)}, **of)
+        with pytest.raises(UnitError, match="fourth of a bin"):
+            kind(scan, grid, **{name: PhasorFilter(0.1, 1e-6)}, **of)
     with pytest.raises(ShapeError, match="a VoxelGrid for a LaplacianFilter"):
         FilteredBackprojection(scan, POINTS, filter=LaplacianFilter(), **of)
     with pytest.raises(ShapeError, match="evenly spaced"):
         FilteredBackprojection(scan, grid.at_depths([0.1, 0.2, 0.4]), filter=LaplacianFilter(), **of)
-    for make in (lambda: PhasorFilter(0.0), lambda: PhasorFilter(1.0, -1.0), lambda: LaplacianFilter(math.inf)):
+    for make in (lambda: PhasorFilter(0.0), lambda: PhasorFilter(1.0, -1.0), lambda: LaplacianFilter(math.inf),
+                 lambda: LaplacianFilter(0.1)):  # fmt: skip
         with pytest.raises(UnitError):
             make()
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):

@@ -4,6 +4,7 @@ of its voxels, captures as data, typed errors.
 
 import copy
 import inspect
+import math
 import pickle
 from dataclasses import replace
 
@@ -369,6 +370,7 @@ def test_grids_of_the_same_wall_are_told_from_others():
 
 MADE = {
     "fk": lambda scan, points, of: FK(scan["confocal"], **of),
+    "fk of a grid": lambda scan, points, of: FK(PlanarScan.of(scan["confocal"].sensor_points, who="test"), **of),
     "lct": lambda scan, points, of: LCT(scan["confocal"], **of),
     "midpoint fk": lambda scan, points, of: MidpointFK(scan["single"], **of),
     "backprojection": lambda scan, points, of: Backprojection(scan["confocal"], points, **of),
@@ -414,3 +416,14 @@ def test_choices_that_are_none(value):
         FK(grid_operators.SCAN, taps=value, **of)
     with pytest.raises(UnitError, match="passes"):
         DiffusionDeconvolution(grid_operators.SCAN, passes=value, **of)
+
+
+@pytest.mark.parametrize("kind", [LCT, DirectionalLCT, DiffusionDeconvolution])
+def test_ratios_that_single_precision_cannot_hold(kind):
+    of = {"time_axis": grid_operators.AXIS}
+    for snr in (1e-20, 1e20):
+        operator = kind(grid_operators.SCAN, snr=snr, **of)
+        assert operator.reconstruct(torch.ones(operator.data_shape)).isfinite().all()
+    for snr in (1e-60, 1e60, 0.0, math.inf, None):
+        with pytest.raises(UnitError, match="snr"):
+            kind(grid_operators.SCAN, snr=snr, **of)

@@ -145,6 +145,8 @@ def test_what_cannot_be_taken():
         depth_map(torch.zeros(grid.shape), grid, threshold=2.0)
     with pytest.raises(UnitError, match="sharpness"):
         soft_depth(torch.zeros(grid.shape), grid, sharpness=0.0)
+    with pytest.raises(UnitError, match="sharpness"):
+        soft_depth(torch.zeros(grid.shape), grid, sharpness=1e50)
     with pytest.raises(ShapeError, match="knows its axes"):
         normals_from_depth(torch.zeros(9, 9), UNEVEN)
     with pytest.raises(ShapeError, match="expected depths"):

@@ -13,10 +13,12 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.quantities import positive, shown
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
 PRECISIONS = (torch.float32, torch.float64)
+# Signal-to-noise ratios that a Wiener filter in single precision tells from none and from infinite ones.
+SNR = (1e-20, 1e20)
 
 
 def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
@@ -24,6 +26,16 @@ def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
     if dtype not in PRECISIONS:
         raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {shown(dtype)}.")
     return dtype
+
+
+def within(name: str, value: Any, low: float, high: float) -> float:
+    """``value`` as a float. Raises UnitError unless it lies between the two, beyond which single precision has zero or
+    nothing left.
+    """
+    number = positive(name, value)
+    if not low <= number <= high:
+        raise UnitError(f"{name}: expected a number from {low:g} to {high:g}, got {shown(value)}.")
+    return number
 
 
 def one_of(name: str, value: Any, options: Collection[Any]) -> Any:

@@ -42,13 +42,14 @@ class ConfocalOperator(TransientOperator):
 
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         who = type(self).__name__
-        wall, bins = confocal_wall(scan, who), checked_axis(time_axis, who).num_bins
+        confocal_wall(scan, who)
+        bins = checked_axis(time_axis, who).num_bins
         if bins < LEAST_BINS:
             raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        self.wall = wall
-        self.grid = VoxelGrid.of_wall(wall, time_axis.centers_opl / 2)
-        self.data_shape = (bins, *wall.size)
+        self.wall = confocal_wall(self.scan, who)
+        self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
+        self.data_shape = (bins, *self.wall.size)
         self.volume_shape = self.data_shape
 
     @property

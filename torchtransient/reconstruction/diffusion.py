@@ -19,6 +19,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import UnitError
 from torchtransient.quantities import finite, positive
+from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
@@ -99,7 +100,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         self.properties = _slab_properties(properties, who)
         if isinstance(passes, bool) or not isinstance(passes, int) or passes not in (1, 2):
             raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={passes!r}.")
-        self.passes, self.snr = passes, positive(f"{who}: snr", snr)
+        self.passes, self.snr = passes, within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:

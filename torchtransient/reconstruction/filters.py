@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import positive
+from torchtransient.reconstruction.capture_checks import within
 from torchtransient.reconstruction.plane_waves import good_length
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -55,7 +56,8 @@ class PhasorFilter:
     Transients, the light of a bin in its middle, are convolved with exp(2 pi i t / wavelength) exp(-t^2 / 2 sigma^2),
     sigma = cycles wavelength / 6, whose transform is a Gaussian of height one; light before and behind the record
     counts as none, however long the pulse is. The picture is the squared modulus. Wavelengths of twice the scan's pitch
-    and more are free of ghosts. Raises UnitError, for wavelengths below two bins as well.
+    and more are free of ghosts. Raises UnitError, for wavelengths below two bins and a sigma below a fourth of one as
+    well.
     """
 
     wavelength: float
@@ -75,10 +77,11 @@ class PhasorFilter:
         return True
 
     def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
-        check_sampling(self.wavelength, bin_width_opl, who)
+        check_sampling(self, bin_width_opl, who)
 
     def samples(self, bin_width_opl: float) -> int:
-        return max(1, math.ceil(SAMPLES * bin_width_opl / self.wavelength - 1e-9))
+        # Pulses of less than a cycle are steeper than their wave.
+        return max(1, math.ceil(SAMPLES * bin_width_opl / (self.wavelength * min(1.0, self.cycles)) - 1e-9))
 
     def rows(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
         bins, (first, last) = rows.shape[-1], sample_places(rows.shape[-1], samples)
@@ -133,13 +136,14 @@ class LaplacianFilter:
 
     -(d^2/dz^2 + d^2/dy^2 + d^2/dx^2) of the volume smoothed by a Gaussian of ``sigma`` voxels in each direction; the
     derivatives are per voxel. What is outside of the volume counts as zero. The picture is what comes out, with its
-    negative lobes. Needs a :class:`VoxelGrid` of evenly spaced planes. Raises UnitError; ShapeError for other volumes.
+    negative lobes. Needs a :class:`VoxelGrid` of evenly spaced planes. Raises UnitError, for a ``sigma`` below 0.2 as
+    well, of which the neighbours of a voxel see nothing; ShapeError for other volumes.
     """
 
     sigma: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sigma", positive("LaplacianFilter: sigma", self.sigma))
+        object.__setattr__(self, "sigma", within("LaplacianFilter: sigma", self.sigma, 0.2, 1e3))
 
     @property
     def complex_volume(self) -> bool:
@@ -199,11 +203,17 @@ class LaplacianFilter:
         return smooth.to(like.device, like.dtype), curved.to(like.device, like.dtype)
 
 
-def check_sampling(wavelength: float, bin_width_opl: float, who: str) -> None:
-    """Raises UnitError for wavelengths that the bins cannot hold."""
-    if wavelength < 2 * bin_width_opl:
+def check_sampling(pulse: PhasorFilter, bin_width_opl: float, who: str) -> None:
+    """Raises UnitError for pulses that the bins cannot hold."""
+    if pulse.wavelength < 2 * bin_width_opl:
         raise UnitError(
-            f"{who}: expected a wavelength of two bins at least, {2 * bin_width_opl:.4g} m, got {wavelength:.4g} m."
+            f"{who}: expected a wavelength of two bins at least, {2 * bin_width_opl:.4g} m, got "
+            f"{pulse.wavelength:.4g} m."
+        )
+    if pulse.sigma < bin_width_opl / 4:
+        raise UnitError(
+            f"{who}: expected a pulse with a standard deviation of a fourth of a bin at least, "
+            f"{bin_width_opl / 4:.4g} m, got {pulse.sigma:.4g} m of {pulse.cycles:g} cycles. Take more of them."
         )
 
 

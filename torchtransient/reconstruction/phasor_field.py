@@ -81,7 +81,7 @@ class PhasorField(ScanOperator):
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         if not isinstance(pulse, PhasorFilter):
             raise ShapeError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
-        check_sampling(pulse.wavelength, time_axis.bin_width_opl, "PhasorField")
+        check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
         if not isinstance(self.camera, Camera):
             raise ShapeError(

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.quantities import positive, share, shown
+from torchtransient.quantities import share, shown
+from torchtransient.reconstruction.capture_checks import within
 from torchtransient.reconstruction.voxels import VoxelGrid, checked_depths
 
 
@@ -75,7 +76,7 @@ def soft_depth(volume: Tensor, depths: VoxelGrid | Any, *, sharpness: float = 20
     have the mean of all planes. Raises ShapeError, UnitError.
     """
     z, volume = _checked(volume, depths, "soft_depth")
-    sharpness = positive("soft_depth: sharpness", sharpness)
+    sharpness = within("soft_depth: sharpness", sharpness, 1e-30, 1e30)
     if volume.numel() == 0:
         return volume.sum(-3)
     highest = volume.amax(-3, keepdim=True)
