@@ -24,9 +24,9 @@ def real(x):
     return not x.is_complex()
 
 
-def gradient(case, x, y, mask=None):
+def gradient(case, x, y, mask=None, **more):
     x = x.detach().clone().requires_grad_()
-    case(x, y, mask, "sum").backward()
+    case(x, y, mask, "sum", **more).backward()
     return x.grad
 
 
@@ -60,7 +60,7 @@ def test_items_of_a_batch_do_not_see_each_other(case):
     whole = case(x, y, reduction="none")
     for i in range(2):
         torch.testing.assert_close(whole[i], case(x[i], y[i], reduction="none"))
-    more = case(x[None].expand(3, *x.shape), y[None].expand(3, *y.shape), reduction="none")
+    more = case(x[None].expand(3, *x.shape), y[None].expand(3, *y.shape), reduction="none", **case.said)
     torch.testing.assert_close(more[2], whole)
 
 
@@ -191,8 +191,8 @@ def test_a_single_bin(case):
         x, y = x[..., :1, :1, :1], y[..., :1, :1, :1]
     elif case.crop is not None:
         x, y = x[..., :1, :1], y[..., :1, :1]
-    assert bool(torch.isfinite(case(x, y)))
-    assert bool(torch.isfinite(gradient(case, x, y)).all())
+    assert bool(torch.isfinite(case(x, y, **case.said)))
+    assert bool(torch.isfinite(gradient(case, x, y, **case.said)).all())
 
 
 @every

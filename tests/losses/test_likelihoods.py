@@ -173,7 +173,7 @@ def test_read_noise_value():
     torch.testing.assert_close(read_noise_nll(y, m, 2.0, shot_noise=False, reduction="none"), plain)
     sigma = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda s: read_noise_nll(y, m, s), sigma)
-    with pytest.raises(UnitError, match="read_noise > 0"):
+    with pytest.raises(UnitError, match="read_noise greater than zero"):
         read_noise_nll(y, m, 0.0)
 
 

@@ -68,8 +68,10 @@ def test_items_may_have_more_dimensions():
     volume = draw(1, 3, 2, 2, 2, 2)
     measured = volume * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).reshape(3, 1, 1, 1, 1)
     loss = functools.partial(losses.measurement_consistency, operator=lambda v: v, scale_invariant=True)
-    assert float(loss(volume, measured, item_dims=4)) < 1e-28
-    assert float(loss(volume, measured, item_dims=6)) > 0.01
+    assert float(loss(volume, measured, dim=-3)) < 1e-28
+    assert float(loss(volume, measured, dim=-5)) > 0.01
+    with pytest.raises(ShapeError, match="dim="):
+        loss(volume, measured)
 
 
 def test_compares_by_any_loss():
@@ -96,9 +98,16 @@ def test_an_operator_of_the_library_learns_a_volume():
 
 
 def test_says_what_the_operator_did_not_make():
+    with pytest.raises(ShapeError, match="compare to be a function"):
+        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, compare="squared")
+    for root in (3, lambda x: 1.0):
+        with pytest.raises(ShapeError, match="root"):
+            losses.root_loss(draw(1, 4, 3, 3), draw(1, 4, 3, 3), root=root)
     with pytest.raises(ShapeError, match=r"measurement's shape \(1, 4, 3, 3\)"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v[..., :-1])
-    with pytest.raises(ShapeError, match="item_dims"):
-        losses.measurement_consistency(
-            draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, scale_invariant=True, item_dims=0
-        )
+    with pytest.raises(ShapeError, match="dimension 4"):
+        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, scale_invariant=True, dim=4)
+    with pytest.raises(ShapeError, match="list and Tensor"):
+        losses.measurement_consistency([1.0], draw(1, 4, 3, 3), lambda v: v)
+    with pytest.raises(ShapeError, match="the operator to be a function"):
+        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), 3)

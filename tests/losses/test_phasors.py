@@ -89,7 +89,7 @@ def test_no_branch_cut():
 
 def test_dark_pixels():
     """Both dark: alike. One dark: half way between alike and opposite. A dark item takes the scale of the other."""
-    light, dark = torch.ones(2, 3, 4, 4, dtype=torch.complex128), torch.zeros(2, 3, 4, 4, dtype=torch.complex128)
+    light, dark = torch.ones(2, 4, 4, 4, dtype=torch.complex128), torch.zeros(2, 4, 4, 4, dtype=torch.complex128)
     assert float(losses.phasor_loss(dark, dark, phase_only=True)) == 0
     assert float(losses.phasor_loss(dark, light, phase_only=True)) == pytest.approx(1, rel=1e-5)
     x = dark.clone().requires_grad_()
@@ -112,7 +112,7 @@ def test_errors():
         losses.transient_phasors(torch.zeros(1, 60, 2, 2), AXIS, BAND)
     with pytest.raises(UnitError, match="TimeAxis and a FrequencyAxis"):
         losses.transient_phasors(torch.zeros(1, 64, 2, 2), AXIS, [1.0])
-    with pytest.raises(ShapeError, match="dimension -3"):
+    with pytest.raises(ShapeError, match="dim="):
         losses.transient_phasors(torch.zeros(64, 2), AXIS, BAND)
     with pytest.raises(UnitError, match="complex phasors"):
         losses.phasor_loss(torch.zeros(3), torch.zeros(3))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ShapeError
+from torchtransient.errors import DeviceError, ShapeError, UnitError
 from torchtransient.losses.surface_distance import point_triangle_distance
 
 
@@ -48,6 +48,81 @@ def test_a_wider_square():
     assert float(far) == pytest.approx(float(mean), rel=2e-3)
 
 
+TRIANGLE, FACES = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]])
+LIFT = torch.tensor([0.0, 0.0, 0.01])
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-19, 1e-12, 1e-9, 1e-7, 1e-6, 1.0, 1e6, 1e19, 1e30])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_unit(unit, dtype):
+    """Squares, areas and normals of small things are no smaller than those of large ones."""
+    low, high = (unit * t.to(dtype) for t in (TRIANGLE, TRIANGLE + LIFT))
+    low.requires_grad_()
+    found = tt.losses.surface_distance(low, FACES, high, FACES)
+    assert float(found.detach()) / unit == pytest.approx(0.01, rel=1e-5)
+    (slope,) = torch.autograd.grad(found, low)
+    # lifted towards the other as a whole, it comes as much nearer
+    assert float(slope[:, 2].sum()) == pytest.approx(-1.0, rel=1e-5)
+    far = point_triangle_distance(unit * torch.tensor([[0.2, 0.2, 3.0]], dtype=dtype), low.detach()[None])
+    assert float(far) / unit == pytest.approx(3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("edge", [1e-8, 1e-4])
+@pytest.mark.parametrize("thin", [1.0, 1e-4])
+def test_small_and_thin_triangles_among_others(edge, thin):
+    """The point above the middle of one, nearer to it than to its edges."""
+    middle = torch.tensor([1 / 3, thin / 3, 0.0], dtype=torch.float64) * edge
+    small = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, thin, 0]], dtype=torch.float64) * edge
+    triangles = torch.stack([small - middle, TRIANGLE.double() + 1.0])
+    point = torch.tensor([[0.0, 0.0, 0.3 * thin * edge]], dtype=torch.float64)
+    found = point_triangle_distance(point, triangles)
+    assert float(found) == pytest.approx(0.3 * thin * edge, rel=1e-6)
+
+
+def test_against_dense_points():
+    """Random triangles of all sizes: the distance to the nearest of 400,000 points of each, which is never less."""
+    generator = torch.Generator().manual_seed(2)
+    triangles = torch.randn(6, 3, 3, dtype=torch.float64, generator=generator)
+    triangles *= torch.tensor([1.0, 1e-3, 1e-6, 1.0, 0.1, 1e-9], dtype=torch.float64).reshape(6, 1, 1)
+    points = torch.randn(7, 3, dtype=torch.float64, generator=generator)
+    u, v = (t.flatten() for t in torch.meshgrid(*[torch.linspace(0, 1, 401, dtype=torch.float64)] * 2, indexing="ij"))
+    weights = torch.stack([1 - u, u * (1 - v), u * v], 1)
+    for triangle in triangles:
+        found = point_triangle_distance(points, triangle[None])
+        dense = torch.cdist(points, weights @ triangle).amin(1)
+        assert bool((found <= dense + 1e-12).all()) and bool((dense - found < 1e-4).all())
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+def test_autocast_and_half_precision(half):
+    other = 1.1 * TRIANGLE + torch.tensor([0.0, 0.0, 0.5])
+    wanted = tt.losses.surface_distance(TRIANGLE + 0.123, FACES, other, FACES)
+    with torch.autocast("cpu", dtype=half):
+        found = tt.losses.surface_distance(TRIANGLE + 0.123, FACES, other, FACES)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    coarse = tt.losses.surface_distance(TRIANGLE.to(half), FACES, other, FACES)
+    assert coarse.dtype == torch.float32
+    torch.testing.assert_close(coarse, tt.losses.surface_distance(TRIANGLE, FACES, other, FACES))
+    double = tt.losses.surface_distance(TRIANGLE, FACES, other.double(), FACES.to(torch.uint8))
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), coarse)
+
+
+def test_what_is_no_number_stays_none():
+    nowhere = TRIANGLE.clone()
+    nowhere[1, 1] = math.nan
+    assert tt.losses.surface_distance(nowhere, FACES, TRIANGLE, FACES).isnan()
+    assert tt.losses.surface_distance(TRIANGLE, FACES, nowhere, FACES).isnan()
+    assert point_triangle_distance(torch.tensor([[math.nan, 0.0, 0.0]]), TRIANGLE[None]).isnan()
+
+
+def test_in_vmap():
+    many = TRIANGLE + torch.rand(3, 3, 3, generator=torch.Generator().manual_seed(1))
+    found = torch.vmap(lambda v: tt.losses.surface_distance(v, FACES, TRIANGLE, FACES))(many)
+    wanted = [tt.losses.surface_distance(v, FACES, TRIANGLE, FACES) for v in many]
+    torch.testing.assert_close(found, torch.stack(wanted))
+
+
 def test_slopes():
     vertices, faces = square(1)
     generator = torch.Generator().manual_seed(3)
@@ -71,3 +146,22 @@ def test_refusals():
         tt.losses.surface_distance(vertices, faces[:0], vertices, faces)
     with pytest.raises(ShapeError, match="cells"):
         tt.losses.surface_distance(vertices, faces, vertices, faces, 0)
+    with pytest.raises(ShapeError, match="cells"):
+        tt.losses.surface_distance(vertices, faces, vertices, faces, 2.5)
+    for wrong in (faces - 1, faces + 2):
+        with pytest.raises(ShapeError, match="from 0 to 3"):
+            tt.losses.surface_distance(vertices, faces, vertices, wrong)
+    for wrong in (faces.double(), faces > 0):
+        with pytest.raises(UnitError, match="others: expected faces of whole numbers"):
+            tt.losses.surface_distance(vertices, faces, vertices, wrong)
+    with pytest.raises(UnitError, match="floating"):
+        tt.losses.surface_distance(vertices.long(), faces, vertices.long(), faces)
+    with pytest.raises(UnitError, match="real"):
+        tt.losses.surface_distance(vertices + 0j, faces, vertices, faces)
+    with pytest.raises(ShapeError, match="list"):
+        tt.losses.surface_distance(vertices.tolist(), faces, vertices, faces)
+    with pytest.raises(ShapeError, match="with an area"):
+        tt.losses.surface_distance(vertices, faces, 0 * vertices, faces)
+    for wrong in ((vertices.to("meta"), faces.to("meta")), (vertices, faces.to("meta"))):
+        with pytest.raises(DeviceError, match="one device"):
+            tt.losses.surface_distance(vertices, faces, *wrong)

@@ -54,15 +54,21 @@ class LossCase:
     pair: bool = True
     mapped: bool = True  # torch.vmap
     floors_detached: bool = False  # the scale of an item goes in without gradient
+    dim: int | None = None  # where time is, of losses that want to know it
 
     def tensors(self, seed=0, dtype=torch.float64):
         generator = torch.Generator().manual_seed(seed)
         x = self.draw(self.input_shape, generator, dtype)
         return x, (self.draw_target or self.draw)(self.target_shape or self.input_shape, generator, dtype)
 
-    def __call__(self, input, target, mask=None, reduction="mean"):
+    def __call__(self, input, target, mask=None, reduction="mean", **more):
         arguments = (input, target) if self.pair else (input,)
-        return self.function(*arguments, **self.options, mask=mask, reduction=reduction)
+        return self.function(*arguments, **self.options, **more, mask=mask, reduction=reduction)
+
+    @property
+    def said(self):
+        """The dimension of time, for tensors that do not show it by their number of dimensions."""
+        return {} if self.dim is None else {"dim": self.dim}
 
     def as_module(self, input, target, mask=None, reduction="mean"):
         module = self.module(**self.options, reduction=reduction)
@@ -76,20 +82,21 @@ def _measurement(name, **options):
     return LossCase(
         name, losses.measurement_consistency, losses.MeasurementConsistency, {"operator": operator, **options},
         input_shape=VOLUME, target_shape=(2, 1, BINS, 5, 7), crop=PIXELS, symmetric=False, zero_at_equality=False,
+        dim=-3,
     )  # fmt: skip
 
 
 def _phasors(name, **options):
     return LossCase(
         name, losses.transient_phasor_loss, losses.TransientPhasorLoss, {"axis": AXIS, "frequencies": BAND, **options},
-        crop=PIXELS, floors_detached=options == {"phase_only": True},
+        crop=PIXELS, floors_detached=options == {"phase_only": True}, dim=-3,
     )  # fmt: skip
 
 
 def _likelihood(name, function, module, **options):
     return LossCase(
         name, function, module, {"floor": 1e-3, **options}, draw_target=counts, crop=PIXELS, symmetric=False,
-        zero_at_equality=False, mapped=False,
+        zero_at_equality=False, mapped=False, dim=-3,
     )  # fmt: skip
 
 
@@ -103,18 +110,19 @@ CASES = [
     _measurement("measurement, roots", compare=losses.root_loss),
     LossCase("phasor", losses.phasor_loss, losses.PhasorLoss, draw=complex_numbers),
     LossCase("phasor, phase only", losses.phasor_loss, losses.PhasorLoss, {"phase_only": True, "floor": 0.1},
-             draw=complex_numbers),
+             draw=complex_numbers, dim=-3),
     _phasors("transient phasor"),
     _phasors("transient phasor, phase only", phase_only=True, floor=0.1),
     _phasors("transient phasor, phase only, own floor", phase_only=True),
-    LossCase("Wasserstein", losses.wasserstein_loss, losses.WassersteinLoss, {**WIDTH, "floor": 1e-2}),
-    LossCase("Wasserstein, own floor", losses.wasserstein_loss, losses.WassersteinLoss, WIDTH, floors_detached=True),
+    LossCase("Wasserstein", losses.wasserstein_loss, losses.WassersteinLoss, {**WIDTH, "floor": 1e-2}, dim=-3),
+    LossCase("Wasserstein, own floor", losses.wasserstein_loss, losses.WassersteinLoss, WIDTH, floors_detached=True,
+             dim=-3),
     LossCase("Wasserstein, unbalanced", losses.wasserstein_loss, losses.WassersteinLoss,
-             {**WIDTH, "creation_cost_opl": 0.3}),
+             {**WIDTH, "creation_cost_opl": 0.3}, dim=-3),
     LossCase("Anscombe", losses.root_loss, losses.RootLoss),
-    LossCase("log ratio", losses.log_ratio_loss, losses.LogRatioLoss, {"background": 0.05}),
+    LossCase("log ratio", losses.log_ratio_loss, losses.LogRatioLoss, {"background": 0.05}, dim=-3),
     LossCase("log ratio, own background", losses.log_ratio_loss, losses.LogRatioLoss, symmetric=False,
-             floors_detached=True),
+             floors_detached=True, dim=-3),
     LossCase("total variation", losses.total_variation, losses.TotalVariation, {"smoothing": 0.01}, pair=False,
              zero_at_equality=False, **VOLUMES),
     LossCase("total variation, along the axes", losses.total_variation, losses.TotalVariation,
@@ -130,6 +138,7 @@ CASES = [
     LossCase("SSIM of projections", losses.projection_ssim_loss, losses.ProjectionSSIMLoss,
              {"window": 3, "value_range": 1.1}, crop=None, **VOLUMES),
     _likelihood("Poisson", losses.poisson_loss, losses.PoissonLoss),
+    _likelihood("Poisson, own floor", losses.poisson_loss, losses.PoissonLoss, floor=None),
     _likelihood("first photon", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES),
     _likelihood("first photon, dead time", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES,
                 dead_bins=2.0),

@@ -7,17 +7,17 @@ that do not count as empty in both, and leaves out the pixels that have no bin l
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from torchtransient.errors import DeviceError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.quantities import finite, shown
 
 Reduction = Literal["none", "sum", "mean"]
-
-# An item of a batch: its C, T, Y, X.
-ITEM_DIMS = 4
 
 
 def check_reduction(reduction: Reduction, where: str) -> None:
@@ -25,43 +25,136 @@ def check_reduction(reduction: Reduction, where: str) -> None:
         raise ShapeError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {reduction!r}.")
 
 
-def check_pair(input: Tensor, target: Tensor, where: str, *, complex_too: bool = False) -> tuple[Tensor, Tensor]:
-    """Both in their common dtype: half precision in float32, as networks give it under autocast, integer counts as the
-    floats of the other. Raises ShapeError for no tensors or two shapes, UnitError for other numbers, DeviceError.
+def check_pair(
+    input: Tensor, target: Tensor, where: str, *, complex_too: bool = False, names: str = "input and target"
+) -> tuple[Tensor, Tensor]:
+    """Both in their common dtype (`working_dtype`). Raises ShapeError for no tensors or two shapes, UnitError for other
+    numbers, DeviceError.
     """
-    if not isinstance(input, Tensor) or not isinstance(target, Tensor):
-        raise ShapeError(f"{where}: expected two tensors, got {type(input).__name__} and {type(target).__name__}.")
+    check_dense((input, target), where)
     if input.shape != target.shape:
         raise ShapeError(
-            f"{where}: expected input and target of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
+            f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
         )
-    if input.device != target.device:
-        raise DeviceError(
-            f"{where}: expected input and target on one device, got {input.device} and {target.device}. Move one of "
-            "them with .to(device)."
-        )
-    dtype = working_dtype(torch.promote_types(input.dtype, target.dtype), where, complex_too=complex_too)
+    check_device(input, target, where, names)
+    dtype = working_dtype((input, target), where, complex_too=complex_too)
     return input.to(dtype), target.to(dtype)
 
 
-def working_dtype(dtype: torch.dtype, where: str, *, complex_too: bool = False) -> torch.dtype:
-    """float32 for half precision, the dtype itself for others that are floating. Raises UnitError."""
+def check_dense(tensors: tuple[object, ...], where: str) -> None:
+    """Raises ShapeError unless all are tensors, and none a sparse one."""
+    kinds = [
+        str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
+    ]
+    if not all(isinstance(x, Tensor) and x.layout == torch.strided for x in tensors):
+        number = {1: "a dense tensor", 2: "two dense tensors"}.get(len(tensors), "dense tensors")
+        raise ShapeError(f"{where}: expected {number}, got {' and '.join(kinds)}.")
+
+
+def check_device(x: Tensor, other: Tensor, where: str, names: str) -> None:
+    """Raises DeviceError for two tensors on two devices."""
+    if x.device != other.device:
+        raise DeviceError(
+            f"{where}: expected {names} on one device, got {x.device} and {other.device}. Move one of them with "
+            ".to(device)."
+        )
+
+
+def working_dtype(tensors: tuple[Tensor, ...], where: str, *, complex_too: bool = False) -> torch.dtype:
+    """The dtype in which tensors are compared: that of the most precise floating one, float32 at least; networks give
+    half precision under autocast. Whole numbers and truth values, counts and frames of detectors, take that of the
+    others. Raises UnitError.
+    """
+    dtypes = [x.dtype for x in tensors if x.dtype.is_floating_point or x.dtype.is_complex]
+    if not dtypes:
+        raise UnitError(f"{where}: expected a floating dtype, got {tensors[0].dtype}. Convert one with .float().")
+    dtype = functools.reduce(torch.promote_types, map(_single, dtypes))
+    if dtype.is_complex and not complex_too:
+        raise UnitError(f"{where}: expected real numbers, got {dtype}. Give the modulus, or use phasor_loss.")
+    return dtype
+
+
+def _single(dtype: torch.dtype) -> torch.dtype:
     if dtype.is_complex:
-        if not complex_too:
-            raise UnitError(f"{where}: expected real numbers, got {dtype}. Give the modulus, or use phasor_loss.")
-        return torch.complex64 if dtype == torch.complex32 else dtype
-    if not dtype.is_floating_point:
-        raise UnitError(f"{where}: expected a floating dtype, got {dtype}. Convert one of the two with .float().")
-    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
+        return torch.complex64 if dtype.itemsize < 8 else dtype
+    return torch.float32 if dtype.itemsize < 4 else dtype
 
 
-def check_mask(mask: Tensor | None, shape: torch.Size, where: str) -> Tensor | None:
-    """The mask, expanded to `shape`. Raises ShapeError unless it broadcasts to it, UnitError unless it is boolean."""
+def check_level(
+    name: str, value: Tensor | float, like: Tensor, where: str, *, zero: bool = False, square: bool = False
+) -> Tensor:
+    """A floor, a background or a width that goes with `like`, in its precision: a number, or a tensor that broadcasts
+    to it. Greater than zero (`zero`: or zero), and one that the precision holds (`square`: its square, too).
+
+    Raises UnitError for other numbers, ShapeError for a tensor that does not fit, DeviceError. Values of tensors are
+    not looked at in `torch.vmap` over them.
+    """
+    dtype = like.real.dtype if like.is_complex() else like.dtype
+    if isinstance(value, Tensor):
+        if value.is_complex() or value.dtype == torch.bool:
+            raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
+        if value.ndim:
+            check_device(value, like, where, f"{name} and tensors")
+        try:
+            value.expand(like.shape)
+        except RuntimeError:
+            raise ShapeError(
+                f"{where}: expected {name} to be a number or a tensor that broadcasts to {tuple(like.shape)}, got "
+                f"{tuple(value.shape)}."
+            ) from None
+        level = value.detach()
+    else:
+        level = torch.tensor(finite(f"{where}: {name}", value), dtype=torch.float64)
+    limits = torch.finfo(dtype)
+    least, most = (math.sqrt(limits.tiny), math.sqrt(limits.max)) if square else (limits.tiny, limits.max)
+    wide = level if level.dtype == torch.float64 else level.to(dtype)
+    fits = (wide >= least) & (wide <= most)
+    if not holds(fits | (wide == 0) if zero else fits):
+        got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
+        raise UnitError(
+            f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero that {dtype} holds "
+            f"({least:.1g} to {most:.1g}), got {got}."
+        )
+    return (value if isinstance(value, Tensor) else level).to(like.device, dtype)
+
+
+def holds(condition: Tensor) -> bool:
+    """Whether it is true everywhere, as far as it can be looked at: not in `torch.vmap`, not without memory."""
+    if condition.is_meta:
+        return True
+    try:
+        return bool(condition.all())
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return True
+
+
+def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
+    """A number of things, 1 or more; 3.0 is three. Raises UnitError for no number, `error` for others."""
+    number = math.nan if isinstance(value, bool) else finite(f"{where}: {name}", value)
+    if not number >= 1 or number != int(number):
+        raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
+    return int(number)
+
+
+def check_function(name: str, value: object, where: str) -> None:
+    if not callable(value):
+        raise ShapeError(f"{where}: expected {name} to be a function of tensors, got {shown(value)}.")
+
+
+def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
+    """The mask, expanded to the shape of `like`. Raises ShapeError unless it broadcasts to it, UnitError unless it is
+    boolean, DeviceError.
+    """
+    shape, device = like.shape, like.device
     if mask is None:
         return None
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         kind = mask.dtype if isinstance(mask, Tensor) else type(mask).__name__
         raise UnitError(f"{where}: expected a mask of truth values, True where it counts, got {kind}. Use mask > 0.")
+    if mask.device != device:
+        raise DeviceError(f"{where}: expected the mask on {device}, got one on {mask.device}. Use mask.to(device).")
     try:
         return mask.expand(shape)
     except RuntimeError:
@@ -85,20 +178,23 @@ def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None 
         return value
     if reduction == "sum":
         return value.sum()
-    return value.mean() if mask is None else value.sum() / mask.sum().clamp_min(1)
+    if mask is None:
+        return value.mean() if value.numel() else value.sum()
+    return value.sum() / mask.sum().clamp_min(1)
 
 
-def item_mean(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean of `|x|` over what counts of each item (its last four dimensions), without gradient; broadcasts to `x`."""
+def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
+    """Mean of `|x|` over what counts of each item (`layouts.item_dims`), without gradient; broadcasts to `x`."""
     size = counted(x.detach(), mask).abs()
-    dims = tuple(range(-min(ITEM_DIMS, size.ndim), 0))
+    if not dims:  # torch takes no dimensions for all of them
+        return size
     if mask is None:
         return size.mean(dims, keepdim=True) if size.numel() else size.sum(dims, keepdim=True)
     return size.sum(dims, keepdim=True) / mask.sum(dims, keepdim=True).clamp_min(1)
 
 
-def item_scale(x: Tensor, other: Tensor, mask: Tensor | None = None) -> Tensor:
+def item_scale(x: Tensor, other: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
     """`item_mean` of `x`; that of `other` where `x` is dark altogether, and 1 where both are."""
-    own, others = item_mean(x, mask), item_mean(other, mask)
+    own, others = item_mean(x, dims, mask), item_mean(other, dims, mask)
     scale = torch.where(own > 0, own, others)
     return torch.where(scale > 0, scale, torch.ones_like(scale))

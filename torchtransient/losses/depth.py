@@ -17,7 +17,7 @@ def depth_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, red
     where = "depth_loss"
     input, target = check_pair(input, target, where)
     surface = torch.isfinite(target)
-    given = check_mask(mask, target.shape, where)
+    given = check_mask(mask, target, where)
     mask = surface if given is None else given & surface
     return reduce((counted(input, mask) - counted(target, mask)).abs(), reduction, where, mask)
 

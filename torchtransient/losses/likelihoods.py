@@ -4,7 +4,9 @@ All take rates or means (..., C, T, H, W) and measurements of the same shape, an
 zero counts and in empty bins. Where the model says "impossible" (a count where the mean is 0) a floor keeps them so:
 `floor`, in the unit of the mean, is added to it. Counts below 0 (those of a normal surrogate) enter the same formulas,
 which keeps the gradient unbiased. Terms that do not depend on the mean are left out unless `constant`.
-Half precision is computed, and the loss returned, in float32. `mask`: truth values that broadcast to the tensors, True
+Counts may be whole numbers, truth values of frames, or half precision; the loss is computed and returned in the
+precision of the more precise of the two, float32 at least. `dim`: where time is, which also says over what the average
+is (`layouts.py`). `mask`: truth values that broadcast to the tensors, True
 counts (`comparison.py`). First-photon and free-running detectors are dead for some time after every detection: a bin
 that does not count still takes cycles from those behind it, only pixels without any bin that counts are not looked at.
 `poisson_loss(input, target)` and `first_photon_loss` are the same with the model first, as torch and the other losses.
@@ -17,9 +19,21 @@ import math
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import Reduction, check_mask, counted, item_mean
+from torchtransient.errors import UnitError
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_dense,
+    check_level,
+    check_mask,
+    check_pair,
+    check_whole,
+    counted,
+    item_mean,
+    working_dtype,
+)
 from torchtransient.losses.comparison import reduce as _reduce
+from torchtransient.losses.layouts import as_columns, bins_dim, item_dims
+from torchtransient.quantities import positive
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.spad import first_photon_log_prob
 
@@ -28,15 +42,12 @@ _TIME = -3
 _RELATIVE_FLOOR = 1e-3
 
 
-def _check(measured: Tensor, model: Tensor, where: str) -> None:
-    if not isinstance(measured, Tensor) or not isinstance(model, Tensor):
-        raise ShapeError(f"{where}: expected two tensors, got {type(measured).__name__} and {type(model).__name__}.")
-    if measured.shape != model.shape:
-        raise ShapeError(
-            f"{where}: expected counts and model of one shape, got {tuple(measured.shape)} and {tuple(model.shape)}."
-        )
+def _check(measured: Tensor, model: Tensor, where: str) -> tuple[Tensor, Tensor]:
+    """Both in their common dtype. Raises ShapeError, DeviceError; UnitError for other numbers and whole models."""
+    pair = check_pair(measured, model, where, names="counts and model")
     if not model.is_floating_point():
-        raise UnitError(f"{where}: expected a floating dtype, got {model.dtype}.")
+        raise UnitError(f"{where}: expected a model of a floating dtype, got {model.dtype}. Use model.float().")
+    return pair
 
 
 def _check_rates(model: Tensor, where: str) -> None:
@@ -45,28 +56,44 @@ def _check_rates(model: Tensor, where: str) -> None:
         raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
 
 
-def _single(model: Tensor) -> Tensor:
-    """Half precision, as networks give it under autocast, in float32: squares of counts exceed float16."""
-    return model.float() if model.dtype in (torch.float16, torch.bfloat16) else model
+def _exact(measured: Tensor, mask: Tensor | None, dim: int) -> Tensor:
+    """Counts in double precision, 0 in pixels of which no bin counts: detectors that are dead need sums of them."""
+    counts = measured.to(torch.float64)
+    return counts if mask is None else counted(counts, mask.any(dim, keepdim=True))
 
 
-def _counted_pixels(x: Tensor, mask: Tensor | None) -> Tensor:
-    """`x`, and 0 in pixels of which no bin counts."""
-    return x if mask is None else counted(x, mask.any(_TIME, keepdim=True))
+def _floored(
+    model: Tensor, floor: Tensor | float | None, dim: int | None, mask: Tensor | None, where: str
+) -> Tensor:
+    if floor is None:
+        return model + _relative_floor(model, item_dims(model, dim, where, " or floor="), mask)
+    return model + check_level("floor", floor, model, where, zero=True)
 
 
-def relative_floor(model: Tensor, share: float = _RELATIVE_FLOOR, mask: Tensor | None = None) -> Tensor:
+def relative_floor(
+    model: Tensor, share: float = _RELATIVE_FLOOR, mask: Tensor | None = None, dim: int | None = None
+) -> Tensor:
     """`share` of the mean of each item (its C, T, H, W) of the model, without gradient: a floor that knows the scale.
 
     Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one; an
-    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite. `mask`:
-    means are over what counts.
+    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite. `dim`:
+    where time is, which says what is an item (`losses.layouts`). `mask`: means are over what counts.
     """
-    mask = check_mask(mask, model.shape, "relative_floor")
+    where = "relative_floor"
+    check_dense((model,), where)
+    model = model.to(working_dtype((model,), where))
+    mask = check_mask(mask, model, where)
+    part = check_level("share", share, model.new_empty(()), where)
+    return _relative_floor(model, item_dims(model, dim, where), mask, part)
+
+
+def _relative_floor(
+    model: Tensor, dims: tuple[int, ...], mask: Tensor | None, share: Tensor | float = _RELATIVE_FLOOR
+) -> Tensor:
     size = counted(model.detach(), mask).abs()
     number = max(1, size.numel()) if mask is None else mask.sum().clamp_min(1)
     whole = size.sum() / number
-    item = item_mean(model, mask) if size.ndim > 4 else whole
+    item = item_mean(model, dims, mask) if len(dims) < model.ndim else whole
     return (share * torch.where(item > 0, item, whole)).clamp_min(torch.finfo(model.dtype).tiny)
 
 
@@ -76,6 +103,7 @@ def poisson_nll(
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -85,11 +113,11 @@ def poisson_nll(
     likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. Raises
     ShapeError for different shapes, UnitError for negative means.
     """
-    _check(counts, mean, "poisson_nll")
-    mask = check_mask(mask, mean.shape, "poisson_nll")
-    counts, mean = counted(counts, mask), counted(_single(mean), mask, 1.0)
+    counts, mean = _check(counts, mean, "poisson_nll")
+    mask = check_mask(mask, mean, "poisson_nll")
+    counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
     _check_rates(mean, "poisson_nll")
-    m = mean + (relative_floor(mean, mask=mask) if floor is None else floor)
+    m = _floored(mean, floor, dim, mask, "poisson_nll")
     hit = counts != 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(hit, m, torch.ones_like(m)).log()
@@ -107,6 +135,7 @@ def first_photon_nll(
     dead_bins: float | None = None,
     floor: Tensor | float | None = None,
     constant: bool = False,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -117,13 +146,17 @@ def first_photon_nll(
     dead; `dead_bins`: several detections per cycle (`SynchronousSPAD`). `floor` as in `poisson_nll`. Raises ShapeError;
     UnitError for negative rates or more counts than cycles.
     """
-    _check(counts, rate, "first_photon_nll")
-    mask = check_mask(mask, rate.shape, "first_photon_nll")
-    counts, rate = _counted_pixels(counts, mask), counted(_single(rate), mask, 1.0)
-    _check_rates(rate, "first_photon_nll")
-    r = rate + (relative_floor(rate, mask=mask) if floor is None else floor)
-    value = -first_photon_log_prob(counts, r, cycles, dead_bins, constant=constant)
-    return _reduce(value, reduction, "first_photon_nll", mask)
+    where = "first_photon_nll"
+    measured, rate = counts, _check(counts, rate, where)[1]
+    number = check_whole("cycles", cycles, where, UnitError)
+    dead = None if dead_bins is None else positive(f"{where}: dead_bins", dead_bins)
+    dim = bins_dim(rate, dim, where)
+    mask = check_mask(mask, rate, where)
+    rate = counted(rate, mask, 1.0)
+    _check_rates(rate, where)
+    n, r = (as_columns(x, dim) for x in (_exact(measured, mask, dim), _floored(rate, floor, dim, mask, where)))
+    value = -first_photon_log_prob(n, r, number, dead, constant=constant).reshape(rate.shape)
+    return _reduce(value, reduction, where, mask)
 
 
 def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
@@ -156,6 +189,7 @@ def free_running_nll(
     dead_bins: float,
     *,
     floor: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -166,22 +200,25 @@ def free_running_nll(
     best rate, r = n/armed, is second order in the counts of a bin per period. Its least is where Rapp et al. and Gupta
     et al. (see `sensing.free_running`) put it. Arguments as in `first_photon_nll`.
     """
-    _check(counts, rate, "free_running_nll")
-    mask = check_mask(mask, rate.shape, "free_running_nll")
-    rate = counted(_single(rate), mask, 1.0)
-    _check_rates(rate, "free_running_nll")
-    n = _counted_pixels(counts, mask).to(torch.float64)
+    where = "free_running_nll"
+    measured, rate = counts, _check(counts, rate, where)[1]
+    periods, dead_bins = check_whole("periods", periods, where, UnitError), positive(f"{where}: dead_bins", dead_bins)
+    dim = bins_dim(rate, dim, where)
+    mask = check_mask(mask, rate, where)
+    rate = counted(rate, mask, 1.0)
+    _check_rates(rate, where)
+    n = as_columns(_exact(measured, mask, dim), dim)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the places inside a bin leave an uncertainty of about the square root of the counts
     if bool((armed < -(2 + 6 * n.sum(_TIME, keepdim=True).sqrt())).any()):
         raise UnitError(
-            f"free_running_nll: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
+            f"{where}: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
             "got more. Check periods and dead time."
         )
-    r = (rate + (relative_floor(rate, mask=mask) if floor is None else floor)).to(torch.float64)
+    r = as_columns(_floored(rate, floor, dim, mask, where), dim).to(torch.float64)
     hit = n != 0
     value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
-    return _reduce(value.to(rate.dtype), reduction, "free_running_nll", mask)
+    return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
 
 
 def read_noise_nll(
@@ -199,12 +236,11 @@ def read_noise_nll(
     (y - m)^2 / (2 v) + log(v)/2 (+ log(2 pi)/2 with `constant`), v = read_noise^2 + max(m, 0) with `shot_noise`, in
     electrons. `read_noise` > 0, a number or a tensor that broadcasts; differentiable in it and in `mean`.
     """
-    _check(measured, mean, "read_noise_nll")
-    mask = check_mask(mask, mean.shape, "read_noise_nll")
-    measured, mean = counted(_single(measured), mask), counted(_single(mean), mask)
-    sigma = torch.as_tensor(read_noise, device=mean.device).to(mean.dtype)
-    if not bool((sigma.detach() > 0).all()):
-        raise UnitError("read_noise_nll: expected read_noise > 0 electrons: without it an empty pixel has no width.")
+    measured, mean = _check(measured, mean, "read_noise_nll")
+    mask = check_mask(mask, mean, "read_noise_nll")
+    measured, mean = counted(measured, mask), counted(mean, mask)
+    # without it an empty pixel has no width
+    sigma = check_level("read_noise", read_noise, mean, "read_noise_nll", square=True)
     variance = sigma**2 + (mean.clamp_min(0) if shot_noise else torch.zeros_like(mean))
     value = (measured - mean) ** 2 / (2 * variance) + 0.5 * variance.log()
     if constant:
@@ -217,11 +253,12 @@ def poisson_loss(
     target: Tensor,
     *,
     floor: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts."""
-    return poisson_nll(target, input, floor=floor, mask=mask, reduction=reduction)
+    return poisson_nll(target, input, floor=floor, dim=dim, mask=mask, reduction=reduction)
 
 
 def first_photon_loss(
@@ -231,36 +268,51 @@ def first_photon_loss(
     *,
     dead_bins: float | None = None,
     floor: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """`first_photon_nll(target, input, cycles)`: a model's rates per cycle and bin against a histogram of counts."""
-    return first_photon_nll(target, input, cycles, dead_bins=dead_bins, floor=floor, mask=mask, reduction=reduction)
+    return first_photon_nll(
+        target, input, cycles, dead_bins=dead_bins, floor=floor, dim=dim, mask=mask, reduction=reduction
+    )
 
 
 class PoissonNLL(nn.Module):
     """`poisson_nll(counts, mean)` with its options held."""
 
-    def __init__(self, floor: float | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
-        self.floor, self.reduction = floor, reduction
+        self.floor, self.dim, self.reduction = floor, dim, reduction
 
     def forward(self, counts: Tensor, mean: Tensor, mask: Tensor | None = None) -> Tensor:
-        return poisson_nll(counts, mean, floor=self.floor, mask=mask, reduction=self.reduction)
+        return poisson_nll(counts, mean, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
 
 
 class FirstPhotonNLL(nn.Module):
     """`first_photon_nll(counts, rate, cycles)` with its options held."""
 
     def __init__(
-        self, cycles: int, dead_bins: float | None = None, floor: float | None = None, reduction: Reduction = "mean"
+        self,
+        cycles: int,
+        dead_bins: float | None = None,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        self.cycles, self.dead_bins, self.floor, self.reduction = cycles, dead_bins, floor, reduction
+        self.cycles, self.dead_bins, self.floor = cycles, dead_bins, floor
+        self.dim, self.reduction = dim, reduction
 
     def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
-            counts, rate, self.cycles, dead_bins=self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
+            counts, rate,
+            self.cycles,
+            dead_bins=self.dead_bins,
+            floor=self.floor,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
         )
 
 
@@ -268,14 +320,27 @@ class FreeRunningNLL(nn.Module):
     """`free_running_nll(counts, rate, periods, dead_bins)` with its options held."""
 
     def __init__(
-        self, periods: int, dead_bins: float, floor: float | None = None, reduction: Reduction = "mean"
+        self,
+        periods: int,
+        dead_bins: float,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        self.periods, self.dead_bins, self.floor, self.reduction = periods, dead_bins, floor, reduction
+        self.periods, self.dead_bins, self.floor = periods, dead_bins, floor
+        self.dim, self.reduction = dim, reduction
 
     def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
         return free_running_nll(
-            counts, rate, self.periods, self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
+            counts,
+            rate,
+            self.periods,
+            self.dead_bins,
+            floor=self.floor,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
         )
 
 
@@ -295,24 +360,36 @@ class ReadNoiseNLL(nn.Module):
 class PoissonLoss(nn.Module):
     """`poisson_loss(input, target)` with its options held."""
 
-    def __init__(self, floor: float | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
-        self.floor, self.reduction = floor, reduction
+        self.floor, self.dim, self.reduction = floor, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-        return poisson_loss(input, target, floor=self.floor, mask=mask, reduction=self.reduction)
+        return poisson_loss(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
 
 
 class FirstPhotonLoss(nn.Module):
     """`first_photon_loss(input, target, cycles)` with its options held."""
 
     def __init__(
-        self, cycles: int, dead_bins: float | None = None, floor: float | None = None, reduction: Reduction = "mean"
+        self,
+        cycles: int,
+        dead_bins: float | None = None,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        self.cycles, self.dead_bins, self.floor, self.reduction = cycles, dead_bins, floor, reduction
+        self.cycles, self.dead_bins, self.floor = cycles, dead_bins, floor
+        self.dim, self.reduction = dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return first_photon_loss(
-            input, target, self.cycles, dead_bins=self.dead_bins, floor=self.floor, mask=mask, reduction=self.reduction
+            input, target,
+            self.cycles,
+            dead_bins=self.dead_bins,
+            floor=self.floor,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
         )

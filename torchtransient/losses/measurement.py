@@ -9,7 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import ITEM_DIMS, Reduction, check_mask, check_pair, counted, reduce
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_dense,
+    check_function,
+    check_mask,
+    check_pair,
+    counted,
+    reduce,
+)
+from torchtransient.losses.layouts import item_dims
 
 
 class PairLoss(Protocol):
@@ -21,7 +30,7 @@ class PairLoss(Protocol):
 def squared_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
     """`|input - target|^2` of each element, real or complex, any shape. Symmetric. Raises ShapeError, UnitError."""
     input, target = check_pair(input, target, "squared_loss", complex_too=True)
-    mask = check_mask(mask, input.shape, "squared_loss")
+    mask = check_mask(mask, input, "squared_loss")
     return reduce(_power(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
 
 
@@ -32,7 +41,7 @@ def measurement_consistency(
     *,
     compare: PairLoss = squared_loss,
     scale_invariant: bool = False,
-    item_dims: int = ITEM_DIMS,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -40,32 +49,34 @@ def measurement_consistency(
 
     `operator` is `A`: a `LinearOperator` of `tt.nlos` or any function from `volume` (..., C, Z, Y, X) to the shape of
     `measured` (..., C, T, Y, X); `compare` any loss (input, target) with `mask` and `reduction`, `mask` of the
-    measurement. With `scale_invariant` A volume is first multiplied by the real number that brings each item (the last
-    `item_dims` dimensions) nearest to the measurement in least squares: powers of lasers and albedos are seldom
-    calibrated. That number may be negative, so keep volumes non-negative where their sign matters; it is 1 for a volume
-    that is dark altogether, whose gradient then leads out of the dark. Not symmetric; zero where A volume is the
-    measurement. Raises ShapeError where A volume is no tensor of the measurement's shape.
+    measurement. With `scale_invariant` A volume is first multiplied by the real number that brings each item nearest to
+    the measurement in least squares: powers of lasers and albedos are seldom calibrated. `dim`, where time is in the
+    measurement, then says what is an item (`losses.layouts`). That number may be negative, so keep volumes non-negative
+    where their sign matters; it is 1 for a volume that is dark altogether, whose gradient then leads out of the dark.
+    Not symmetric; zero where A volume is the measurement. Raises ShapeError where A volume is no tensor of the
+    measurement's shape.
     """
     where = "measurement_consistency"
+    check_dense((volume, measured), where)
+    check_function("the operator", operator, where)
+    check_function("compare", compare, where)
     prediction = operator(volume)
-    if not isinstance(prediction, Tensor) or not isinstance(measured, Tensor) or prediction.shape != measured.shape:
+    if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
         got = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
-        wanted = tuple(measured.shape) if isinstance(measured, Tensor) else type(measured).__name__
         raise ShapeError(
-            f"{where}: expected the operator to make a tensor of the measurement's shape {wanted} of a volume "
-            f"{tuple(volume.shape)}, got {got}."
+            f"{where}: expected the operator to make a tensor of the measurement's shape {tuple(measured.shape)} of a "
+            f"volume {tuple(volume.shape)}, got {got}."
         )
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)
-        prediction = _scaled(*pair, check_mask(mask, measured.shape, where), item_dims)
+        prediction = _scaled(*pair, check_mask(mask, measured, where), item_dims(measured, dim, where))
     return compare(prediction, measured, mask=mask, reduction=reduction)
 
 
-def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, item_dims: int) -> Tensor:
+def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:
     """The prediction times the number that brings each item nearest to the measurement."""
-    if item_dims < 1:
-        raise ShapeError(f"measurement_consistency: expected item_dims of at least 1, got {item_dims}.")
-    dims = tuple(range(-min(item_dims, prediction.ndim), 0))
+    if not prediction.numel():
+        return prediction
     seen = counted(prediction, mask)
     peak = seen.detach().abs().amax(dims, keepdim=True)
     dark = peak == 0
@@ -109,12 +120,12 @@ class MeasurementConsistency(nn.Module):
         operator: Callable[[Tensor], Tensor],
         compare: PairLoss = squared_loss,
         scale_invariant: bool = False,
-        item_dims: int = ITEM_DIMS,
+        dim: int | None = None,
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
         self.operator, self.compare = operator, compare
-        self.scale_invariant, self.item_dims, self.reduction = scale_invariant, item_dims, reduction
+        self.scale_invariant, self.dim, self.reduction = scale_invariant, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return measurement_consistency(
@@ -123,7 +134,7 @@ class MeasurementConsistency(nn.Module):
             self.operator,
             compare=self.compare,
             scale_invariant=self.scale_invariant,
-            item_dims=self.item_dims,
+            dim=self.dim,
             mask=mask,
             reduction=self.reduction,
         )

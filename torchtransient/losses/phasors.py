@@ -17,6 +17,8 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
+    check_dense,
+    check_level,
     check_mask,
     check_pair,
     counted,
@@ -24,18 +26,19 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
-from torchtransient.quantities import positive
+from torchtransient.losses.layouts import bins_dim, item_dims
 from torchtransient.sensing.layout import without_autocast
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
 _PHASE_FLOOR = 1e-3
 
 
-@without_autocast
-def transient_phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, *, dim: int = -3) -> Tensor:
+def transient_phasors(
+    transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, *, dim: int | None = None
+) -> Tensor:
     """Phasors (..., C, F, Y, X), complex, of transients (..., C, T, Y, X): a dense transform to F frequencies.
 
-    `dim`: where time is, and frequency then (-5 of exhaustive captures (C, T, Ly, Lx, Sy, Sx)). As from a renderer with
+    `dim`: where time is, and frequency then (`losses.layouts`). As from a renderer with
     `frequencies=`, but for the bins: those count as at their middles, which lacks a factor `sinc(nu bin_width_opl)`.
     Phases are computed in double precision. Raises ShapeError where T is not that of the axis, UnitError.
     """
@@ -45,19 +48,25 @@ def transient_phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyA
             f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
             f"{type(frequencies).__name__}."
         )
-    if not isinstance(transient, Tensor) or not -transient.ndim <= dim < transient.ndim:
-        got = tuple(transient.shape) if isinstance(transient, Tensor) else type(transient).__name__
-        raise ShapeError(f"{where}: expected a tensor with time as its dimension {dim}, got {got}.")
-    place = dim % transient.ndim
+    check_dense((transient,), where)
+    place = bins_dim(transient, dim, where) + transient.ndim
     lead, bins, trail = transient.shape[:place], transient.shape[place], transient.shape[place + 1 :]
     if bins != axis.num_bins:
-        raise ShapeError(f"{where}: expected T = {axis.num_bins} bins in dimension {dim}, got {bins}.")
-    dtype = working_dtype(transient.dtype, where)
+        raise ShapeError(
+            f"{where}: expected T = {axis.num_bins} bins in dimension {place - transient.ndim}, got {bins}. Say with "
+            "dim= where time is elsewhere."
+        )
+    dtype = working_dtype((transient,), where)
     turns = torch.outer(frequencies.per_metre, axis.centers_opl - frequencies.start_opl)
     angle = -2 * math.pi * (turns - turns.round())
     cos, sin = (table.to(transient.device, dtype) for table in (angle.cos(), angle.sin()))
-    record = transient.to(dtype).reshape(*lead, bins, -1)
-    return torch.complex(cos @ record, sin @ record).reshape(*lead, frequencies.num_frequencies, *trail)
+    record = transient.to(dtype).reshape(*lead, bins, math.prod(trail))
+    return _transformed(record, cos, sin).reshape(*lead, frequencies.num_frequencies, *trail)
+
+
+@without_autocast
+def _transformed(record: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    return torch.complex(cos @ record, sin @ record)
 
 
 def phasor_loss(
@@ -66,6 +75,7 @@ def phasor_loss(
     *,
     phase_only: bool = False,
     floor: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -73,27 +83,25 @@ def phasor_loss(
 
     `phase_only`: of `P / sqrt(|P|^2 + floor^2)` and Q likewise, each between 0 and 1, so that brightness has no part:
     `2 - 2 cos` of the angle between them where both are bright, 1 where one is dark. `floor`, in the unit of the
-    phasors, says what is dark and bounds the gradient by 4/floor; None: 1e-3 of the mean modulus of each item of each.
-    Raises ShapeError for two shapes, UnitError for real numbers.
+    phasors, says what is dark and bounds the gradient by 4/floor; None: 1e-3 of the mean modulus of each item of each;
+    `dim`, where frequency is, then says what is an item (`losses.layouts`). Raises ShapeError for two shapes, UnitError
+    for real numbers.
     """
     where = "phasor_loss"
     input, target = check_pair(input, target, where, complex_too=True)
     if not input.is_complex():
         raise UnitError(f"{where}: expected complex phasors, got {input.dtype}. See transient_phasor_loss.")
-    mask = check_mask(mask, input.shape, where)
+    mask = check_mask(mask, input, where)
     input, target = counted(input, mask), counted(target, mask)
     if phase_only:
-        ours = _PHASE_FLOOR * item_scale(input, target, mask) if floor is None else _floor(floor, input)
-        theirs = _PHASE_FLOOR * item_scale(target, input, mask) if floor is None else ours
+        if floor is None:
+            item = item_dims(input, dim, where, " or floor=")
+            ours, theirs = (_PHASE_FLOOR * item_scale(*x, item, mask) for x in ((input, target), (target, input)))
+        else:
+            ours = theirs = check_level("floor", floor, input, where)
         input, target = _phase(input, ours), _phase(target, theirs)
     difference = input - target
     return reduce(difference.real.square() + difference.imag.square(), reduction, where, mask)
-
-
-def _floor(floor: Tensor | float, phasor: Tensor) -> Tensor:
-    if not isinstance(floor, Tensor):
-        floor = torch.tensor(positive("phasor_loss: floor", floor), dtype=torch.float64)
-    return floor.to(phasor.device, phasor.real.dtype)
 
 
 def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
@@ -111,6 +119,7 @@ def transient_phasor_loss(
     *,
     phase_only: bool = False,
     floor: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -119,26 +128,39 @@ def transient_phasor_loss(
     Parseval: over all frequencies of a discrete transform its mean is that of the squared difference times T; over a
     band it forgets what the band does not see. `mask` (..., C, T, Y, X): bins that do not count are empty in both,
     pixels of which none does are left out. `reduction="none"`: (..., C, F, Y, X). Errors as those of
-    `transient_phasors` and `phasor_loss`.
+    `transient_phasors` and `phasor_loss`. `dim`: where time is (`losses.layouts`).
     """
     where = "transient_phasor_loss"
     input, target = check_pair(input, target, where)
-    mask = check_mask(mask, input.shape, where)
-    ours, theirs = (transient_phasors(counted(x, mask), axis, frequencies) for x in (input, target))
-    pixels = None if mask is None else mask.any(-3, keepdim=True)
-    return phasor_loss(ours, theirs, phase_only=phase_only, floor=floor, mask=pixels, reduction=reduction)
+    dim = bins_dim(input, dim, where)
+    mask = check_mask(mask, input, where)
+    ours, theirs = (transient_phasors(counted(x, mask), axis, frequencies, dim=dim) for x in (input, target))
+    pixels = None if mask is None else mask.any(dim, keepdim=True)
+    return phasor_loss(ours, theirs, phase_only=phase_only, floor=floor, dim=dim, mask=pixels, reduction=reduction)
 
 
 class PhasorLoss(nn.Module):
     """`phasor_loss(input, target)` with its options held."""
 
-    def __init__(self, phase_only: bool = False, floor: float | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        phase_only: bool = False,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
+    ) -> None:
         super().__init__()
-        self.phase_only, self.floor, self.reduction = phase_only, floor, reduction
+        self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return phasor_loss(
-            input, target, phase_only=self.phase_only, floor=self.floor, mask=mask, reduction=self.reduction
+            input,
+            target,
+            phase_only=self.phase_only,
+            floor=self.floor,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
         )
 
 
@@ -151,11 +173,12 @@ class TransientPhasorLoss(nn.Module):
         frequencies: FrequencyAxis,
         phase_only: bool = False,
         floor: float | None = None,
+        dim: int | None = None,
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
         self.axis, self.frequencies = axis, frequencies
-        self.phase_only, self.floor, self.reduction = phase_only, floor, reduction
+        self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return transient_phasor_loss(
@@ -165,6 +188,7 @@ class TransientPhasorLoss(nn.Module):
             self.frequencies,
             phase_only=self.phase_only,
             floor=self.floor,
+            dim=self.dim,
             mask=mask,
             reduction=self.reduction,
         )

@@ -8,10 +8,20 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import Reduction, check_mask, check_pair, counted, item_scale, reduce
-from torchtransient.quantities import positive
-from torchtransient.sensing.layout import check_number
+from torchtransient.errors import ShapeError
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_dense,
+    check_function,
+    check_level,
+    check_mask,
+    check_pair,
+    counted,
+    item_scale,
+    reduce,
+    working_dtype,
+)
+from torchtransient.losses.layouts import item_dims
 
 _OFFSET = 3 / 8
 _BACKGROUND = 1e-3
@@ -23,10 +33,14 @@ def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
     Anscombe 1948; with read noise, in counts, the generalised transform of Starck, Murtagh and Bijaoui 1998 for gain
     one. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below
     zero, of a record less its background, continue the tangent at zero, so that values and gradients are finite.
-    Raises UnitError for a read noise below zero.
+    Whole numbers count in torch's default dtype, half precision in float32. Raises UnitError for a read noise below
+    zero and for complex numbers, ShapeError for no tensor.
     """
-    read_noise = check_number(read_noise, "read_noise", "anscombe")
-    offset = _OFFSET + read_noise**2
+    check_dense((counts,), "anscombe")
+    whole = not (counts.is_floating_point() or counts.is_complex())
+    counts = counts.to(torch.get_default_dtype() if whole else working_dtype((counts,), "anscombe"))
+    check_level("read_noise", read_noise, counts.new_empty(()), "anscombe", zero=True, square=True)
+    offset = _OFFSET + float(read_noise) ** 2
     negative = counts < 0
     root = (torch.where(negative, torch.zeros_like(counts), counts) + offset).sqrt()
     return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / math.sqrt(offset)
@@ -46,12 +60,14 @@ def root_loss(
     noise lets it be when its loss is. Take `tt.nlos.stabilised_root`, `H / sqrt(|H| + 1/4)`, for what f-k migration
     sees of counts, or `functools.partial` of either. Raises ShapeError, UnitError.
     """
+    check_function("root", root, "root_loss")
     input, target = check_pair(input, target, "root_loss")
-    mask = check_mask(mask, input.shape, "root_loss")
-    value = (root(counted(input, mask)) - root(counted(target, mask))).square()
-    if value.shape != input.shape:
-        raise ShapeError(f"root_loss: expected a root that keeps the shape, got {tuple(value.shape)}.")
-    return reduce(value, reduction, "root_loss", mask)
+    mask = check_mask(mask, input, "root_loss")
+    ours, theirs = root(counted(input, mask)), root(counted(target, mask))
+    check_dense((ours, theirs), "root_loss, of the root")
+    if ours.shape != input.shape:
+        raise ShapeError(f"root_loss: expected a root that keeps the shape, got {tuple(ours.shape)}.")
+    return reduce((ours - theirs).square(), reduction, "root_loss", mask)
 
 
 def log_ratio_loss(
@@ -59,6 +75,7 @@ def log_ratio_loss(
     target: Tensor,
     *,
     background: Tensor | float | None = None,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -66,22 +83,19 @@ def log_ratio_loss(
 
     Relative errors of bins that are brighter than `background`, in the unit of the transient; errors of darker ones
     count as shares of it: put it where noise begins. None: 1e-3 of the mean of each item of the target (of the input,
-    where that is dark), which is not symmetric. Values below zero continue the tangent of the logarithm at zero, so
+    where that is dark), which is not symmetric; `dim`, where time is (`losses.layouts`), then says what is an item.
+    Values below zero continue the tangent of the logarithm at zero, so
     that values are finite and gradients at most of the size of a logarithm over the background. Raises ShapeError;
     UnitError for a background that is not above zero.
     """
     where = "log_ratio_loss"
     input, target = check_pair(input, target, where)
-    mask = check_mask(mask, input.shape, where)
+    mask = check_mask(mask, input, where)
     input, target = counted(input, mask), counted(target, mask)
     if background is None:
-        level = _BACKGROUND * item_scale(target, input, mask)
-    elif isinstance(background, Tensor):
-        if not bool((background.detach() > 0).all()):
-            raise UnitError(f"{where}: expected a background above zero, got some that is not.")
-        level = background.to(input)
+        level = _BACKGROUND * item_scale(target, input, item_dims(input, dim, where, " or background="), mask)
     else:
-        level = torch.tensor(positive(f"{where}: background", background), dtype=torch.float64).to(input)
+        level = check_level("background", background, input, where)
     return reduce((_log(input, level) - _log(target, level)).square(), reduction, where, mask)
 
 
@@ -105,9 +119,13 @@ class RootLoss(nn.Module):
 class LogRatioLoss(nn.Module):
     """`log_ratio_loss(input, target)` with its options held."""
 
-    def __init__(self, background: float | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self, background: float | None = None, dim: int | None = None, reduction: Reduction = "mean"
+    ) -> None:
         super().__init__()
-        self.background, self.reduction = background, reduction
+        self.background, self.dim, self.reduction = background, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-        return log_ratio_loss(input, target, background=self.background, mask=mask, reduction=self.reduction)
+        return log_ratio_loss(
+            input, target, background=self.background, dim=self.dim, mask=mask, reduction=self.reduction
+        )

@@ -6,8 +6,16 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import Reduction, check_mask, check_pair, check_reduction, counted, reduce
-from torchtransient.quantities import positive
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_level,
+    check_mask,
+    check_pair,
+    check_reduction,
+    check_whole,
+    counted,
+    reduce,
+)
 
 WINDOW = 11
 
@@ -35,21 +43,24 @@ def ssim_loss(
     where = "ssim_loss"
     check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
+    window = check_whole("an odd window", window, where)
     half = window // 2
-    if window < 1 or window % 2 == 0:
+    if window % 2 == 0:
         raise ShapeError(f"{where}: expected an odd window, got {window}.")
     if input.ndim < 3 or min(input.shape[-2:]) <= half:
         raise ShapeError(
             f"{where}: expected pictures (..., C, Y, X) with Y and X above {half} for a window of {window}, got "
             f"{tuple(input.shape)}. Take a smaller window."
         )
-    mask = check_mask(mask, input.shape, where)
+    mask = check_mask(mask, input, where)
     a, b = counted(input, mask), counted(target, mask)
+    if not input.numel():
+        return reduce((a - b).abs(), reduction, where, mask)
     if value_range is None:
         peak = b.detach().abs().amax((-3, -2, -1), keepdim=True)
         scale = torch.where(peak > 0, peak, torch.ones_like(peak))
     else:
-        scale = torch.tensor(positive(f"{where}: value_range", value_range), dtype=torch.float64).to(a)
+        scale = check_level("value_range", value_range, a[..., :1, :1, :1], where)
     shape = (-1, *a.shape[-3:])
     # No further number in the denominator: with a range of 1 its own constants keep it from zero.
     similarity = ssim((a / scale).reshape(shape), (b / scale).reshape(shape), window, max_val=1.0, eps=0.0)
@@ -61,7 +72,7 @@ def maximum_projections(volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     Gradients go to the brightest voxel of each line, in equal parts to equal ones. Raises ShapeError.
     """
-    if not isinstance(volume, Tensor) or volume.ndim < 3 or volume.is_complex():
+    if not isinstance(volume, Tensor) or volume.ndim < 3 or volume.is_complex() or not all(volume.shape[-3:]):
         got = f"{tuple(volume.shape)} {volume.dtype}" if isinstance(volume, Tensor) else type(volume).__name__
         raise ShapeError(f"maximum_projections: expected a real volume (..., Z, Y, X), got {got}.")
     return volume.amax(-3), volume.amax(-2), volume.amax(-1)
@@ -86,7 +97,7 @@ def projection_ssim_loss(
     input, target = check_pair(input, target, where)
     if input.ndim < 4:
         raise ShapeError(f"{where}: expected volumes (..., C, Z, Y, X), got {tuple(input.shape)}.")
-    mask = check_mask(mask, input.shape, where)
+    mask = check_mask(mask, input, where)
     ours, theirs = maximum_projections(counted(input, mask)), maximum_projections(counted(target, mask))
     masks = (None,) * 3 if mask is None else tuple(mask.any(dim) for dim in (-3, -2, -1))
     values = []

@@ -4,38 +4,63 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses.comparison import check_dense, check_device, check_whole, holds, working_dtype
+from torchtransient.sensing.layout import without_autocast
 
 # Numbers held at a time of one of the tensors (points, triangles, 3, 3).
 _MOST = 1 << 24
 
 
 def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, cells: int = 4) -> Tensor:
-    """Mean distance of two surfaces, in the unit of the vertices: scalar, differentiable in both.
+    """Mean distance of two surfaces, in the unit of the vertices, whatever that is: scalar, differentiable in both.
 
     From points of each to the nearest point of the other, over the area, and the mean of both ways. `vertices` and
-    `others`: (V, 3), (W, 3); `faces`, `other_faces`: (F, 3), (G, 3), of any order and sense. Points are the middles of
-    `cells`^2 equal parts of each triangle; to the other surface distances are exact. Triangles without area weigh
-    nothing. Time and memory grow with F times G. Raises ShapeError.
+    `others`: (V, 3), (W, 3); `faces`, `other_faces`: whole numbers (F, 3), (G, 3), of any order and sense. Points are
+    the middles of `cells`^2 equal parts of each triangle; to the other surface distances are exact. Triangles without
+    area weigh nothing. Time and memory grow with F times G. Half precision is computed in float32. Raises ShapeError,
+    also for a mesh without area; UnitError for other numbers, DeviceError.
     """
+    where = "surface_distance"
+    check_dense((vertices, faces, others, other_faces), where)
     for name, mesh, index in (("vertices", vertices, faces), ("others", others, other_faces)):
         if mesh.ndim != 2 or mesh.shape[1] != 3 or index.ndim != 2 or index.shape[1] != 3 or not len(index):
             raise ShapeError(
-                f"surface_distance: expected {name} (V, 3) with one or more faces (F, 3), got {tuple(mesh.shape)} and "
+                f"{where}: expected {name} (V, 3) with one or more faces (F, 3), got {tuple(mesh.shape)} and "
                 f"{tuple(index.shape)}."
             )
-    if cells < 1:
-        raise ShapeError(f"surface_distance: expected cells of at least 1, got {cells}.")
-    first, second = vertices[faces], others[other_faces]
+        _check_faces(index, mesh, f"{where}: {name}")
+    check_device(vertices, others, where, "both meshes")
+    cells = check_whole("cells", cells, where)
+    dtype = working_dtype((vertices, others), where)
+    first, second = vertices.to(dtype)[faces.long()], others.to(dtype)[other_faces.long()]
+    return _both_ways(first, second, cells)
+
+
+@without_autocast
+def _both_ways(first: Tensor, second: Tensor, cells: int) -> Tensor:
     return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
+
+
+def _check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
+    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
+    check_device(faces, vertices, where, "vertices and faces")
+    wide = faces.long()
+    if not holds((wide >= 0) & (wide < len(vertices))):
+        raise ShapeError(f"{where}: expected faces of numbers from 0 to {len(vertices) - 1}, got others.")
 
 
 def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
     """(N,): distance of points (N, 3) to the nearest of triangles (F, 3, 3), exact and differentiable."""
+    # In units of what there is: squares of metres that are small vanish in single precision.
+    middle = triangles.detach().mean((0, 1))
+    points, triangles = points - middle, triangles - middle
+    unit = torch.maximum(points.detach().abs().amax(), triangles.detach().abs().amax())
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))
     size = max(1, _MOST // (9 * len(triangles)))
-    return torch.cat([_distance(part, triangles) for part in torch.split(points, size)])
+    return unit * torch.cat([_distance(part, triangles / unit) for part in torch.split(points / unit, size)])
 
 
 def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
@@ -43,9 +68,35 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     weights = _middles(cells).to(triangles)
     points = torch.einsum("kc,fcd->fkd", weights, triangles)
     distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
-    area = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).norm(dim=1)
+    edges = triangles[:, 1:] - triangles[:, :1]
+    longest = edges.detach().abs().amax()
+    edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))
+    area = _length(torch.linalg.cross(edges[:, 0], edges[:, 1]))
+    if not holds((area.detach().sum() > 0) | area.detach().isnan().any()):
+        raise ShapeError("surface_distance: expected meshes with an area, got one of whose triangles none has any.")
     mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
     return mean
+
+
+def _length(x: Tensor) -> Tensor:
+    """Of vectors (..., 3)."""
+    return _root(x.square().sum(-1))
+
+
+def _root(square: Tensor) -> Tensor:
+    """The root has no slope at zero: there it is taken as zero."""
+    apart = square != 0  # NaN is no zero
+    return torch.where(apart, torch.where(apart, square, torch.ones_like(square)).sqrt(), 0.0)
+
+
+def _normal(edges: Tensor) -> Tensor:
+    """Unit normals (F, 3) of triangles by their edges (F, 3, 3), zero where they have no area."""
+    longest = edges.detach().abs().amax((1, 2))[:, None]
+    edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))[..., None]
+    across = torch.linalg.cross(edges[:, 0], edges[:, 1])
+    length = _length(across)[:, None]
+    upright = length != 0
+    return torch.where(upright, across / torch.where(upright, length, torch.ones_like(length)), 0.0)
 
 
 def _middles(cells: int) -> Tensor:
@@ -58,7 +109,7 @@ def _middles(cells: int) -> Tensor:
 
 def _distance(points: Tensor, triangles: Tensor) -> Tensor:
     edges = triangles.roll(-1, 1) - triangles
-    normal = functional.normalize(torch.linalg.cross(edges[:, 0], edges[:, 1]), dim=1)
+    normal = _normal(edges)
     from_corner = points[:, None, None] - triangles
     squared = edges.square().sum(-1).clamp_min(torch.finfo(edges.dtype).tiny)
     along = ((from_corner * edges).sum(-1) / squared).clamp(0, 1)
@@ -68,6 +119,4 @@ def _distance(points: Tensor, triangles: Tensor) -> Tensor:
     # A triangle without area has no normal, and its edges are all of it.
     inside = ((from_corner * inwards).sum(-1) >= 0).all(-1) & (normal.square().sum(-1) > 0)
     nearest = torch.where(inside, height.square(), to_edges).amin(1)
-    # The root has no slope at zero: there it is taken as zero.
-    apart = nearest > 0
-    return torch.where(apart, torch.where(apart, nearest, torch.ones_like(nearest)).sqrt(), 0.0)
+    return _root(nearest)

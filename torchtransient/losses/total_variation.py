@@ -8,9 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import Reduction, check_mask, counted, item_scale, reduce, working_dtype
-from torchtransient.quantities import positive
-from torchtransient.sensing.layout import check_number
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_dense,
+    check_level,
+    check_mask,
+    counted,
+    item_scale,
+    reduce,
+    working_dtype,
+)
+from torchtransient.quantities import shown
 
 _DIMS = (-3, -2, -1)
 _SMOOTHING = 1e-3
@@ -33,23 +41,27 @@ def total_variation(
     (anisotropic: of its projections onto the axes).
 
     `smoothing`, in units of the volume per metre, makes `sqrt(d^2 + s^2) - s` of a modulus d, whose gradient is zero in
-    flat places and nowhere infinite; it is less than d by s at most. None: 1e-3 of the mean modulus of each item per
+    flat places and nowhere infinite; it is less than d by s at most. None: 1e-3 of the mean modulus of each Z, Y, X per
     spacing; 0: the modulus itself, with gradient zero in flat places. Raises ShapeError, UnitError.
     """
     where = "total_variation"
-    if not isinstance(volume, Tensor) or volume.ndim < 3:
-        got = tuple(volume.shape) if isinstance(volume, Tensor) else type(volume).__name__
-        raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {got}.")
-    if len(spacing) != 3:
-        raise ShapeError(f"{where}: expected the spacing along Z, Y and X, got {len(spacing)} numbers.")
-    steps = [positive(f"{where}: spacing", step) for step in spacing]
-    volume = volume.to(working_dtype(volume.dtype, where, complex_too=True))
-    mask = check_mask(mask, volume.shape, where)
+    check_dense((volume,), where)
+    if volume.ndim < 3:
+        raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
+    if not hasattr(spacing, "__len__") or len(spacing) != 3:
+        raise ShapeError(f"{where}: expected the spacing along Z, Y and X, three numbers, got {shown(spacing)}.")
+    volume = volume.to(working_dtype((volume,), where, complex_too=True))
+    for step in spacing:
+        check_level("spacing", step, volume.new_empty(()), where, square=True)
+    steps = [float(step) for step in spacing]
+    mask = check_mask(mask, volume, where)
     seen = counted(volume, mask)
+    if not volume.numel():
+        return reduce(seen.abs(), reduction, where, mask)
     if smoothing is None:
-        smooth = _SMOOTHING / min(steps) * item_scale(seen, seen, mask)
+        smooth = _SMOOTHING / min(steps) * item_scale(seen, seen, _DIMS, mask)
     else:
-        smooth = torch.tensor(check_number(smoothing, "smoothing", where), dtype=torch.float64).to(seen.real)
+        smooth = check_level("smoothing", smoothing, seen, where, zero=True, square=True)
     squares = [_squared_difference(seen, mask, dim, step) for dim, step in zip(_DIMS, steps, strict=True)]
     if isotropic:
         squares = [torch.stack(squares).sum(0)]

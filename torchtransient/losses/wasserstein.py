@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
+    check_level,
     check_mask,
     check_pair,
     check_reduction,
@@ -20,7 +20,7 @@ from torchtransient.losses.comparison import (
     item_scale,
     reduce,
 )
-from torchtransient.quantities import positive
+from torchtransient.losses.layouts import bins_dim, item_dims
 
 # Pixels below this share of the mean light of a pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3
@@ -33,7 +33,7 @@ def wasserstein_loss(
     *,
     creation_cost_opl: float | None = None,
     floor: Tensor | float | None = None,
-    dim: int = -3,
+    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -50,36 +50,36 @@ def wasserstein_loss(
     pixels. This is the cost of one way to do it, at least that of the cheapest (partial optimal transport).
 
     Light counts as at the middle of its bin; negative bins, of captures less their background, enter the same formula.
-    Computed by cumulative sums of differences. `dim`: where time is. `mask` (..., C, T, Y, X): bins that do not count
-    are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
+    Computed by cumulative sums of differences. `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins
+    that do not count are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "wasserstein_loss"
-    width = positive(f"{where}: bin_width_opl", bin_width_opl)
     check_reduction(reduction, where)
-    if floor is not None and not isinstance(floor, Tensor):
-        positive(f"{where}: floor", floor)
     input, target = check_pair(input, target, where)
-    if not -input.ndim <= dim < input.ndim:
-        raise ShapeError(f"{where}: expected transients with time as their dimension {dim}, got {tuple(input.shape)}.")
-    mask = check_mask(mask, input.shape, where)
+    dim = bins_dim(input, dim, where)
+    mask = check_mask(mask, input, where)
+    width = check_level("bin_width_opl", bin_width_opl, input.new_empty(()), where)
     pixels = None if mask is None else mask.any(dim)
     a, b = counted(input, mask), counted(target, mask)
     if creation_cost_opl is not None:
-        cost = positive(f"{where}: creation_cost_opl", creation_cost_opl)
+        cost = check_level("creation_cost_opl", creation_cost_opl, width, where)
         return reduce(_unbalanced(a, b, width, cost, dim), reduction, where, pixels)
     mass_a, mass_b = a.sum(dim, keepdim=True), b.sum(dim, keepdim=True)
     kept = None if pixels is None else pixels.unsqueeze(dim)
-    floor_a = _MASS_FLOOR * item_scale(mass_a, mass_b, kept) if floor is None else floor
-    floor_b = _MASS_FLOOR * item_scale(mass_b, mass_a, kept) if floor is None else floor
+    if floor is None:
+        item = item_dims(input, dim, where)
+        floor_a, floor_b = (_MASS_FLOOR * item_scale(*m, item, kept) for m in ((mass_a, mass_b), (mass_b, mass_a)))
+    else:
+        floor_a = floor_b = check_level("floor", floor, mass_a, where)
     counts = torch.ones_like(a) if mask is None else mask.to(a.dtype)
     even = counts / counts.sum(dim, keepdim=True).clamp_min(1)
     difference = _normalised(a, mass_a, even, floor_a) - _normalised(b, mass_b, even, floor_b)
     return reduce(width * _moved(difference, dim), reduction, where, pixels)
 
 
-def _normalised(x: Tensor, mass: Tensor, even: Tensor, floor: Tensor | float) -> Tensor:
+def _normalised(x: Tensor, mass: Tensor, even: Tensor, floor: Tensor) -> Tensor:
     """Records of mass one: those below the floor are filled up to it evenly."""
-    least = torch.as_tensor(floor, dtype=x.dtype, device=x.device).clamp_min(torch.finfo(x.dtype).tiny)
+    least = floor.clamp_min(torch.finfo(x.dtype).tiny)
     lacking = (least - mass).clamp_min(0)
     return (x + lacking * even) / torch.maximum(mass, least)
 
@@ -91,7 +91,7 @@ def _moved(difference: Tensor, dim: int) -> Tensor:
     return difference.narrow(dim, 0, bins - 1).cumsum(dim).abs().sum(dim)
 
 
-def _unbalanced(a: Tensor, b: Tensor, width: float, cost: float, dim: int) -> Tensor:
+def _unbalanced(a: Tensor, b: Tensor, width: Tensor, cost: Tensor, dim: int) -> Tensor:
     mass_a, mass_b = a.sum(dim, keepdim=True), b.sum(dim, keepdim=True)
     darker = torch.minimum(mass_a, mass_b).clamp_min(0)
 
@@ -113,7 +113,7 @@ class WassersteinLoss(nn.Module):
         bin_width_opl: float,
         creation_cost_opl: float | None = None,
         floor: float | None = None,
-        dim: int = -3,
+        dim: int | None = None,
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()

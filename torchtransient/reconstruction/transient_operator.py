@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -28,8 +29,9 @@ from torchtransient.reconstruction.voxels import VoxelGrid
 class TransientOperator(LinearOperator):
     """A linear operator between a volume and transients (..., T, *scan points).
 
-    ``scan``, ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes stand on, None for points that stand on
-    none. Tables are built in double precision and kept in ``dtype``; ``operator.double()`` builds them anew.
+    ``scan``: a copy of what was given, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes
+    stand on, None for points that stand on none. Tables are built in double precision and kept in ``dtype``;
+    ``operator.double()`` builds them anew.
 
     Classes say :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape`` and
     ``grid`` (without one, they say :attr:`points`), and call ``_set_tables()`` last. Raises ShapeError for what is
@@ -42,9 +44,10 @@ class TransientOperator(LinearOperator):
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         super().__init__()
         who = type(self).__name__
-        self.scan, self.axis = scan, checked_axis(time_axis, who)
+        scan = scan if isinstance(scan, PlanarScan) else checked_scan(scan, who)
+        self.scan, self.axis = _kept(scan), checked_axis(time_axis, who)
         self.dtype = checked_precision(dtype, who)
-        check_proportions(scan if isinstance(scan, PlanarScan) else checked_scan(scan, who), self.axis, who)
+        check_proportions(scan, self.axis, who)
 
     @property
     def points(self) -> Tensor:
@@ -77,7 +80,7 @@ class TransientOperator(LinearOperator):
         of the old.
         """
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point()}
+        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point() or buffer.is_complex()}
         if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
             device = self.device
             try:
@@ -108,6 +111,12 @@ class TransientOperator(LinearOperator):
     def extra_repr(self) -> str:
         volume = " x ".join(map(str, self.volume_shape))
         return f"{volume} voxels, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
+
+
+def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:
+    """A copy that later changes of the caller's tensors do not reach."""
+    copies: dict[str, Any] = {k: v.detach().clone() for k, v in vars(scan).items() if isinstance(v, Tensor)}
+    return replace(scan, **copies)
 
 
 def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:

@@ -1,0 +1,369 @@
+"""What losses are given, over the list of all: layouts of captures, kinds of numbers, nothing, floors, devices."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from support.loss_cases import AXIS, BAND, CASES
+from torchtransient import losses
+from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
+
+NAN, INF = float("nan"), float("inf")
+# Likelihoods with the measurement first, as (model, counts) like the others.
+NLLS = {
+    "poisson_nll": lambda x, y, **k: losses.poisson_nll(y, x, **k),
+    "poisson_nll, constant": lambda x, y, **k: losses.poisson_nll(y, x, constant=True, **k),
+    "first_photon_nll": lambda x, y, **k: losses.first_photon_nll(y, x, 10_000, constant=True, **k),
+    "first_photon_nll, dead": lambda x, y, **k: losses.first_photon_nll(y, x, 10_000, dead_bins=2.5, **k),
+    "free_running_nll": lambda x, y, **k: losses.free_running_nll(y, x, 10_000, 2.5, **k),
+    "read_noise_nll": lambda x, y, **k: losses.read_noise_nll(y, x, 2.0, **k),
+}
+nlls = pytest.mark.parametrize("loss", NLLS.values(), ids=NLLS.keys())
+every = pytest.mark.parametrize("case", CASES, ids=str)
+
+
+def over(condition):
+    return pytest.mark.parametrize("case", [case for case in CASES if condition(case)], ids=str)
+
+
+def of_time(case):
+    return case.dim is not None and case.function is not losses.measurement_consistency
+
+
+def pair_of(case):
+    """Two items of three channels and 8 x 4 x 5 bins, the second item a thousand times darker."""
+    x, y = (torch.cat([t, t.flip(-1), t.flip(-2)], 1) for t in case.tensors())
+    dark = torch.tensor([1.0, 1e-3], dtype=torch.float64).reshape(2, 1, 1, 1, 1)
+    return x * dark, y if case.draw_target is not None else y * dark
+
+
+# ------------------------------------------------------------------------------------------------------------- layouts
+
+
+# dim, and the places Y, X as those of another layout
+LAYOUTS = {
+    "a list": (-2, lambda t: t.flatten(-2)),
+    "exhaustive": (-5, lambda t: t.unflatten(-1, (1, 5)).unflatten(-3, (2, 2))),
+    "exhaustive list": (-3, lambda t: t),
+    "one point": (-1, lambda t: t[..., 0, 0]),
+}
+
+
+@over(of_time)
+@pytest.mark.parametrize("dim, laid_out", LAYOUTS.values(), ids=LAYOUTS.keys())
+def test_every_layout_has_the_numbers_of_images(case, dim, laid_out):
+    x, y = pair_of(case)
+    if dim == -1:
+        x, y = x[..., :1, :1], y[..., :1, :1]
+    for mask in (None, torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6):
+        given = laid_out(x), laid_out(y), None if mask is None else laid_out(mask)
+        for reduction in ("none", "mean"):
+            wanted = case(x, y, mask, reduction)
+            found = case(*given, reduction, dim=dim)
+            if reduction == "none":
+                wanted = laid_out(wanted)
+            torch.testing.assert_close(found, wanted)
+            torch.testing.assert_close(case(*given, reduction, dim=dim + given[0].ndim), found)
+    module = case.module(**case.options, dim=dim)
+    torch.testing.assert_close(module(*given[:2]), case(*given[:2], dim=dim))
+
+
+def value_or_error(call):
+    try:
+        return call()
+    except ShapeError as error:
+        return str(error)
+
+
+@over(of_time)
+def test_another_layout_is_never_taken_for_images(case):
+    """Without `dim`: the same number, or an error that asks for it."""
+    x, y = pair_of(case)
+    for dim, laid_out in LAYOUTS.values():
+        a, b = laid_out(x), laid_out(y)
+        for part in (slice(None), (slice(None), slice(0, 1)), 0, (0, slice(0, 1))):
+            found = value_or_error(lambda pair=(a[part], b[part]): case(*pair))
+            if isinstance(found, str):
+                assert "dim=" in found
+            else:
+                torch.testing.assert_close(found, case(a[part], b[part], dim=dim))
+
+
+@nlls
+def test_likelihoods_in_every_layout(loss):
+    x = 0.1 + torch.rand(2, 3, 8, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    x = x * torch.tensor([1.0, 1e-3], dtype=torch.float64).reshape(2, 1, 1, 1, 1)
+    y = torch.poisson(5 * x, generator=torch.Generator().manual_seed(2))
+    if loss is NLLS["read_noise_nll"]:
+        torch.testing.assert_close(loss(x.flatten(), y.flatten()), loss(x, y))
+        return
+    wanted = loss(x, y, reduction="none")
+    for dim, laid_out in LAYOUTS.values():
+        if dim != -1:
+            torch.testing.assert_close(loss(laid_out(x), laid_out(y), dim=dim, reduction="none"), laid_out(wanted))
+    with pytest.raises(ShapeError, match="dim="):
+        loss(x.flatten(-2), y.flatten(-2))
+    for dim in (1.5, True, "time", 9):
+        with pytest.raises(ShapeError, match="dimension"):
+            loss(x, y, dim=dim)
+
+
+def test_a_shift_of_a_list_of_points():
+    """Three points whose light is two bins late: two bins of path, wherever time is."""
+    a, b = torch.zeros(1, 20, 3), torch.zeros(1, 20, 3)
+    a[:, 4], b[:, 6] = 1.0, 1.0
+    with pytest.raises(ShapeError, match=r"-2 of lists"):
+        losses.wasserstein_loss(a, b, 0.05)
+    assert float(losses.wasserstein_loss(a, b, 0.05, dim=-2)) == pytest.approx(0.1)
+    phases = losses.transient_phasors(a[:, 4:12], AXIS, BAND, dim=-2)
+    torch.testing.assert_close(phases[..., None], losses.transient_phasors(a[:, 4:12, :, None], AXIS, BAND, dim=1))
+
+
+@over(of_time)
+def test_records_have_bins(case):
+    x, y = (t[:, :, :0] for t in case.tensors())
+    found = value_or_error(lambda: case(x, y, dim=-3))
+    # a loss of each element, of none of them
+    assert "one or more bins" in found if isinstance(found, str) else float(found) == 0
+
+
+# ---------------------------------------------------------------------------------------------------- kinds of numbers
+
+
+WHOLE = (torch.uint8, torch.int8, torch.int16, torch.uint16, torch.int32, torch.uint32, torch.int64, torch.uint64)
+FLOATING = (torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2)
+
+
+@over(lambda case: case.pair and not case.tensors()[0].is_complex())
+@pytest.mark.parametrize("dtype", [*WHOLE, *FLOATING, torch.bool], ids=str)
+def test_targets_of_every_kind(case, dtype):
+    x, y = case.tensors(dtype=torch.float32)
+    y = (y if case.draw_target is not None else 100 * y).to(dtype)
+    wanted = case(x, y.to(torch.float32))
+    found = case(x, y)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+
+
+@over(lambda case: case.pair and case.draw_target is None and not case.tensors()[0].is_complex())
+@pytest.mark.parametrize("dtype", [*WHOLE, *FLOATING, torch.bool], ids=str)
+def test_inputs_of_every_kind(case, dtype):
+    if case.function is losses.measurement_consistency:
+        return  # its operator is the user's
+    x, y = case.tensors(dtype=torch.float32)
+    x = (100 * x).to(dtype)
+    torch.testing.assert_close(case(x, y), case(x.to(torch.float32), y), rtol=0, atol=0)
+
+
+@nlls
+@pytest.mark.parametrize("dtype", [*WHOLE, torch.float16, torch.bfloat16, torch.bool], ids=str)
+def test_counts_up_to_the_last_of_their_kind(loss, dtype):
+    """255 + 1 is 0 in uint8: the logarithm of a factorial is not computed there."""
+    most = 1 if dtype == torch.bool else min(torch.iinfo(dtype).max if dtype in WHOLE else 256, 1000)
+    counts = torch.tensor([0, 1, most, most // 2]).reshape(1, 4, 1, 1).to(dtype)
+    model = torch.rand(1, 4, 1, 1, generator=torch.Generator().manual_seed(1))
+    found = loss(model, counts)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, loss(model, counts.to(torch.float32)), rtol=0, atol=0)
+    torch.testing.assert_close(found, loss(model.double(), counts.to(torch.float64)).float(), rtol=1e-5, atol=1e-5)
+
+
+def test_the_constant_of_counts():
+    counts = torch.tensor([255, 254, 3, 100], dtype=torch.uint8)
+    wanted = -torch.distributions.Poisson(torch.full((4,), 200.0)).log_prob(counts.float()).mean()
+    torch.testing.assert_close(losses.poisson_nll(counts, torch.full((4,), 200.0), floor=0, constant=True), wanted)
+
+
+@nlls
+def test_counts_are_real(loss):
+    x = torch.ones(1, 4, 1, 1)
+    with pytest.raises(UnitError, match="real numbers"):
+        loss(x, x + 1j)
+    with pytest.raises(UnitError, match="floating"):
+        loss(x.int(), x)
+
+
+def test_counts_that_single_precision_cannot_hold():
+    """2^24 + 1 photons in as many cycles, one bin."""
+    cycles = 2**24 + 1
+    counts = torch.zeros(1, 4, 1, 1, dtype=torch.int64)
+    counts[0, 1], counts[0, 2] = 2**24, 1
+    assert bool(torch.isfinite(losses.first_photon_nll(counts, torch.ones(1, 4, 1, 1), cycles)))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.bool, torch.float16], ids=str)
+def test_anscombe_of_every_kind(dtype):
+    counts = torch.tensor([0, 1, 255]).to(dtype)
+    torch.testing.assert_close(losses.anscombe(counts), 2 * (counts.float() + 3 / 8).sqrt())
+    with pytest.raises(UnitError, match="real"):
+        losses.anscombe(torch.ones(2) + 1j)
+    with pytest.raises(ShapeError, match="tensor"):
+        losses.anscombe([1.0])
+
+
+@over(lambda case: case.function is not losses.measurement_consistency)  # its operator is the user's
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=str)
+def test_autocast_does_not_reach_in(case, half):
+    for dtype in (torch.float32, torch.float64):
+        x, y = case.tensors(dtype=dtype)
+        wanted = case(x, y)
+        with torch.autocast("cpu", dtype=half):
+            found = case(x, y)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+
+
+# ---------------------------------------------------------------------------------------------------------- of nothing
+
+
+@every
+@pytest.mark.parametrize("place", [0, 1, -1], ids=["no items", "no channels", "no pixels"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_of_nothing_is_zero(case, place, masked):
+    x, y = (t.narrow(place, 0, 0) for t in case.tensors())
+    mask = torch.ones(y.shape, dtype=torch.bool) if masked else None
+    if "SSIM" in case.name and place == -1:
+        with pytest.raises(ShapeError):
+            case(x, y)
+        return
+    whole = case(*case.tensors(), reduction="none")
+    wanted = list(whole.shape)
+    wanted[place] = 0
+    x = x.clone().requires_grad_()
+    for reduction in ("none", "mean", "sum"):
+        value = case(x, y, mask, reduction)
+        assert list(value.shape) == (wanted if reduction == "none" else [])
+        assert bool((value == 0).all())
+        (slope,) = torch.autograd.grad(value.sum(), x)
+        assert slope.shape == x.shape
+
+
+@nlls
+def test_likelihoods_of_nothing(loss):
+    for shape in ((0, 1, 8, 2, 2), (1, 1, 8, 0, 2)):
+        x = torch.ones(shape, requires_grad=True)
+        value = loss(x, torch.ones(shape))
+        value.backward()
+        assert float(value) == 0
+
+
+# ------------------------------------------------------------------------------------------------- floors and the like
+
+
+WIDER = torch.full((3, 2, 1, 8, 4, 5), 0.5)
+NO_LEVELS = [-1.0, NAN, INF, True, "a", 1e-50, 1e50, torch.tensor(-1.0), torch.tensor(NAN), torch.tensor(INF),
+             torch.tensor(1 + 1j), torch.tensor(True), torch.rand(7), WIDER, [1.0]]  # fmt: skip
+X, Y = (0.1 + torch.rand(2, 1, 8, 4, 5, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+LEVELS = {
+    "poisson": lambda v: losses.poisson_loss(X, Y, floor=v),
+    "first photon": lambda v: losses.first_photon_loss(X, Y, 400, floor=v),
+    "free running": lambda v: losses.free_running_nll(Y, X, 400, 2.0, floor=v),
+    "read noise": lambda v: losses.read_noise_nll(Y, X, v),
+    "log ratio": lambda v: losses.log_ratio_loss(X, Y, background=v),
+    "Wasserstein": lambda v: losses.wasserstein_loss(X, Y, 0.1, floor=v),
+    "Wasserstein's width": lambda v: losses.wasserstein_loss(X, Y, v),
+    "Wasserstein's cost": lambda v: losses.wasserstein_loss(X, Y, 0.1, creation_cost_opl=v),
+    "phasor": lambda v: losses.phasor_loss(X + 0j, Y + 0j, phase_only=True, floor=v),
+    "transient phasor": lambda v: losses.transient_phasor_loss(X, Y, AXIS, BAND, phase_only=True, floor=v),
+    "total variation": lambda v: losses.total_variation(X, smoothing=v),
+    "spacing": lambda v: losses.total_variation(X, spacing=(v, 1.0, 1.0)),
+    "SSIM": lambda v: losses.ssim_loss(X, Y, window=3, value_range=v),
+    "projections": lambda v: losses.projection_ssim_loss(X, Y, window=3, value_range=v),
+    "relative floor": lambda v: losses.relative_floor(X, v),
+}
+levels = pytest.mark.parametrize("loss", LEVELS.values(), ids=LEVELS.keys())
+
+
+@levels
+def test_levels_are_positive_numbers_that_fit(loss):
+    for value in NO_LEVELS:
+        with pytest.raises(TorchTransientError, match="expected"):
+            loss(value)
+    for value in (0.5, torch.tensor(0.5), torch.tensor(0.5, dtype=torch.float64), 1):
+        assert bool(torch.isfinite(loss(value)).all())
+
+
+@pytest.mark.parametrize("name", ["poisson", "first photon", "free running", "log ratio"])
+def test_levels_of_places(name):
+    for shape in ((4, 5), (2, 1, 1, 4, 5), (8, 1, 1)):
+        torch.testing.assert_close(LEVELS[name](torch.full(shape, 0.5)), LEVELS[name](0.5))
+
+
+@pytest.mark.parametrize("name", ["Wasserstein", "log ratio", "phasor", "SSIM"])
+def test_levels_in_vmap(name):
+    """Tensors that are mapped over are not looked at, others are."""
+    found = torch.vmap(LEVELS[name])(torch.tensor([0.5, 0.7]))
+    torch.testing.assert_close(found, torch.stack([LEVELS[name](0.5), LEVELS[name](0.7)]))
+
+
+def test_functions_take_their_arguments_by_name():
+    record = torch.rand(1, 8, 2, 2)
+    named = losses.transient_phasors(transient=record, axis=AXIS, frequencies=BAND)
+    torch.testing.assert_close(named, losses.transient_phasors(record, AXIS, BAND))
+
+
+def test_no_floor_is_one_of_likelihoods():
+    for name in ("poisson", "first photon", "free running"):
+        assert bool(torch.isfinite(LEVELS[name](0.0))) and bool(torch.isfinite(LEVELS[name](torch.zeros(4, 5))))
+    for name in ("log ratio", "Wasserstein", "phasor", "read noise", "SSIM", "spacing"):
+        with pytest.raises(UnitError, match="greater than zero"):
+            LEVELS[name](0.0)
+
+
+@pytest.mark.parametrize("value", [-5, 0, 2.5, NAN, "a", True, None])
+def test_numbers_of_things(value):
+    calls = [
+        lambda: losses.free_running_nll(Y, X, value, 3.0),
+        lambda: losses.first_photon_loss(X, Y, value),
+        lambda: losses.ssim_loss(X, Y, window=value),
+    ]
+    for call in calls:
+        with pytest.raises(TorchTransientError, match="expected"):
+            call()
+    if value != 2.5:
+        with pytest.raises(TorchTransientError, match="expected"):
+            losses.free_running_nll(Y, X, 400, value)
+    assert float(losses.ssim_loss(X, Y, window=3.0)) == float(losses.ssim_loss(X, Y, window=3))
+
+
+@pytest.mark.parametrize("spacing", [1.0, (1.0, 1.0), "abc", None, (1.0, NAN, 1.0)])
+def test_spacings_are_three_numbers(spacing):
+    with pytest.raises(TorchTransientError, match="spacing"):
+        losses.total_variation(X, spacing=spacing)
+
+
+# ------------------------------------------------------------------------------------------------------------- devices
+
+
+@every
+def test_inputs_are_on_one_device(case):
+    """Tensors without memory are on a device of their own."""
+    x, y = case.tensors()
+    mask = torch.ones(y.shape[-2:], dtype=torch.bool)
+    with pytest.raises(DeviceError, match="expected the mask on cpu, got one on meta"):
+        case(x, y, mask.to("meta"))
+    if case.pair:
+        with pytest.raises(DeviceError, match="on one device"):
+            case(x, y.to("meta"))
+
+
+@nlls
+def test_counts_and_models_are_on_one_device(loss):
+    with pytest.raises(DeviceError, match="counts and model on one device"):
+        loss(X, Y.to("meta"))
+    with pytest.raises(DeviceError, match="mask"):
+        loss(X, Y, mask=torch.ones(4, 5, dtype=torch.bool, device="meta"))
+
+
+@levels
+def test_levels_are_on_the_device_of_what_they_go_with(loss):
+    if loss not in (LEVELS["Wasserstein's width"], LEVELS["Wasserstein's cost"], LEVELS["relative floor"]):
+        with pytest.raises(TorchTransientError, match="expected"):
+            loss(torch.full((2, 1, 1, 1, 1), 0.5, device="meta"))
+
+
+@every
+def test_sparse_tensors_are_refused(case):
+    x, y = case.tensors()
+    with pytest.raises(ShapeError, match="sparse_coo"):
+        case(x.to_sparse(), y)
