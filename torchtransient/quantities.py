@@ -107,6 +107,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def with_article(word: str) -> str:
+    """"a confocal", "an exhaustive"."""
+    return f"{'an' if word[:1] in 'aeiou' else 'a'} {word}"
+
+
 def _number(value: Any) -> float:
     """NaN for what is no real number."""
     if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):

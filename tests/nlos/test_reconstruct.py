@@ -12,7 +12,6 @@ from click.testing import CliRunner
 import torchtransient as tt
 from torchtransient.capture import Wall
 from torchtransient.cli.main import main
-from torchtransient.cli.reconstruct import METHODS as NAMES
 from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
 from torchtransient.nlos.methods import METHODS, default_wavelength
 from torchtransient.testing.point_captures import point_capture
@@ -49,9 +48,8 @@ def test_from_the_simulation_through_a_file_to_the_volume(tmp_path, kind, method
 
 
 def test_every_method_of_the_command_is_known():
-    assert tuple(METHODS) == NAMES
     told = re.findall(r"^\| `([\w-]+)` \| `(\w+)`", TEXT, flags=re.MULTILINE)
-    assert {name for name, _ in told} == set(NAMES) and all(hasattr(tt.nlos, operator) for _, operator in told)
+    assert {name for name, _ in told} == set(METHODS) and all(hasattr(tt.nlos, operator) for _, operator in told)
 
 
 def test_curved_walls_are_backprojected():
@@ -146,3 +144,14 @@ def test_the_page(tmp_path, monkeypatch):
     assert set(re.findall(r"--[a-z][\w-]+", TEXT)) <= options
     for picture in (PAGE.parent / "images" / "reconstruction").iterdir():
         assert picture.stat().st_size < 150_000
+
+
+def test_public_names_in_texts_are_there():
+    """`tt.nlos.X` and `tt.losses.X` of pages, docstrings and messages."""
+    package = Path(tt.__file__).parent
+    files = [*PAGE.parent.glob("*.md"), package.parent / "README.md", *package.rglob("*.py")]
+    named = {name for path in files for name in re.findall(r"\btt\.((?:nlos|losses)\.\w+)", path.read_text("utf-8"))}
+    assert len(named) > 20
+    for name in sorted(named):
+        room, attribute = name.split(".")
+        assert hasattr(getattr(tt, room), attribute), name

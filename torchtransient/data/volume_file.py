@@ -10,66 +10,20 @@ are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchtransient.data import array_file
 from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
-from torchtransient.errors import ShapeError, StorageError
-from torchtransient.quantities import shown
+from torchtransient.errors import StorageError
+from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 FORMAT = "torchtransient volume 1"
 _WHAT = "volume file"
 _VECTORS = ("first", "along_x", "along_y", "normal")
-
-
-@dataclass(frozen=True, eq=False)
-class HiddenVolume:
-    """What a method found behind a corner.
-
-    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
-    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
-    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
-    data. Raises ShapeError where tensors and grid do not fit.
-    """
-
-    values: Tensor
-    grid: VoxelGrid
-    method: str
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    times: Tensor | None = None
-    directions: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.grid, VoxelGrid):
-            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
-        frames = () if self.times is None else (len(self.times),)
-        self._check("values", self.values, (*frames, *self.grid.shape))
-        if self.directions is not None:
-            self._check("directions", self.directions, (3, *self.grid.shape))
-
-    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex():
-            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
-            sizes = ", ".join(map(str, shape))
-            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
-
-    def picture(self) -> Tensor:
-        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
-        per_item = 4 if self.times is None else 5
-        values = self.values.detach()
-        while values.ndim > per_item:
-            values = values[0]
-        summed = values.sum(0)
-        return summed if self.times is None else summed.amax(0)
 
 
 def check_volume_target(path: str | Path) -> Path:

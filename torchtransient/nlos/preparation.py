@@ -10,6 +10,7 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import DeviceError, ShapeError
+from torchtransient.nlos.measured_light import checked_light
 from torchtransient.quantities import count, shown
 from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
 
@@ -42,6 +43,7 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     transient, axis = capture.transient, capture.axis
     if transient is None or axis is None:
         raise ShapeError("without_slab: expected a capture with a transient, got phasors alone.")
+    checked_light(capture, "without_slab")
     # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
     slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
     clear = slab.to(transient.device).reconstruct(transient.double())

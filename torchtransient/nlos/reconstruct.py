@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,15 +12,17 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.data.volume_file import HiddenVolume
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
-from torchtransient.quantities import finite, shown
+from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
+from torchtransient.quantities import finite, positive, shown
 from torchtransient.reconstruction import (
     Backprojection,
     ConfocalCamera,
     DirectLight,
     FilteredBackprojection,
+    HiddenVolume,
     LaplacianFilter,
     PhasorField,
     PhasorFilter,
@@ -34,13 +36,11 @@ from torchtransient.reconstruction import (
     subtract_legs,
 )
 from torchtransient.reconstruction.midpoint_fk import Midpoints
+from torchtransient.reconstruction.proportions import check_proportions, check_reach, check_wavelength
+from torchtransient.volume_methods import FILTERS, Method
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
-# Planes that are found at once by backprojection, between two steps of the progress bar. Phasor fields share their
-# spectra over all planes.
-_AT_ONCE = 4
-FILTERS = ("phasor", "laplacian")
 
 
 def reconstruct(
@@ -49,7 +49,7 @@ def reconstruct(
     *,
     grid: VoxelGrid | None = None,
     depths: Sequence[float] | None = None,
-    progress: bool = False,
+    progress: bool = True,
     **options: Any,
 ) -> HiddenVolume:
     """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
@@ -79,18 +79,24 @@ def reconstruct(
     if grid is not None and (depths is not None or not entry.free_grid):
         why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
         raise SceneError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
-    capture = _intensities(capture)
+    assert capture.axis is not None
+    check_proportions(capture.scan, capture.axis, "reconstruct")
+    capture = checked_light(_intensities(capture), "reconstruct")
     if not entry.takes_legs:
         capture = _from_zero(subtract_legs(capture))
     near_far = None if depths is None else checked_depths(depths)
+    assert capture.axis is not None
     with torch.no_grad():
         if entry.free_grid:
             voxels = default_grid(capture, depths=near_far) if grid is None else grid
+            check_reach(capture.scan, voxels, capture.axis, "reconstruct", seen=True)
+            check_volume_fits(choice.name, capture, voxels, options)
             values, directions, times, used = _on_grid(choice.name, capture, voxels, options, progress)
         else:
+            check_volume_fits(choice.name, capture, None, options)
             values, directions, voxels = _on_own_grid(choice.name, capture, near_far, options, progress)
             times, used = None, options
-    metadata = {"reason": choice.reason, "settings": _told(used)}
+    metadata = {"reason": choice.reason, "settings": _settings(entry, used, capture.axis)}
     return HiddenVolume(values, voxels, choice.name, metadata, times, directions)
 
 
@@ -159,7 +165,7 @@ def normals_of(volume: HiddenVolume) -> Tensor:
 # ------------------------------------------------------------------------------------------------------------- parts
 
 
-def _check_options(name: str, known: tuple[str, ...], options: dict[str, Any]) -> None:
+def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> None:
     for option in options:
         if option not in known:
             raise SceneError(
@@ -172,8 +178,17 @@ def _check_options(name: str, known: tuple[str, ...], options: dict[str, Any]) -
         raise SceneError("reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out.")
 
 
-def _told(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value if isinstance(value, int | float | str) else repr(value) for name, value in options.items()}
+def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, Any]:
+    """All options that a method has, those too that nobody gave, as plain data."""
+    found = {**entry.options, **used}
+    if "v_bins" in found and found["v_bins"] is None:
+        found["v_bins"] = axis.num_bins
+    if "camera" in found and found["camera"] is None:
+        found["camera"] = DirectLight()
+    if found.get("filter") == "laplacian":
+        found = {name: value for name, value in found.items() if name not in ("wavelength", "cycles")}
+        found["sigma"] = LaplacianFilter().sigma
+    return {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.items()}
 
 
 def _intensities(capture: Capture) -> Capture:
@@ -243,11 +258,15 @@ def _on_grid(
     assert axis is not None and transient is not None
     used = dict(options)
     laplacian = used.get("filter") == "laplacian"
-    if name != "bp" and not laplacian:
-        used.setdefault("wavelength", default_wavelength(capture))
+    if laplacian:
+        LaplacianFilter().check(grid, axis.bin_width_opl, "reconstruct")
+    elif name != "bp":
+        wavelength = used.setdefault("wavelength", default_wavelength(capture))
+        check_wavelength(positive("reconstruct: wavelength", wavelength), capture.scan, axis, "reconstruct")
     make = _maker(name, capture, axis, used)
     found = []
-    at_once = len(grid.depths) if name == "phasor" else _AT_ONCE
+    # Phasor fields share their spectra over all planes; backprojection takes a step of the bar for some of them.
+    at_once = len(grid.depths) if name == "phasor" else AT_ONCE
     with _bar(len(grid.depths), progress) as bar:
         for first in range(0, len(grid.depths), at_once):
             part = grid.depths[first : first + at_once]
@@ -256,7 +275,6 @@ def _on_grid(
     values = torch.cat(found, -3)
     if laplacian:
         negative_laplacian = LaplacianFilter()
-        negative_laplacian.check(grid, axis.bin_width_opl, "reconstruct")
         values = negative_laplacian.image(negative_laplacian.volume(values))
     camera = used.get("camera", DirectLight())
     return values, None, camera.times, used

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import positive, shown
+from torchtransient.quantities import positive, shown, with_article
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
 PRECISIONS = (torch.float32, torch.float64)
@@ -94,8 +94,9 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
         raise ShapeError(f"{who}: expected a tt.nlos.Scan or a PlanarScan, got {shown(scan)}.")
     if scan.kind != "confocal":
         raise ShapeError(
-            f"{who}: expected a confocal scan, got a {scan.kind} one. Take the diagonal of an exhaustive capture with "
-            "capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or PhasorField."
+            f"{who}: expected a confocal scan, got {with_article(scan.kind)} one. Take the diagonal of an exhaustive "
+            "capture with capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or "
+            "PhasorField."
         )
     refuse_legs(scan, who)
     return PlanarScan.of_scan(scan, who)

@@ -87,7 +87,7 @@ def read_capture(
         Gaps(given, OWN, source).check_all_used()
         return capture_file.read_capture(source)
     with opened(source) as contents:
-        layout = _found(contents) if format is None else next(entry for entry in LAYOUTS if entry.name == format)
+        layout = _found(contents) if format is None else _asked_for(contents, format)
         gaps = Gaps(given, layout.name, source)
         capture = layout.read(contents, gaps)
         gaps.check_all_used()
@@ -139,6 +139,18 @@ def _is_own(source: Path) -> bool:
             return False
     with damage_said(source, WHAT), hdf5_package(WHAT).File(source, "r") as file:
         return str(read_attributes(file, WHAT, ["format"]).get("format", "")).startswith(OWN)
+
+
+def _asked_for(contents: Contents, name: str) -> Layout:
+    """The layout of a name. Raises StorageError for a file that has another one."""
+    layout = next(entry for entry in LAYOUTS if entry.name == name)
+    others = [entry.name for entry in LAYOUTS if entry.recognises(contents)]
+    if others and not layout.recognises(contents):
+        raise StorageError(
+            f"{WHAT}: expected '{contents.source}' in the layout {name!r}, got one of {others[0]!r} (it holds "
+            f"{', '.join(sorted(contents.shapes))}). Leave format= out, or give format={others[0]!r}."
+        )
+    return layout
 
 
 def _found(contents: Contents) -> Layout:

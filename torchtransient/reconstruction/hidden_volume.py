@@ -1,0 +1,77 @@
+"""A hidden volume as a record of tensors: what a method found, where its voxels stand, and how it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from torchtransient.errors import ShapeError
+from torchtransient.quantities import shown
+from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.tensor_record import TensorRecord
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HiddenVolume(TensorRecord):
+    """What a method found behind a corner.
+
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
+    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
+    data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
+
+    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
+    values and directions; grid and times stay on the CPU, and are the same in a batch. Raises ShapeError where tensors
+    and grid do not fit.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    values: Tensor
+    grid: VoxelGrid
+    method: str
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    times: Tensor | None = None
+    directions: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, VoxelGrid):
+            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
+        frames = () if self.times is None else (len(self.times),)
+        self._check("values", self.values, (*frames, *self.grid.shape))
+        if self.directions is not None:
+            self._check("directions", self.directions, (3, *self.grid.shape))
+
+    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
+        if not fits or tensor.is_complex():
+            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
+            sizes = ", ".join(map(str, shape))
+            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Values and directions."""
+        return {name: tensor for name, tensor in super().tensors().items() if name != "times"}
+
+    def _settings(self) -> dict[str, Any]:
+        return {**super()._settings(), "times": None if self.times is None else tuple(self.times.tolist())}
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[HiddenVolume]) -> dict[str, Any]:
+        return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
+
+    def _shown(self) -> dict[str, str]:
+        frames = {} if self.times is None else {"times": f"{len(self.times)} of them"}
+        return {**{name: text for name, text in super()._shown().items() if name != "times"}, **frames}
+
+    def picture(self) -> Tensor:
+        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
+        per_item = 4 if self.times is None else 5
+        values = self.values.detach()
+        while values.ndim > per_item:
+            values = values[0]
+        summed = values.sum(0)
+        return summed if self.times is None else summed.amax(0)
