@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.arithmetic import summed
 from torchtransient.capture.files import reader, writer
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.errors import ShapeError, StorageError, UnitError
@@ -137,8 +138,10 @@ class Capture(TensorRecord):
     # -------------------------------------------------------------------------------------------------- measurements
 
     def total(self) -> Tensor:
-        """All light that the transient holds: its sum over time, (C, *scan.shape). Raises ShapeError without one."""
-        return self._cube("total").sum(self._time)
+        """All light that the transient holds: its sum over time, (C, *scan.shape); whole numbers stay whole (int64), half
+        precision becomes float32. Raises ShapeError without one.
+        """
+        return summed(self._cube("total"), self._time)
 
     def peak_time(self) -> Tensor:
         """Centre of the bin in which most light (sum over channels, S0 of a polarized capture) arrives at each pair,
@@ -147,7 +150,7 @@ class Capture(TensorRecord):
         cube = self._cube("peak_time").detach()
         if self.polarized:
             cube = cube.select(self._time - _CHANNEL_AND_TIME, 0)
-        highest, index = cube.sum(self._time - 1).max(self._time)
+        highest, index = summed(cube, self._time - 1).max(self._time)
         assert self.axis is not None  # a transient has one
         return torch.where(highest > 0, self.axis.centers_opl.to(cube.device)[index], torch.nan)
 

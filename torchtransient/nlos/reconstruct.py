@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
+from torchtransient.capture.arithmetic import precision_of
 from torchtransient.data.volume_file import HiddenVolume
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
@@ -266,8 +267,7 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
     """The operator of a method on some planes."""
     transient = capture.transient
     assert transient is not None
-    dtype = torch.float64 if transient.dtype == torch.float64 else torch.float32
-    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": dtype}
+    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": precision_of(transient)}
     if name == "bp" or options.get("filter") == "laplacian":
         return lambda grid: Backprojection(capture.scan, grid, **common)
     pulse = PhasorFilter(options["wavelength"], options.get("cycles", 4.0))
