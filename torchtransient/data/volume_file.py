@@ -9,7 +9,6 @@ are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchtransient.capture.arithmetic import summed
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
-from torchtransient.errors import ShapeError, StorageError
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.data.entries import notes_of, text_of
+from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -34,10 +36,11 @@ _VECTORS = ("first", "along_x", "along_y", "normal")
 class HiddenVolume:
     """What a method found behind a corner.
 
-    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
-    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
+    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
     values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
-    data. Raises ShapeError where tensors and grid do not fit.
+    data. Raises ShapeError where tensors and grid do not fit, UnitError for times that are not finite, StorageError for
+    metadata that is not plain.
     """
 
     values: Tensor
@@ -50,14 +53,24 @@ class HiddenVolume:
     def __post_init__(self) -> None:
         if not isinstance(self.grid, VoxelGrid):
             raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
-        frames = () if self.times is None else (len(self.times),)
+        frames = () if self.times is None else _frames(self.times)
         self._check("values", self.values, (*frames, *self.grid.shape))
         if self.directions is not None:
             self._check("directions", self.directions, (3, *self.grid.shape))
+            items = tuple(self.values.shape[: -3 - len(frames)])
+            if tuple(self.directions.shape[:-4]) != items:
+                sizes = ", ".join(map(str, (*items, 3, *self.grid.shape)))
+                raise ShapeError(
+                    f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
+                    f"{tuple(self.directions.shape)}."
+                )
+        if not isinstance(self.method, str):
+            raise ShapeError(f"HiddenVolume: expected method as a name, got {shown(self.method)}.")
+        metadata_text(self.metadata, "HiddenVolume")
 
     def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
         fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex():
+        if not fits or tensor.is_complex() or tensor.numel() == 0:
             got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
             sizes = ", ".join(map(str, shape))
             raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
@@ -68,8 +81,17 @@ class HiddenVolume:
         values = self.values.detach()
         while values.ndim > per_item:
             values = values[0]
-        summed = values.sum(0)
-        return summed if self.times is None else summed.amax(0)
+        together = summed(values, 0)
+        return together if self.times is None else together.amax(0)
+
+
+def _frames(times: Any) -> tuple[int]:
+    if not isinstance(times, Tensor) or times.ndim != 1 or times.is_complex():
+        got = f"{tuple(times.shape)} {times.dtype}" if isinstance(times, Tensor) else shown(times)
+        raise ShapeError(f"HiddenVolume: expected times as a tensor (N,) of real numbers, got {got}.")
+    if not bool(torch.isfinite(times).all()):
+        raise UnitError("HiddenVolume: expected finite times in metres of optical path, got some that are not.")
+    return (len(times),)
 
 
 def check_volume_target(path: str | Path) -> Path:
@@ -86,10 +108,7 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
     target = check_volume_target(path)
     if not isinstance(volume, HiddenVolume):
         raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
-    try:
-        note = json.dumps(dict(volume.metadata))
-    except (TypeError, ValueError) as error:
-        raise StorageError(f"volume file: metadata must be plain data ({error}).") from error
+    note = metadata_text(volume.metadata, _WHAT)
     grid = volume.grid
     given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
     given |= {name: getattr(grid, name) for name in _VECTORS}
@@ -100,17 +119,18 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
 
 
 def read_volume(path: str | Path) -> HiddenVolume:
-    """Read what `write_volume` wrote, as tensors on the CPU.
+    """Read what `write_volume` wrote, as tensors on the CPU. What somebody put beside it is left alone.
 
     Raises StorageError when the file is missing, damaged or not a volume.
     """
-    found = read_arrays(path, FORMAT, _WHAT)
+    needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
+    known = {*needed, *optional, "format", "method", "metadata"}
+    found = read_arrays(path, FORMAT, _WHAT, known.__contains__)
     with damage_said(Path(path), _WHAT):
-        values = {name: torch.from_numpy(np.asarray(found[name])) for name in ("values", "depths", "pitch", *_VECTORS)}
-        more = {name: torch.from_numpy(np.asarray(found[name])) for name in ("times", "directions") if name in found}
+        values = {name: tensor_in(found[name]) for name in needed}
+        more = {name: tensor_in(found[name]) for name in optional if name in found}
         rows, columns = values["values"].shape[-2:]
         dy, dx = values["pitch"].tolist()
         vectors = {name: values[name] for name in _VECTORS}
         grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
-        metadata = json.loads(str(found["metadata"]))
-        return HiddenVolume(values["values"], grid, str(found["method"]), metadata, **more)
+        return HiddenVolume(values["values"], grid, text_of(found, "method"), notes_of(found, "metadata"), **more)

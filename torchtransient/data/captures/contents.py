@@ -7,6 +7,8 @@ that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, 
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +17,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import damage_said, hdf5_package, path_of
-from torchtransient.data.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.data.array_file import check_source, damage_said
+from torchtransient.data.hdf5_limits import check_memory, check_size, read_attributes, read_dataset
+from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 
 WHAT = "capture file"
 _HEADER_BYTES = 128
-_BYTES_PER_VALUE = 8
+# Bytes of a value, by what scipy calls its class; others are no arrays of numbers.
+_BYTES = {
+    "double": 8, "single": 4, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "int64": 8,
+    "uint64": 8, "logical": 1,
+}  # fmt: skip
+_COMPRESSED = 15
 
 
 class Contents(Protocol):
@@ -43,9 +51,7 @@ class Contents(Protocol):
 @contextmanager
 def opened(path: str | Path) -> Iterator[Contents]:
     """The contents of an HDF5 or MATLAB file. Raises StorageError for others, and for what is damaged."""
-    source = path_of(path, WHAT)
-    if not source.is_file():
-        raise StorageError(f"{WHAT}: '{source}' does not exist.")
+    source = check_source(path, WHAT)
     with damage_said(source, WHAT, "a capture of the layout that was read"):
         if _is_old_mat(source):
             yield MatContents(source)
@@ -105,9 +111,12 @@ class MatContents:
     def __init__(self, source: Path) -> None:
         self.source = source
         self._io = _scipy_io()
-        self._size = source.stat().st_size
         with _errors_said(source):
             found = self._io.whosmat(str(source))
+        parts = _parts(source)
+        if len(parts) != len(found):
+            raise StorageError(f"{WHAT}: '{source}' has {len(parts)} parts and {len(found)} variables: it is damaged.")
+        self._parts = {name: (kind, *part) for (name, _, kind), part in zip(found, parts, strict=True)}
         shapes = {name: None if kind == "struct" else tuple(reversed(shape)) for name, shape, kind in found}
         self.shapes: Mapping[str, tuple[int, ...] | None] = shapes
         self._kept: dict[str, Any] = {}
@@ -124,9 +133,10 @@ class MatContents:
         if value is None or (isinstance(value, np.ndarray) and value.size == 0):
             return None
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "biufc":
-            raise StorageError(f"{WHAT}: expected numbers in '{name}', got {getattr(value, 'dtype', type(value))}.")
-        found: NDArray[Any] = value.T[part]
-        return found
+            found = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {found}.")
+        turned: NDArray[Any] = value.T[part]
+        return turned
 
     def text(self, name: str) -> str | None:
         value = self._variable(name)
@@ -140,11 +150,37 @@ class MatContents:
         if name not in self.shapes:
             return None
         if name not in self._kept:
-            declared = math.prod(self.shapes[name] or ()) * _BYTES_PER_VALUE
-            check_size(declared, self._size, f"{WHAT}: '{name}' {self.shapes[name]}")
+            self._check(name, math.prod(self.shapes[name] or ()))
             with _errors_said(self.source):
                 self._kept[name] = self._io.loadmat(str(self.source), variable_names=[name])[name]
         return self._kept[name]
+
+    def _check(self, name: str, values: int) -> None:
+        """Compare what is declared with what is stored before memory is asked for. MATLAB stores values in as few bytes
+        as hold them, at least one for each.
+        """
+        kind, unpacked, stored = self._parts[name]
+        what = f"{WHAT}: '{name}' {self.shapes[name] or kind}"
+        check_size(unpacked, stored, what)
+        if kind in _BYTES:
+            check_size(values, unpacked, what)
+            check_memory(values * _BYTES[kind], what)
+
+
+def _parts(source: Path) -> list[tuple[int, int]]:
+    """How many bytes each variable has unpacked, as its tag says, and as it is stored."""
+    found: list[tuple[int, int]] = []
+    with source.open("rb") as file:
+        order = "<" if file.read(_HEADER_BYTES).endswith(b"IM") else ">"
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(f"{order}II", tag)
+            place, unpacked = file.tell(), size
+            if kind == _COMPRESSED:
+                inner = zlib.decompressobj().decompress(file.read(min(size, 4096)), 8)
+                unpacked = struct.unpack(f"{order}II", inner)[1]
+            found.append((unpacked, size))
+            file.seek(place + size)
+    return found
 
 
 def _is_old_mat(source: Path) -> bool:

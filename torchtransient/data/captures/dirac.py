@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures.contents import WHAT, Contents
 from torchtransient.data.captures.gaps import Gaps, cannot, only_transient, scan_of, tensor_of, time_axis
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import new_hdf5
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}
@@ -90,7 +91,7 @@ def write(target: Path, capture: Capture) -> None:
     legs = scan.first_and_last_leg
     laser, sensor = array_of(scan.laser_legs, WHAT), array_of(scan.sensor_legs, WHAT)
     data = array_of(transient, WHAT).transpose(0, 2, 1)
-    with replacing(target, WHAT) as unfinished, hdf5_package(WHAT).File(unfinished, "w") as file:
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         write_parts(file.create_dataset("data_t", data.shape, data.dtype), data)
         for name, value in {
             "xg": x.T, "yg": y.T, "xa": x[0], "ya": y[:, 0], "da": capture.axis.edges_opl[:-1].numpy(),

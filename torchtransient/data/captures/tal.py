@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures import tal_scene_info
 from torchtransient.data.captures.contents import WHAT, Contents
 from torchtransient.data.captures.gaps import (
@@ -33,6 +33,7 @@ from torchtransient.data.captures.gaps import (
     time_axis,
 )
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.errors import StorageError
 
 NAME = "tal"
@@ -269,7 +270,7 @@ def write(target: Path, capture: Capture) -> None:
     if "volume_format" in kept:
         formats["volume_format"] = (_VOLUMES, kept["volume_format"])
     h5py = hdf5_package(WHAT)
-    with replacing(target, WHAT) as unfinished, h5py.File(unfinished, "w") as file:
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         dtype = np.dtype(kept["dtypes"].get("H", h.dtype))
         write_parts(file.create_dataset("H", h.shape, dtype if _holds(h, dtype) else h.dtype), h)
         for name, (numbers, number) in formats.items():

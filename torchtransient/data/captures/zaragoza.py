@@ -16,10 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures.contents import WHAT, Contents
 from torchtransient.data.captures.gaps import Gaps, cannot, only_transient, scan_of, tensor_of, time_axis
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import new_hdf5
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}
@@ -140,7 +141,7 @@ def write(target: Path, capture: Capture) -> None:
     data = data.transpose(0, 2, 1) if scan.kind == "confocal" else data.transpose(0, 4, 3, 2, 1)
     said = capture.metadata.get("hidden_volume")
     volume = {name: np.array(said[name]) if said and name in said else np.full(3, np.nan) for name in _VOLUME}
-    with replacing(target, WHAT) as unfinished, hdf5_package(WHAT).File(unfinished, "w") as file:
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         shape = (1, len(data), _BOUNCES, *data.shape[1:])
         # A chunk holds one bounce, so that empty ones are never stored.
         chunks = (1, min(64, len(data)), 1, *(min(32, n) for n in data.shape[1:]))
