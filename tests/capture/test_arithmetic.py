@@ -93,7 +93,7 @@ def test_volumes_and_pictures_of_counts(dtype):
 
 
 def test_polarized_light_behind_a_slab_keeps_its_signs():
-    """The slab is linear: it makes of -Q what it makes of Q, with the other sign; intensities alone are not negative."""
+    """The slab is linear: it makes of -Q what it makes of Q with the other sign. Intensities alone are not negative."""
     scan = scanned("confocal", legs=False)
     light = torch.rand(1, 60, 3, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for dtype in (torch.float32, torch.float64):

@@ -37,8 +37,8 @@ class Capture(TensorRecord):
 
     ``steady``: (C, ...) without the time, all light. ``polarized``: the four Stokes components come before C in all of
     them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (what
-    JSON can hold; names are texts); that of a batch is a list under ``batch``. ``axis`` is in metres of optical path, counted as the
-    scan's ``first_and_last_leg`` says.
+    JSON can hold; names are texts, tuples come back as lists); that of a batch is a list under ``batch``. ``axis`` is
+    in metres of optical path, counted as the scan's ``first_and_last_leg`` says.
 
     Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory where they can.
     Two captures are equal when all but ``metadata`` is.
@@ -133,8 +133,8 @@ class Capture(TensorRecord):
     # -------------------------------------------------------------------------------------------------- measurements
 
     def total(self) -> Tensor:
-        """All light that the transient holds: its sum over time, (C, *scan.shape); whole numbers stay whole (int64), half
-        precision becomes float32. Raises ShapeError without one.
+        """All light that the transient holds: its sum over time, (C, *scan.shape). Whole numbers stay whole (int64),
+        half precision becomes float32. Raises ShapeError without one.
         """
         return summed(self._cube("total"), self._time)
 

@@ -124,8 +124,8 @@ def read_arrays(
 
 @contextmanager
 def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
-    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected of a file of
-    another program, of which the library's own errors are repeated as they are: arguments may have been wrong.
+    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected of a file
+    of another program, where the library's own errors are repeated as they are: arguments may have been wrong.
     """
     try:
         yield

@@ -114,7 +114,7 @@ def _text(dataset: Any, what: str) -> str:
     else:
         check_size(dataset.nbytes, dataset.id.get_storage_size(), f"{what}: the text '{dataset.name}'")
     try:
-        value = dataset.asstr()[()]
+        value = dataset.asstr("utf-8")[()]  # whatever the file says of its letters
     except UnicodeDecodeError as error:
         raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
     return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)

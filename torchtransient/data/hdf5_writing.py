@@ -21,11 +21,10 @@ def new_hdf5(path: Path, what: str, **settings: Any) -> Iterator[Any]:
         try:
             with h5py.File(sink, "w", **settings) as file:
                 yield file
-        except Exception as error:
+        finally:
             # What HDF5 says of bytes that it does not find again tells less.
-            raise sink.error or error from None
-        if sink.error is not None:
-            raise sink.error
+            if sink.error is not None:
+                raise sink.error
 
 
 class _Sink:

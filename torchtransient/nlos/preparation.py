@@ -18,8 +18,8 @@ from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
 def sum_bins(capture: Capture, number: int) -> Capture:
     """The capture with so many neighbouring bins added up; what is left over at the record's end is dropped.
 
-    Counts stay whole (int64), half precision becomes float32; phasors beside a transient stay. Raises ShapeError without a transient and for more bins than there are, UnitError
-    for a number that is none.
+    Counts stay whole (int64), half precision becomes float32; phasors beside a transient stay. Raises ShapeError
+    without a transient and for more bins than there are, SceneError for a number that is none.
     """
     number = count("sum_bins: number", number)
     transient, axis = capture.transient, capture.axis

@@ -69,7 +69,7 @@ class Hdf5Contents:
             name: self._shape(name) for name in file if name != "#refs#"
         }
         self.attributes: Mapping[str, str] = {
-            name: str(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
+            name: _sole(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
         }
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
@@ -103,6 +103,12 @@ class Hdf5Contents:
 
     def _read(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
         return read_dataset(self._file, name, WHAT, part)
+
+
+def _sole(value: Any) -> str:
+    """A text, also one in an array of one."""
+    sole = np.asarray(value).reshape(-1)[0] if np.size(value) == 1 else value
+    return sole.decode("utf-8", "replace") if isinstance(sole, bytes) else str(sole)
 
 
 class MatContents:
