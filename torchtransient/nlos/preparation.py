@@ -13,6 +13,7 @@ from torchtransient.capture.arithmetic import precision_of, summed
 from torchtransient.errors import DeviceError, ShapeError
 from torchtransient.quantities import count, shown
 from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
+from torchtransient.reconstruction.capture_checks import checked_capture
 
 
 def sum_bins(capture: Capture, number: int) -> Capture:
@@ -22,9 +23,7 @@ def sum_bins(capture: Capture, number: int) -> Capture:
     without a transient and for more bins than there are, SceneError for a number that is none.
     """
     number = count("sum_bins: number", number)
-    transient, axis = capture.transient, capture.axis
-    if transient is None or axis is None:
-        raise ShapeError("sum_bins: expected a capture with a transient, got phasors alone.")
+    transient, axis = checked_capture(capture, "sum_bins")
     if number == 1:
         return capture
     bins = axis.num_bins // number
@@ -40,10 +39,9 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     with the foam of Lindell and Wetzstein (2020); intensities below zero are zero, the other Stokes components are as
     they come. Without legs, in double precision where the capture is, else in single. Raises as it does.
     """
+    checked_capture(capture, "without_slab")
     capture = subtract_legs(capture)
-    transient, axis = capture.transient, capture.axis
-    if transient is None or axis is None:
-        raise ShapeError("without_slab: expected a capture with a transient, got phasors alone.")
+    transient, axis = checked_capture(capture, "without_slab")
     # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
     slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
     clear = slab.to(transient.device).reconstruct(transient.double())
