@@ -318,6 +318,73 @@ def test_structures_count_for_memory_too(tmp_path, monkeypatch):
                 MatContents(tmp_path / "a.mat").array("dataset/data")
 
 
+@pytest.mark.parametrize("compressed", [False, True])
+def test_old_matlab_files_against_scipy(tmp_path, compressed):
+    """Every kind of numbers, texts, structures; stored in fewer bytes, and in the other order of bytes."""
+    import scipy.io
+
+    rng = np.random.default_rng(0)
+    kinds = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8", "c8", "c16")
+    given = {kind: (rng.random((2, 3, 4)) * 100).astype(kind) for kind in kinds}
+    given |= {"row": np.arange(5.0), "one": 3.5, "structure": {"a": given["f4"], "inner": {"b": given["u2"]}}}
+    given |= {"text": "straße", "flag": np.array([[True, False]]), "nothing": np.zeros((0, 3)), "cell": [1.0, "a"]}
+    scipy.io.savemat(tmp_path / "a.mat", given, do_compression=compressed)
+    contents = MatContents(tmp_path / "a.mat")
+    for kind in kinds:
+        assert contents.shapes[kind] == (4, 3, 2)
+        found = contents.array(kind)
+        np.testing.assert_array_equal(found, given[kind].T)
+        assert found.dtype == (kind if kind != "c8" else np.complex64) and found.flags.writeable
+        np.testing.assert_array_equal(contents.array(kind, (slice(None), 1)), given[kind].T[:, 1])
+    np.testing.assert_array_equal(contents.array("structure/inner/b"), given["u2"].T)
+    assert contents.fields("structure") == {"a", "inner"} and contents.shapes["structure"] is None
+    assert contents.array("structure/c") is None and contents.array("nothing") is None and contents.array("?") is None
+    assert contents.text("text") == "straße" and contents.array("flag").tolist() == [[1], [0]]
+    assert contents.array("row").shape == (5, 1) and float(contents.array("one")[0, 0]) == 3.5
+    for name in ("cell", "structure", "text"):
+        with pytest.raises(StorageError, match="expected an array of numbers"):
+            contents.array(name)
+
+
+def old_matlab(order, stored, values, shape=None, kind=6):
+    """A variable `m` of class double whose numbers are stored as others, in an order of bytes."""
+    import struct
+
+    def element(number, data):
+        return struct.pack(f"{order}II", number, len(data)) + data + bytes(-len(data) % 8)
+
+    shape = values.shape if shape is None else shape
+    parts = element(6, struct.pack(f"{order}II", kind, 0)) + element(5, struct.pack(f"{order}ii", *shape))
+    parts += struct.pack(f"{order}II4s", 1 << 16 | 1, ord("m") if order == "<" else ord("m") << 24, b"")[:8]
+    parts += element(stored, values.T.astype(values.dtype.newbyteorder(order)).tobytes())
+    version = b"\x00\x01IM" if order == "<" else b"\x01\x00MI"
+    return b"MATLAB 5.0".ljust(124) + version + element(14, parts)
+
+
+def test_old_matlab_files_of_either_order_and_damaged_ones(tmp_path):
+    path, values = tmp_path / "a.mat", np.arange(12, dtype=np.uint8).reshape(3, 4)
+    for order in "<>":
+        path.write_bytes(old_matlab(order, 2, values))
+        found = MatContents(path).array("m")
+        assert found.dtype == np.float64
+        np.testing.assert_array_equal(found, values.T)
+        # Types that there are not, or that are no numbers; sizes that are not those of the numbers.
+        for stored, shape in ((0, None), (8, None), (14, None), (19, None), (255, None), (2, (3, 5)), (2, (-3, -4))):
+            path.write_bytes(old_matlab(order, stored, values, shape))
+            with pytest.raises(StorageError):
+                Capture.read(path, "rect_data")
+            with pytest.raises((ValueError, StorageError)):
+                MatContents(path).array("m")
+    whole = old_matlab("<", 2, values)
+    for end in range(130, len(whole), 7):
+        path.write_bytes(whole[:end])
+        with pytest.raises(StorageError):
+            Capture.read(path)
+    path.write_bytes(whole[:132] + b"\xff\xff\xff\x7f" + whole[136:])  # two gigabytes in a file of two hundred bytes
+    with pytest.raises(StorageError, match="does not end in a file"):
+        Capture.read(path)
+
+
 def test_orders_of_axes(tmp_path):
     path = made(grids(wall=SQUARE, size=(3, 3))["confocal"]).write(tmp_path / "a.h5", "zaragoza")
     expected = Capture.read(path)

@@ -6,9 +6,6 @@ that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, 
 
 from __future__ import annotations
 
-import math
-import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,18 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.array_file import check_source, damage_said
-from torchtransient.data.hdf5_limits import check_memory, check_size, read_attributes, read_dataset
+from torchtransient.data.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.data.hdf5_limits import read_attributes, read_dataset
 from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 
 WHAT = "capture file"
-_HEADER_BYTES = 128
-# Bytes of a value, by what scipy calls its class; others are no arrays of numbers.
-_BYTES = {
-    "double": 8, "single": 4, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "int64": 8,
-    "uint64": 8, "logical": 1,
-}  # fmt: skip
-_COMPRESSED = 15
 
 
 class Contents(Protocol):
@@ -112,107 +103,53 @@ def _sole(value: Any) -> str:
 
 
 class MatContents:
-    """A MATLAB file of versions 5 to 7, read by scipy."""
+    """A MATLAB file of versions 5 to 7."""
 
     def __init__(self, source: Path) -> None:
         self.source = source
-        self._io = _scipy_io()
-        with _errors_said(source):
-            found = self._io.whosmat(str(source))
-        parts = _parts(source)
-        if len(parts) != len(found):
-            raise StorageError(f"{WHAT}: '{source}' has {len(parts)} parts and {len(found)} variables: it is damaged.")
-        self._parts = {name: (kind, *part) for (name, _, kind), part in zip(found, parts, strict=True)}
-        shapes = {name: None if kind == "struct" else tuple(reversed(shape)) for name, shape, kind in found}
-        self.shapes: Mapping[str, tuple[int, ...] | None] = shapes
+        self._file = Mat5File(source)
+        self.shapes: Mapping[str, tuple[int, ...] | None] = {
+            name: variable.shape for name, variable in self._file.variables.items()
+        }
         self._kept: dict[str, Any] = {}
         self.attributes: Mapping[str, str] = {}
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         value: Any = self._variable(name.split("/")[0])
         for field in name.split("/")[1:]:
-            if not isinstance(value, np.ndarray) or value.dtype.names is None or value.size != 1:
-                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {type(value).__name__}.")
-            if field not in value.dtype.names:
-                return None
-            value = value.reshape(-1)[0][field]
-        if value is None or (isinstance(value, np.ndarray) and value.size == 0):
-            return None
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "biufc":
-            found = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {found}.")
-        turned: NDArray[Any] = value.T[part]
-        return turned
+            if not isinstance(value, dict):
+                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {_words(value)}.")
+            value = value.get(field)
+        if value is not None and not isinstance(value, np.ndarray):
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {_words(value)}.")
+        return None if value is None else value[part]
 
     def text(self, name: str) -> str | None:
         value = self._variable(name)
-        return None if value is None else str(np.asarray(value).reshape(-1)[0])
+        if value is not None and not isinstance(value, str):
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got {_words(value)}.")
+        return value
 
     def fields(self, name: str) -> frozenset[str]:
         value = self._variable(name)
-        return frozenset(getattr(getattr(value, "dtype", None), "names", None) or ())
+        return frozenset(value) if isinstance(value, dict) else frozenset()
 
     def _variable(self, name: str) -> Any:
         if name not in self.shapes:
             return None
         if name not in self._kept:
-            self._check(name, math.prod(self.shapes[name] or ()))
-            with _errors_said(self.source):
-                self._kept[name] = self._io.loadmat(str(self.source), variable_names=[name])[name]
+            self._kept[name] = self._file.read(name, WHAT)
         return self._kept[name]
 
-    def _check(self, name: str, values: int) -> None:
-        """Compare what is declared with what is stored before memory is asked for. MATLAB stores values in as few bytes
-        as hold them, at least one for each.
-        """
-        kind, unpacked, stored = self._parts[name]
-        what = f"{WHAT}: '{name}' {self.shapes[name] or kind}"
-        check_size(unpacked, stored, what)
-        if kind in _BYTES:
-            check_size(values, unpacked, what)
-            check_memory(values * _BYTES[kind], what)
 
-
-def _parts(source: Path) -> list[tuple[int, int]]:
-    """How many bytes each variable has unpacked, as its tag says, and as it is stored."""
-    found: list[tuple[int, int]] = []
-    with source.open("rb") as file:
-        order = "<" if file.read(_HEADER_BYTES).endswith(b"IM") else ">"
-        while len(tag := file.read(8)) == 8:
-            kind, size = struct.unpack(f"{order}II", tag)
-            place, unpacked = file.tell(), size
-            if kind == _COMPRESSED:
-                inner = zlib.decompressobj().decompress(file.read(min(size, 4096)), 8)
-                unpacked = struct.unpack(f"{order}II", inner)[1]
-            found.append((unpacked, size))
-            file.seek(place + size)
-    return found
+def _words(value: Any) -> str:
+    if isinstance(value, Other):
+        return value.kind
+    return "a structure" if isinstance(value, dict) else "a text" if isinstance(value, str) else "an array of numbers"
 
 
 def _is_old_mat(source: Path) -> bool:
     with source.open("rb") as file:
-        start = file.read(_HEADER_BYTES)
+        start = file.read(HEADER_BYTES)
     # Version 0x0100, whose bytes tell their order; 7.3 has 0x0200 and is HDF5.
-    return len(start) == _HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")
-
-
-@contextmanager
-def _errors_said(source: Path) -> Iterator[None]:
-    """What scipy has errors of its own for, as StorageError."""
-    from scipy.io.matlab import MatReadError
-
-    try:
-        yield
-    except MatReadError as error:
-        raise StorageError(f"{WHAT}: '{source}' is no MATLAB file, or is damaged: {error}.") from None
-
-
-def _scipy_io() -> Any:
-    try:
-        import scipy.io
-    except ImportError as error:
-        raise StorageError(
-            f"{WHAT}: MATLAB's files before version 7.3 need scipy. Install it with pip install "
-            "'torchtransient[data]', or save the file with MATLAB's option -v7.3."
-        ) from error
-    return scipy.io
+    return len(start) == HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")
