@@ -262,6 +262,7 @@ def test_tensors_without_numbers_in_memory(tmp_path):
         ({"times": torch.tensor([torch.nan])}, UnitError, "finite"),
         ({"directions": torch.zeros(7, 3, 4, 5, 6)}, ShapeError, "one for each of the values"),
         ({"values": torch.zeros(0, 1, 4, 5, 6)}, ShapeError, "values"), ({"method": 5}, ShapeError, "method"),
+        ({"method": "a\0b"}, ShapeError, "method"), ({"values": torch.ones(1, 4, 5, 6) > 0}, ShapeError, "values"),
     ],
 )  # fmt: skip
 def test_what_is_no_volume(changes, error, words):

@@ -93,6 +93,8 @@ def test_what_cannot_be_drawn(tmp_path):
         vis.volume_views(volume(), depths=[0.1])
     with pytest.raises(UnitError, match="extent"):
         vis.volume_views(volume(), extent=(1.0, 0.0))
+    with pytest.raises(UnitError, match="extent"):
+        vis.volume_views(volume(), extent=(1.0, float("inf")))
     with pytest.raises(UnitError, match="gamma"):
         vis.volume_views(volume(), gamma=0.0)
     with pytest.raises(ShapeError, match="depth"):

@@ -64,13 +64,13 @@ class HiddenVolume:
                     f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
                     f"{tuple(self.directions.shape)}."
                 )
-        if not isinstance(self.method, str):
+        if not isinstance(self.method, str) or "\0" in self.method:
             raise ShapeError(f"HiddenVolume: expected method as a name, got {shown(self.method)}.")
         metadata_text(self.metadata, "HiddenVolume")
 
     def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
         fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex() or tensor.numel() == 0:
+        if not fits or tensor.is_complex() or tensor.dtype == torch.bool or tensor.numel() == 0:
             got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
             sizes = ", ".join(map(str, shape))
             raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")

@@ -318,6 +318,7 @@ def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | Confoca
     numbers = real_array(times)
     if numbers is None or numbers.shape != (3,):
         raise UnitError(f"reconstruct: expected times as (start, stop, count), got {shown(times)}.")
-    start, stop = (finite("reconstruct: times", number) for number in numbers[:2])
-    frames = count("reconstruct: count of times", numbers[2])
-    return cameras[name](torch.linspace(start, stop, frames, dtype=torch.float64))
+    start, stop, number = numbers.tolist()
+    frames = count("reconstruct: count of times", number)
+    first, last = finite("reconstruct: times", start), finite("reconstruct: times", stop)
+    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64))

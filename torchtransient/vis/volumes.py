@@ -221,6 +221,6 @@ def _scales(size: tuple[int, ...], depths: Any, extent: Any) -> tuple[Tensor, tu
     if extent is None:
         return z, (float(size[2]), float(size[1]))
     pair = real_array(extent)
-    if pair is None or pair.shape != (2,) or not (pair > 0).all():
+    if pair is None or pair.shape != (2,) or not ((pair > 0) & (pair < float("inf"))).all():
         raise UnitError(f"extent: expected (width, height) in metres, greater than zero, got {shown(extent)}.")
     return z, (float(pair[0]), float(pair[1]))

@@ -54,6 +54,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
     ``hidden_volume`` of the metadata: position, rotation, size. Single captures are pairs with one spot.
     """
+    missing = sorted(_REQUIRED - set(contents.shapes))
+    if missing:
+        raise gaps.error(f"expected {', '.join(missing)}, got {', '.join(contents.shapes) or 'nothing'}.")
     transient, bounces = _summed(contents, gaps)
     sensor, laser = (_grid(contents, f"{who}GridPositions", gaps) for who in ("camera", "laser"))
     if sensor is None or laser is None:
