@@ -79,7 +79,8 @@ def check_folder(path: str | Path, what: str) -> None:
     be written: a folder, a device, a pipe, a file without permission.
     """
     target = path_of(path, what)
-    place = Path(os.path.realpath(target))  # what a link points to is replaced, not the link
+    # What a link points to is replaced, not the link.
+    place = Path(os.path.realpath(target)) if target.is_symlink() else target
     if not place.parent.is_dir():
         raise StorageError(f"{what}: the folder '{place.parent}' does not exist. Create it first.")
     closed = next((p for p in (place.parent, place) if p.exists() and not os.access(p, os.W_OK)), None)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchtransient.capture.arithmetic import summed
@@ -23,8 +22,8 @@ from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
 from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.data.entries import notes_of, text_of
-from torchtransient.errors import ShapeError, StorageError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.errors import StorageError
+from torchtransient.reconstruction.volume_checks import check_volume
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 FORMAT = "torchtransient volume 1"
@@ -51,29 +50,7 @@ class HiddenVolume:
     directions: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.grid, VoxelGrid):
-            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
-        frames = () if self.times is None else _frames(self.times)
-        self._check("values", self.values, (*frames, *self.grid.shape))
-        if self.directions is not None:
-            self._check("directions", self.directions, (3, *self.grid.shape))
-            items = tuple(self.values.shape[: -3 - len(frames)])
-            if tuple(self.directions.shape[:-4]) != items:
-                sizes = ", ".join(map(str, (*items, 3, *self.grid.shape)))
-                raise ShapeError(
-                    f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
-                    f"{tuple(self.directions.shape)}."
-                )
-        if not isinstance(self.method, str) or "\0" in self.method:
-            raise ShapeError(f"HiddenVolume: expected method as a name, got {shown(self.method)}.")
-        metadata_text(self.metadata, "HiddenVolume")
-
-    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex() or tensor.dtype == torch.bool or tensor.numel() == 0:
-            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
-            sizes = ", ".join(map(str, shape))
-            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
+        check_volume(self)
 
     def picture(self) -> Tensor:
         """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
@@ -83,15 +60,6 @@ class HiddenVolume:
             values = values[0]
         together = summed(values, 0)
         return together if self.times is None else together.amax(0)
-
-
-def _frames(times: Any) -> tuple[int]:
-    if not isinstance(times, Tensor) or times.ndim != 1 or times.is_complex():
-        got = f"{tuple(times.shape)} {times.dtype}" if isinstance(times, Tensor) else shown(times)
-        raise ShapeError(f"HiddenVolume: expected times as a tensor (N,) of real numbers, got {got}.")
-    if not bool(torch.isfinite(times).all()):
-        raise UnitError("HiddenVolume: expected finite times in metres of optical path, got some that are not.")
-    return (len(times),)
 
 
 def check_volume_target(path: str | Path) -> Path:
