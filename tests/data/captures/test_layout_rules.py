@@ -385,6 +385,15 @@ def test_old_matlab_files_of_either_order_and_damaged_ones(tmp_path):
         Capture.read(path)
 
 
+@pytest.mark.parametrize("link", [h5py.SoftLink("/there"), h5py.ExternalLink("/etc/passwd", "x")])
+def test_links_are_named(tmp_path, link):
+    write_mat(tmp_path / "a.mat", {"there": np.ones((9, 4, 4), np.float32)})
+    with h5py.File(tmp_path / "a.mat", "a") as file:
+        file["rect_data"] = link
+    with pytest.raises(StorageError, match=r"rect_data \(a link, which is not followed\), there"):
+        Capture.read(tmp_path / "a.mat")
+
+
 def test_orders_of_axes(tmp_path):
     path = made(grids(wall=SQUARE, size=(3, 3))["confocal"]).write(tmp_path / "a.h5", "zaragoza")
     expected = Capture.read(path)

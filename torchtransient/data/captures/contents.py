@@ -24,7 +24,8 @@ WHAT = "capture file"
 
 
 class Contents(Protocol):
-    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file.
+    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
+    names that lead elsewhere, which are not followed.
 
     ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
     ``structure/field``. ``text(name)`` likewise.
@@ -33,6 +34,7 @@ class Contents(Protocol):
     source: Path
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str]
+    links: frozenset[str]
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None: ...
     def text(self, name: str) -> str | None: ...
@@ -63,10 +65,18 @@ class Hdf5Contents:
             name: _sole(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
         }
 
+        self.links = frozenset(name for name in self.shapes if self._is_link(name))
+
+    def _is_link(self, name: str) -> bool:
+        """Whether there is no more than a way to elsewhere, or nothing."""
+        import h5py
+
+        return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
+
     def _shape(self, name: str) -> tuple[int, ...] | None:
         import h5py
 
-        if not isinstance(self._file.get(name, getlink=True), h5py.HardLink):
+        if self._is_link(name):
             return None
         found = self._file[name]
         return found.shape if isinstance(found, h5py.Dataset) else None
@@ -87,7 +97,7 @@ class Hdf5Contents:
         """The names in a structure; empty for what is none."""
         import h5py
 
-        if not isinstance(self._file.get(name, getlink=True), h5py.HardLink):
+        if self._is_link(name):
             return frozenset()
         found = self._file[name]
         return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
@@ -113,6 +123,7 @@ class MatContents:
         }
         self._kept: dict[str, Any] = {}
         self.attributes: Mapping[str, str] = {}
+        self.links: frozenset[str] = frozenset()
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         value: Any = self._variable(name.split("/")[0])

@@ -146,7 +146,8 @@ def _found(contents: Contents) -> Layout:
     for layout in LAYOUTS:
         if layout.recognises(contents):
             return layout
-    names = ", ".join(sorted(contents.shapes)) or "nothing"
+    held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
+    names = ", ".join(sorted(held)) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
         "is one of these; read it with h5py and make a tt.nlos.Capture if it is not."
