@@ -9,14 +9,14 @@ are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.data.entries import notes_of, text_of
 from torchtransient.errors import StorageError
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
@@ -40,10 +40,7 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
     target = check_volume_target(path)
     if not isinstance(volume, HiddenVolume):
         raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
-    try:
-        note = json.dumps(dict(volume.metadata))
-    except (TypeError, ValueError) as error:
-        raise StorageError(f"volume file: metadata must be plain data ({error}).") from error
+    note = metadata_text(volume.metadata, _WHAT)
     grid = volume.grid
     given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
     given |= {name: getattr(grid, name) for name in _VECTORS}
@@ -54,17 +51,18 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
 
 
 def read_volume(path: str | Path) -> HiddenVolume:
-    """Read what `write_volume` wrote, as tensors on the CPU.
+    """Read what `write_volume` wrote, as tensors on the CPU. What somebody put beside it is left alone.
 
     Raises StorageError when the file is missing, damaged or not a volume.
     """
-    found = read_arrays(path, FORMAT, _WHAT)
+    needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
+    known = {*needed, *optional, "format", "method", "metadata"}
+    found = read_arrays(path, FORMAT, _WHAT, known.__contains__)
     with damage_said(Path(path), _WHAT):
-        values = {name: torch.from_numpy(np.asarray(found[name])) for name in ("values", "depths", "pitch", *_VECTORS)}
-        more = {name: torch.from_numpy(np.asarray(found[name])) for name in ("times", "directions") if name in found}
+        values = {name: tensor_in(found[name]) for name in needed}
+        more = {name: tensor_in(found[name]) for name in optional if name in found}
         rows, columns = values["values"].shape[-2:]
         dy, dx = values["pitch"].tolist()
         vectors = {name: values[name] for name in _VECTORS}
         grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
-        metadata = json.loads(str(found["metadata"]))
-        return HiddenVolume(values["values"], grid, str(found["method"]), metadata, **more)
+        return HiddenVolume(values["values"], grid, text_of(found, "method"), notes_of(found, "metadata"), **more)

@@ -42,7 +42,7 @@ def choose_method(capture: Capture) -> Choice:
 
 def check_method(name: str, capture: Capture) -> Method:
     """The method of a name. Raises SceneError for unknown ones and for scans that it does not take."""
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise SceneError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
     if kind not in method.kinds:

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture
+from torchtransient.capture import Capture, Scan
+from torchtransient.capture.arithmetic import precision_of
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
-from torchtransient.quantities import finite, positive, shown
+from torchtransient.quantities import count, finite, positive, real_array, shown
 from torchtransient.reconstruction import (
     Backprojection,
     ConfocalCamera,
@@ -41,6 +42,8 @@ from torchtransient.volume_methods import FILTERS, Method
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
+# How far points are off one line, as a share of its length.
+_LINE = 1e-6
 
 
 def reconstruct(
@@ -76,6 +79,8 @@ def reconstruct(
     entry = check_method(choice.name, capture)
     options = {name: value for name, value in options.items() if value is not None}
     _check_options(choice.name, entry.options, options)
+    if grid is not None and not isinstance(grid, VoxelGrid):
+        raise ShapeError(f"reconstruct: expected grid as a tt.nlos.VoxelGrid, got {shown(grid)}.")
     if grid is not None and (depths is not None or not entry.free_grid):
         why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
         raise SceneError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
@@ -110,8 +115,11 @@ def default_grid(
 ) -> VoxelGrid:
     """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
     ``depths`` (near, far) in metres, None for all that a record reaches, and ``planes`` between them, None for one a
-    bin and 64 at most. Raises ShapeError, UnitError.
+    bin and 64 at most. Raises ShapeError, UnitError, and SceneError for a number of planes that is none, and where
+    sensor points on one line say nothing of an ``extent``.
     """
+    if not isinstance(capture, Capture):
+        raise ShapeError(f"reconstruct: expected a tt.nlos.Capture, got {shown(capture)}.")
     axis = capture.axis
     if axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
@@ -127,12 +135,25 @@ def default_grid(
         near, far = checked_depths(depths)
     if planes is None:
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
+    planes = count("reconstruct: planes", planes)
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64) + 0.5) / planes
+    if extent is None and not _spans_area(capture.scan):
+        raise SceneError(
+            f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
+            "and high a volume is. Give grid=default_grid(capture, extent=(width, height)) in metres, or another grid=."
+        )
     if size is None and extent is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
         size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
+
+
+def _spans_area(scan: Scan) -> bool:
+    """Whether sensor points are more than one, and not all on one line."""
+    points = scan.sensor_points.detach().cpu().reshape(-1, 3)
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    return len(spread) > 1 and bool(spread[1] > _LINE * spread[0])
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:
@@ -172,6 +193,9 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
                 f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
                 "Leave it out, or take another method."
             )
+    for option in ("target", "filter"):
+        if not isinstance(options.get(option, ""), str):
+            raise SceneError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
     if options.get("filter", FILTERS[0]) not in FILTERS:
         raise SceneError(f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}.")
     if options.get("filter") == "laplacian" and ("wavelength" in options or "cycles" in options):
@@ -284,8 +308,7 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
     """The operator of a method on some planes."""
     transient = capture.transient
     assert transient is not None
-    dtype = torch.float64 if transient.dtype == torch.float64 else torch.float32
-    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": dtype}
+    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": precision_of(transient)}
     if name == "bp" or options.get("filter") == "laplacian":
         return lambda grid: Backprojection(capture.scan, grid, **common)
     pulse = PhasorFilter(options["wavelength"], options.get("cycles", 4.0))
@@ -298,16 +321,22 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
 def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
     """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
 
-    Raises SceneError for unknown names and where times are missing or have no meaning.
+    Raises SceneError for unknown names, where times are missing or have no meaning, and for a count that is none,
+    UnitError for times that are not three finite numbers.
     """
-    if name == "direct":
+    if isinstance(name, str) and name == "direct":
         if times is not None:
             raise SceneError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
         return DirectLight()
     cameras = {"confocal": ConfocalCamera, "transient": TransientCamera}
-    if name not in cameras:
+    if not isinstance(name, str) or name not in cameras:
         raise SceneError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
     if times is None:
         raise SceneError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
-    start, stop, number = times
-    return cameras[name](torch.linspace(float(start), float(stop), int(number), dtype=torch.float64))
+    numbers = real_array(times)
+    if numbers is None or numbers.shape != (3,):
+        raise UnitError(f"reconstruct: expected times as (start, stop, count), got {shown(times)}.")
+    start, stop, number = numbers.tolist()
+    frames = count("reconstruct: count of times", number)
+    first, last = finite("reconstruct: times", start), finite("reconstruct: times", stop)
+    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64))

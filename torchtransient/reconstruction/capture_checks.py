@@ -121,15 +121,21 @@ def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
 
 
 def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tensor:
-    """The transient of a capture with the axis of an operator. Raises ShapeError for another axis, polarized light and
-    captures without a transient.
+    """The transient of a capture with the axis of an operator, to a millionth of a bin: edges may have been computed in
+    another way. Raises ShapeError for another axis, polarized light and captures without a transient.
     """
     transient, axis = checked_capture(capture, who)
     if capture.polarized:
         raise ShapeError(f"{who}: expected a capture of intensities, got Stokes components. Give its transient[0].")
-    if axis != time_axis:
+    if not _same_bins(axis, time_axis):
         raise ShapeError(f"{who}: expected a capture with {time_axis}, as the operator has, got {axis}.")
     return transient
+
+
+def _same_bins(a: TimeAxis, b: TimeAxis) -> bool:
+    tolerance = 1e-6 * b.bin_width_opl
+    near = abs(a.start_opl - b.start_opl) <= tolerance and abs(a.end_opl - b.end_opl) <= tolerance
+    return a.num_bins == b.num_bins and near
 
 
 def same_light(a: Scan, b: Scan) -> bool:

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from torchtransient.errors import ShapeError
-from torchtransient.quantities import shown
+from torchtransient.capture.arithmetic import summed
+from torchtransient.reconstruction.volume_checks import check_volume
 from torchtransient.reconstruction.voxels import VoxelGrid
 from torchtransient.tensor_record import TensorRecord
 
@@ -18,14 +18,14 @@ from torchtransient.tensor_record import TensorRecord
 class HiddenVolume(TensorRecord):
     """What a method found behind a corner.
 
-    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
-    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
+    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
     values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
     data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
 
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
     values and directions; grid and times stay on the CPU, and are the same in a batch. Raises ShapeError where tensors
-    and grid do not fit.
+    and grid do not fit, UnitError for times that are not finite, StorageError for metadata that is not plain.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
@@ -38,19 +38,7 @@ class HiddenVolume(TensorRecord):
     directions: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.grid, VoxelGrid):
-            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
-        frames = () if self.times is None else (len(self.times),)
-        self._check("values", self.values, (*frames, *self.grid.shape))
-        if self.directions is not None:
-            self._check("directions", self.directions, (3, *self.grid.shape))
-
-    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex():
-            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
-            sizes = ", ".join(map(str, shape))
-            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
+        check_volume(self)
 
     def tensors(self) -> dict[str, Tensor]:
         """Values and directions."""
@@ -73,5 +61,5 @@ class HiddenVolume(TensorRecord):
         values = self.values.detach()
         while values.ndim > per_item:
             values = values[0]
-        summed = values.sum(0)
-        return summed if self.times is None else summed.amax(0)
+        together = summed(values, 0)
+        return together if self.times is None else together.amax(0)

@@ -13,11 +13,12 @@ from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
 from torchtransient.data import capture_file
-from torchtransient.data.array_file import HDF5, check_folder, damage_said, hdf5_package, path_of
+from torchtransient.data.array_file import HDF5, check_folder, damage_said, path_of
 from torchtransient.data.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.data.captures.contents import WHAT, Contents, opened
 from torchtransient.data.captures.gaps import Gaps
 from torchtransient.data.hdf5_limits import read_attributes
+from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
@@ -157,7 +158,8 @@ def _found(contents: Contents) -> Layout:
     for layout in LAYOUTS:
         if layout.recognises(contents):
             return layout
-    names = ", ".join(sorted(contents.shapes)) or "nothing"
+    held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
+    names = ", ".join(sorted(held)) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
         "is one of these; read it with h5py and make a tt.nlos.Capture if it is not."
