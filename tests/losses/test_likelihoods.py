@@ -20,7 +20,7 @@ from torchtransient.losses import (
     poisson_nll,
     read_noise_nll,
 )
-from torchtransient.losses.likelihoods import armed_periods
+from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD, coates
 
 BINS = 20

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
-from torchtransient.quantities import finite, shown
+from torchtransient.quantities import finite, flag, shown
 
 Reduction = Literal["none", "sum", "mean"]
 
@@ -116,6 +116,32 @@ def check_level(
             f"({least:.1g} to {most:.1g}), got {got}."
         )
     return (value if isinstance(value, Tensor) else level).to(like.device, dtype)
+
+
+def check_option(
+    name: str,
+    value: Tensor | float | None,
+    where: str,
+    *,
+    needed: bool = False,
+    zero: bool = False,
+    square: bool = False,
+) -> None:
+    """`check_level` of what a module holds, before there are tensors that it goes with: in double precision.
+
+    None is the default of what is not `needed`.
+    """
+    if value is None:
+        if needed:
+            raise UnitError(f"{where}: expected {name}, a number, got None.")
+        return
+    shape, device = (value.shape, value.device) if isinstance(value, Tensor) else ((), None)
+    check_level(name, value, torch.empty(shape, dtype=torch.float64, device=device), where, zero=zero, square=square)
+
+
+def check_flag(name: str, value: bool, where: str) -> None:
+    """Raises SceneError for what is no truth value: a text that says no is true."""
+    flag(f"{where}: {name}", value)
 
 
 def holds(condition: Tensor) -> bool:
