@@ -353,3 +353,25 @@ def test_modules_check_their_options_when_made(case):
             with pytest.raises(TorchTransientError, match="expected") as caught:
                 case.module(**{**case.options, name: value})
             assert str(caught.value).startswith(case.module.__name__ + ":"), str(caught.value)
+
+
+@pytest.mark.slow
+@every
+def test_compiled(case):
+    """Values and gradients; likelihoods break the graph where they look at their values."""
+    x, y = case.tensors()
+    for mask in (None, mask_of(y)):
+        torch.compiler.reset()
+        leaves = [x.clone().requires_grad_() for _ in range(2)]
+        found = torch.compile(lambda x, y, m=mask: case(x, y, m, "none"), backend="aot_eager")(leaves[0], y)
+        wanted = case(leaves[1], y, mask, "none")
+        torch.testing.assert_close(found, wanted)
+        found.sum().backward()
+        wanted.sum().backward()
+        torch.testing.assert_close(leaves[0].grad, leaves[1].grad)
+    module = case.module(**case.options)
+    compiled = torch.compile(module, backend="aot_eager")
+    torch.testing.assert_close(compiled(*case.arguments(x, y)), module(*case.arguments(x, y)))
+    if case.function is not losses.read_noise_nll and case.draw_target is not None:
+        with pytest.raises(UnitError, match="expected rates"):
+            compiled(*case.arguments(-x, y))
