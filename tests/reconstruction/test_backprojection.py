@@ -14,12 +14,14 @@ from torchtransient.reconstruction import (
     Backprojection,
     FilteredBackprojection,
     LaplacianFilter,
+    PhasorField,
     PhasorFilter,
     VoxelGrid,
     backproject,
     ellipsoids,
     filtered_backproject,
 )
+from torchtransient.reconstruction.filters import sample_places
 from torchtransient.testing.point_captures import point_capture
 
 F64 = torch.float64
@@ -46,6 +48,14 @@ def written_out(scan, points, axis, falloff):
                 if 0 <= k < axis.num_bins:
                     matrix[k, row, column] += share * (to_spot * to_sensor) ** -falloff
     return matrix.reshape(axis.num_bins, *scan.shape, len(points))
+
+
+def lengths_of(scan, points):
+    """(V, pairs): laser spot - point - sensor point, with the legs where they count; spots vary slowest."""
+    spots, sensors = scan.laser_points.reshape(-1, 3), scan.sensor_points.reshape(-1, 3)
+    to_spot, to_sensor = torch.cdist(points, spots), torch.cdist(points, sensors)
+    apart = to_spot[:, :, None] + to_sensor[:, None] if scan.kind == "exhaustive" else to_spot + to_sensor
+    return (apart + scan.first_and_last_leg * scan.legs.reshape(apart.shape[1:])).flatten(1)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -150,6 +160,83 @@ def test_filtered_light_of_the_end_does_not_come_back_at_the_start():
     assert filtered[:40].abs().max() < 1e-12
 
 
+def pulse_at(pulse, lengths, width):
+    """The pulse's value at lengths from the middle of a bin of that width."""
+    height = torch.exp(-(lengths**2) / (2 * pulse.sigma**2)) * width / (pulse.sigma * math.sqrt(2 * math.pi))
+    return torch.polar(height, 2 * math.pi * lengths / pulse.wavelength)
+
+
+@pytest.mark.parametrize("wavelength, cycles", [(0.02, 4.0), (0.16, 40.0), (1.0, 4.0), (0.08, 20.0), (30.0, 0.5)])
+@pytest.mark.parametrize("samples", [1, 2, 3, 8])
+def test_rows_are_convolved_with_the_whole_pulse_and_do_not_wrap(wavelength, cycles, samples):
+    pulse, width, bins = PhasorFilter(wavelength, cycles), 0.01, 45
+    rows = torch.randn(2, bins, dtype=F64, generator=torch.Generator().manual_seed(0))
+    first, last = sample_places(bins, samples)
+    at = width * torch.arange(first, last, dtype=F64) / samples
+    # From end to end of the record.
+    assert (float(at[0]), float(at[-1])) == pytest.approx((-width * (samples // 2) / samples,
+                                                           width * (bins - 1 + samples // 2 / samples)))  # fmt: skip
+    matrix = pulse_at(pulse, at[:, None] - width * torch.arange(bins, dtype=F64), width)
+    found, expected = pulse.rows(rows, width, samples), rows.to(matrix) @ matrix.T
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+    back = torch.randn(2, len(at), dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+    expected = (back @ matrix.conj()).real
+    found = pulse.rows_adjoint(back, width, samples)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize(
+    "bins, cycles",
+    [(2.0, 4.0), (2.5, 4.0), (3.0, 3.0), (4.0, 4.0), (6.0, 0.5), (9.0, 1.0), (16.0, 0.25), (16.0, 4.0), (40.0, 4.0)],
+)
+@pytest.mark.parametrize("scan", ["confocal", "exhaustive, legs"])
+def test_filtered_light_is_the_pulse_at_every_length(scan, bins, cycles):
+    # Lines between samples of a wave lose (pi / n)^2 / 2 of it at most, n of them: 16 and more.
+    axis, scan, pulse = TimeAxis(0.02, 0.01, 90), SCANS[scan], PhasorFilter(0.01 * bins, cycles)
+    operator = FilteredBackprojection(scan, POINTS, time_axis=axis, filter=pulse, dtype=F64)
+    light = torch.rand(operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    lengths = lengths_of(scan, POINTS)
+    assert float(lengths.min()) > 0.03 and float(lengths.max()) < 0.9
+    matrix = pulse_at(pulse, lengths[..., None] - axis.centers_opl, 0.01)
+    expected = torch.einsum("vpt,tp->v", matrix, light.flatten(1).to(matrix))
+    assert (operator.adjoint(light) - expected).norm() < (math.pi / 16) ** 2 / 2 * expected.norm()
+
+
+@pytest.mark.parametrize("name", ["backprojection", "filtered backprojection"])
+def test_light_at_the_ends_of_a_record_does_not_reach_beyond_them(name):
+    # Before and behind the record there is nothing, not even nothing times NaN.
+    for axis in (TimeAxis(4.0, 0.05, 20), TimeAxis(-3.0, 0.05, 20)):
+        of = {"time_axis": axis, "dtype": F64}
+        scan = SCANS["confocal"]
+        operator = (Backprojection(scan, POINTS, **of) if name == "backprojection" else
+                    FilteredBackprojection(scan, POINTS, filter=PhasorFilter(0.2), **of))  # fmt: skip
+        light = torch.full(operator.data_shape, math.nan, dtype=F64)
+        assert not operator.adjoint(light).abs().any()
+        assert not operator(torch.full_like(operator.adjoint(light), math.nan)).any()
+
+
+def test_falloffs_that_a_precision_cannot_hold_are_refused():
+    scan, of = SCANS["confocal"], {"time_axis": AXIS}
+    for falloff in (50.0, -1000.0, 1000.0):
+        with pytest.raises(UnitError, match="falloff"):
+            Backprojection(scan, POINTS, falloff=falloff, **of)
+        with pytest.raises(UnitError, match="falloff"):
+            PhasorField(scan, VoxelGrid.before(scan, DEPTHS), pulse=PhasorFilter(0.1), falloff=falloff, **of)
+    for falloff in (4.0, -4.0):
+        # Distances in metres and in bins are far apart: neither overflows.
+        axis = TimeAxis(0.0, 1e-5, 60000)
+        operator = Backprojection(scan, POINTS, falloff=falloff, time_axis=axis)
+        r = lengths_of(scan, POINTS) / 2
+        found = operator.adjoint(torch.ones(operator.data_shape))
+        torch.testing.assert_close(found.double(), (r ** (-2 * falloff)).sum(1), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("kind", [torch.complex128, torch.bool])
+def test_points_of_other_numbers_are_refused(kind):
+    with pytest.raises(ShapeError, match="real numbers"):
+        Backprojection(SCANS["confocal"], POINTS.to(kind), time_axis=AXIS)
+
+
 def test_laplacian_of_quadratic_brightness():
     # -(a + b + c) times two inside, whatever the smoothing; zero for a linear one.
     z, y, x = torch.meshgrid(*(torch.arange(n, dtype=F64) for n in (15, 16, 17)), indexing="ij")
@@ -215,13 +302,17 @@ def test_filters_that_cannot_be_taken():
         Backprojection(scan, grid, falloff=math.nan, **of)
     with pytest.raises(ShapeError, match="PhasorFilter or a LaplacianFilter"):
         FilteredBackprojection(scan, grid, filter="pf", **of)
-    with pytest.raises(UnitError, match="two bins"):
-        FilteredBackprojection(scan, grid, filter=PhasorFilter(0.03), **of)
+    for kind, name in ((FilteredBackprojection, "filter"), (PhasorField, "pulse")):
+        with pytest.raises(UnitError, match="two bins"):
+            kind(scan, grid, **{name: PhasorFilter(0.03)}, **of)
+        with pytest.raises(UnitError, match="fourth of a bin"):
+            kind(scan, grid, **{name: PhasorFilter(0.1, 1e-6)}, **of)
     with pytest.raises(ShapeError, match="a VoxelGrid for a LaplacianFilter"):
         FilteredBackprojection(scan, POINTS, filter=LaplacianFilter(), **of)
     with pytest.raises(ShapeError, match="evenly spaced"):
         FilteredBackprojection(scan, grid.at_depths([0.1, 0.2, 0.4]), filter=LaplacianFilter(), **of)
-    for make in (lambda: PhasorFilter(0.0), lambda: PhasorFilter(1.0, -1.0), lambda: LaplacianFilter(math.inf)):
+    for make in (lambda: PhasorFilter(0.0), lambda: PhasorFilter(1.0, -1.0), lambda: LaplacianFilter(math.inf),
+                 lambda: LaplacianFilter(0.1)):  # fmt: skip
         with pytest.raises(UnitError):
             make()
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):

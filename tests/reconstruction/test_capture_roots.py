@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from torchtransient.errors import UnitError
-from torchtransient.reconstruction import StabilisedRoot, stabilised_root
+from support.grid_operators import AXIS, SCAN, SINGLE
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.reconstruction import FK, MidpointFK, StabilisedRoot, stabilised_root
 
 F64 = torch.float64
 VALUES = torch.tensor([-4.0, -0.5, 0.0, 1e-30, 1e-8, 1.0, 100.0, 1e12], dtype=F64)
@@ -42,3 +43,23 @@ def test_kinds_of_numbers():
         StabilisedRoot(-1.0)
     with pytest.raises(UnitError, match="finite"):
         stabilised_root(torch.ones(1), float("nan"))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, F64])
+def test_floors_that_a_precision_takes_for_zero(dtype):
+    least = torch.finfo(dtype).tiny
+    assert stabilised_root(torch.tensor([0.0, 1.0], dtype=dtype), least).tolist() == [0.0, 1.0]
+    with pytest.raises(UnitError, match="at least in"):
+        stabilised_root(torch.tensor([0.0, 1.0], dtype=dtype), least / 2)
+
+
+def test_roots_of_other_things_are_refused():
+    for transient in (torch.tensor([3 + 4j]), [1.0, 2.0], None):
+        with pytest.raises(ShapeError, match="real numbers"):
+            stabilised_root(transient)
+    for kind, scan in ((FK, SCAN), (MidpointFK, SINGLE)):
+        with pytest.raises(UnitError, match="floor"):
+            kind(scan, time_axis=AXIS, floor=1e-46)
+        operator = kind(scan, time_axis=AXIS, floor=1e-46, dtype=F64)
+        with pytest.raises(UnitError, match="floor"):
+            operator.float().reconstruct(torch.zeros(operator.data_shape))

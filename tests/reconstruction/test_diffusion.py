@@ -68,6 +68,50 @@ def test_deconvolution_undoes_the_slab_up_to_noise():
     assert alike(through) < alike(weak.reconstruct(through)) < alike(slab.reconstruct(through))
 
 
+def written_out(light, thickness, passes, pitch, width, reach):
+    """Light (T, Y, X) through a slab that reaches ``reach`` points beyond the scan, one crossing after the other."""
+    bins = len(light)
+    scattering, absorption, index, extrapolation = FOAM
+
+    def flash(count):
+        delay = width * torch.arange(count, dtype=F64)[:, None, None]
+        y, x = (p * torch.arange(-2 * reach, 2 * reach + 1, dtype=F64) for p in pitch)
+        return slab_transmittance(
+            delay, y[:, None] ** 2 + x**2, thickness=thickness, reduced_scattering=scattering,
+            absorption=absorption, index=index, extrapolation=extrapolation,
+        )  # fmt: skip
+
+    kernel = flash(bins) / flash(600).sum()
+    wide = torch.nn.functional.pad(light, (reach,) * 4)
+    for _ in range(passes):
+        late = torch.nn.functional.pad(wide, (2 * reach,) * 4 + (bins - 1, 0))
+        wide = torch.nn.functional.conv3d(late[None, None], kernel.flip(0)[None, None])[0, 0]
+    return wide[:, reach:-reach, reach:-reach]
+
+
+@pytest.mark.parametrize("thickness", [0.0254, 0.06, 0.1])
+@pytest.mark.parametrize("passes", [1, 2])
+def test_crossings_are_convolutions_that_do_not_wrap(thickness, passes):
+    axis, scan = TimeAxis(0.0, 0.04, 12), Scan.grid(Wall.plane(0.4, 0.3), (4, 3), kind="confocal")
+    operator = DiffusionDeconvolution(scan, time_axis=axis, thickness=thickness, passes=passes, dtype=F64)
+    light = torch.rand(operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    expected = written_out(light, thickness, passes, (0.1, 0.1), 0.04, 5)
+    torch.testing.assert_close(operator(light), expected, rtol=0, atol=1e-11 * float(expected.max()))
+
+
+@pytest.mark.parametrize("thickness", [0.0254, 0.1])
+def test_what_comes_into_a_record_does_not_depend_on_its_length(thickness):
+    scan, found = Scan.grid(Wall.plane(0.6, 0.6), 8, kind="confocal"), []
+    for bins in (32, 128, 256):
+        axis = TimeAxis(0.0, 0.0144, bins)
+        light = torch.zeros(bins, 8, 8, dtype=F64)
+        light[0, 3, 4] = 1.0
+        found.append(DiffusionDeconvolution(scan, time_axis=axis, thickness=thickness, dtype=F64)(light)[:32])
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=0, atol=1e-11 * float(found[0].max()))
+    assert float(found[0][0].abs().max()) < 1e-12 * float(found[0].max())
+
+
 def test_what_it_cannot_take_is_refused():
     axis = TimeAxis(0.0, 0.02, 32)
     for settings, message in (

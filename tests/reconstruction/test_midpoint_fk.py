@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -58,6 +59,35 @@ def test_moveout_brings_a_point_below_the_middle_to_its_confocal_time():
     mean = (moved * AXIS.centers_opl[:, None]).sum(0)[seen] / moved.sum(0)[seen]
     assert float((mean - 2 * z).abs().max()) < 0.005
 
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_moveout_is_linear_interpolation_with_nothing_outside_of_the_record(name):
+    # Written out for every pair; many lengths lie behind a record this short.
+    axis = TimeAxis(0.3, 0.04, 25)
+    midpoints = Midpoints(SCANS[name], time_axis=axis, dtype=F64)
+    light = 1 + torch.rand(midpoints.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
+    places, centers = math.prod(midpoints.wall.size), axis.centers_opl.numpy()
+    padded = np.concatenate([[centers[0] - 0.04], centers, [centers[-1] + 0.04]])
+    expected, pairs = np.zeros((25, places)), np.zeros(places)
+    columns = light.reshape(25, -1).numpy()
+    for pair, place in enumerate(midpoints.place.tolist()):
+        later = np.sqrt(centers**2 + float(midpoints.distance_squared[pair]))
+        row = np.concatenate([[0.0], columns[:, pair], [0.0]])
+        expected[:, place] += np.interp(later, padded, row, left=0.0, right=0.0)
+        pairs[place] += 1
+    expected = torch.from_numpy(expected / pairs.clip(1)).reshape(midpoints.volume_shape)
+    assert (expected[-1] == 0).any() and (expected[:, expected.sum(0) > 0] == 0).any()
+    torch.testing.assert_close(midpoints.adjoint(light), expected, rtol=0, atol=1e-12)
+    # Dark bins behind a record are the same record; what stands in its last bin does not reach beyond it.
+    longer = Midpoints(SCANS[name], time_axis=TimeAxis(0.3, 0.04, 40), dtype=F64)
+    dark = torch.cat([light, torch.zeros(15, *light.shape[1:], dtype=F64)])
+    torch.testing.assert_close(longer.adjoint(dark)[:25], midpoints.adjoint(light), rtol=0, atol=1e-12)
+    light[-1] = math.nan
+    behind = np.sqrt(centers[-1] ** 2 + midpoints.distance_squared.numpy()) > centers[-1] + 0.041
+    last = midpoints.adjoint(light)[-1].flatten()
+    alone = [p for p in range(places) if behind[midpoints.place.numpy() == p].all()]
+    assert len(alone) and not last[alone].isnan().any()
 
 @pytest.mark.parametrize("name, place", [("single", (0.0, 0.0, 0.8)), ("exhaustive", (0.1, -0.1, 0.9))])
 def test_points_come_out_where_they_are(name, place):

@@ -4,6 +4,7 @@ of its voxels, captures as data, typed errors.
 
 import copy
 import inspect
+import math
 import pickle
 from dataclasses import replace
 
@@ -14,8 +15,21 @@ import torchtransient.reconstruction as room
 from support import grid_operators, scan_operators
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import DeviceError, ShapeError, UnitError
-from torchtransient.reconstruction import LinearOperator, PlanarScan, confocal_operator
+from torchtransient.errors import DeviceError, SceneError, ShapeError, UnitError
+from torchtransient.reconstruction import (
+    FK,
+    LCT,
+    Backprojection,
+    DiffusionDeconvolution,
+    DirectionalLCT,
+    LinearOperator,
+    MidpointFK,
+    PhasorField,
+    PhasorFilter,
+    PlanarScan,
+    VoxelGrid,
+    confocal_operator,
+)
 from torchtransient.reconstruction.confocal_operator import InverseOperator
 
 ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
@@ -195,6 +209,68 @@ def test_works_where_its_tables_are(name):
         assert operator.reconstruct(data_of(operator, 2).to("meta")).shape == (2, *operator.volume_shape)
 
 
+@every
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+def test_autocast_does_not_reach_in(name, half):
+    operator = copy.deepcopy(OPERATORS[name]).float()
+    for function, make in ((operator, volume_of), (operator.adjoint, data_of)):
+        x = make(operator, 2).requires_grad_()
+        (slope,) = torch.autograd.grad(function(x).abs().sum(), x)
+        with torch.autocast("cpu", dtype=half):
+            found = function(x)
+            torch.testing.assert_close(found, function(x.detach()), rtol=0, atol=0)
+        torch.testing.assert_close(found, function(x), rtol=0, atol=0)
+        (other,) = torch.autograd.grad(found.abs().sum(), x)
+        torch.testing.assert_close(other, slope, rtol=0, atol=0)
+
+
+@every
+def test_batches_may_be_empty(name):
+    operator = OPERATORS[name]
+    for function, x, like in (
+        (operator, volume_of(operator, 2, 0).requires_grad_(), data_of(operator)),
+        (operator.adjoint, data_of(operator, 0).requires_grad_(), volume_of(operator)),
+    ):
+        found = function(x)
+        assert found.shape == (*x.shape[: x.ndim - (volume_of(operator).ndim if function is operator else
+                                                    data_of(operator).ndim)], *like.shape)  # fmt: skip
+        assert found.dtype == like.dtype
+        (slope,) = torch.autograd.grad(found.abs().sum(), x)
+        assert slope.shape == x.shape and slope.dtype == x.dtype
+    if hasattr(operator, "reconstruct"):
+        assert operator.reconstruct(data_of(operator, 0)).shape == (0, *operator.volume_shape)
+
+
+@every
+@pytest.mark.filterwarnings("ignore:Complex modules")
+def test_complex_tables_are_refused(name):
+    operator = copy.deepcopy(OPERATORS[name])
+    expected = operator.adjoint(data_of(operator))
+    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
+        operator.to(torch.complex64)
+    assert operator.dtype == torch.float64
+    torch.testing.assert_close(operator.adjoint(data_of(operator)), expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", [name for name in OPERATORS if name.startswith("inverse")])
+def test_inverses_are_operators_of_their_own(name):
+    operator = copy.deepcopy(OPERATORS[name].operator)
+    inverse = operator.inverse
+    y = data_of(operator)
+    expected = inverse(y)
+    operator.float()
+    assert inverse.dtype == torch.float64
+    torch.testing.assert_close(inverse(y), expected, rtol=0, atol=0)
+    inverse.float()
+    operator.double()
+    assert operator.dtype == torch.float64 and inverse.dtype == torch.float32
+    assert inverse(y).dtype == inverse.adjoint(inverse(y)).dtype == torch.float32
+    torch.testing.assert_close(operator.inverse(y), expected, rtol=0, atol=0)
+    # No copies of tables until then.
+    held = {table.data_ptr() for table in operator.buffers()}
+    assert {table.data_ptr() for table in operator.inverse.buffers()} == held
+
+
 # ----------------------------------------------------------------------------------------- places, captures, arguments
 
 
@@ -290,3 +366,64 @@ def test_grids_of_the_same_wall_are_told_from_others():
     assert not wall.matches(PlanarScan.of(scan.sensor_points, -scan.sensor_normals, who="test"))
     assert not wall.matches(PlanarScan.of(scan.sensor_points[:, 1:], scan.sensor_normals[:, 1:], who="test"))
     assert not isinstance(wall, Scan) and "5 x 6 points" in repr(wall)
+
+
+MADE = {
+    "fk": lambda scan, points, of: FK(scan["confocal"], **of),
+    "fk of a grid": lambda scan, points, of: FK(PlanarScan.of(scan["confocal"].sensor_points, who="test"), **of),
+    "lct": lambda scan, points, of: LCT(scan["confocal"], **of),
+    "midpoint fk": lambda scan, points, of: MidpointFK(scan["single"], **of),
+    "backprojection": lambda scan, points, of: Backprojection(scan["confocal"], points, **of),
+    "phasor field": lambda scan, points, of: PhasorField(
+        scan["single"], VoxelGrid.before(scan["single"], [0.1]), pulse=PhasorFilter(0.1), **of
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_what_the_caller_does_to_its_points_later_does_not_matter(name):
+    scans = {
+        kind: Scan.grid(grid_operators.WALL, (4, 3), kind=kind).detach() for kind in ("confocal", "single")
+    }
+    # Points that are not leaves of a graph: they are copied, and operators are.
+    moved = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    given = {kind: scan.detach() for kind, scan in scans.items()}
+    for kind, scan in given.items():
+        points = scan.sensor_points + moved
+        given[kind] = replace(scan, sensor_points=points, laser_points=points if kind == "confocal" else
+                              scan.laser_points + moved)  # fmt: skip
+    points = torch.tensor([[0.0, 0.01, 0.2], [0.02, 0.0, 0.3]], dtype=torch.float64)
+    operator = MADE[name](given, points, {"time_axis": grid_operators.AXIS, "dtype": torch.float64})
+    y, places = data_of(operator), operator.points.clone()
+    expected = operator.adjoint(y)
+    points += 0.3
+    with torch.no_grad():
+        for scan in given.values():
+            scan.sensor_points.mul_(1.3)
+    again = copy.deepcopy(operator).float().double()
+    torch.testing.assert_close(again.adjoint(y), expected, rtol=0, atol=0)
+    torch.testing.assert_close(again.points, places, rtol=0, atol=0)
+    torch.testing.assert_close(operator.points, places, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("value", [{}, ["fk"], None, True, torch.tensor([1, 2]), 2.5])
+def test_choices_that_are_none(value):
+    of = {"time_axis": grid_operators.AXIS}
+    for kind in (FK, LCT, DirectionalLCT):
+        with pytest.raises(SceneError, match="target"):
+            kind(grid_operators.SCAN, target=value, **of)
+    with pytest.raises(SceneError, match="taps"):
+        FK(grid_operators.SCAN, taps=value, **of)
+    with pytest.raises(UnitError, match="passes"):
+        DiffusionDeconvolution(grid_operators.SCAN, passes=value, **of)
+
+
+@pytest.mark.parametrize("kind", [LCT, DirectionalLCT, DiffusionDeconvolution])
+def test_ratios_that_single_precision_cannot_hold(kind):
+    of = {"time_axis": grid_operators.AXIS}
+    for snr in (1e-20, 1e20):
+        operator = kind(grid_operators.SCAN, snr=snr, **of)
+        assert operator.reconstruct(torch.ones(operator.data_shape)).isfinite().all()
+    for snr in (1e-60, 1e60, 0.0, math.inf, None):
+        with pytest.raises(UnitError, match="snr"):
+            kind(grid_operators.SCAN, snr=snr, **of)

@@ -145,9 +145,107 @@ def test_what_cannot_be_taken():
         depth_map(torch.zeros(grid.shape), grid, threshold=2.0)
     with pytest.raises(UnitError, match="sharpness"):
         soft_depth(torch.zeros(grid.shape), grid, sharpness=0.0)
+    with pytest.raises(UnitError, match="sharpness"):
+        soft_depth(torch.zeros(grid.shape), grid, sharpness=1e50)
     with pytest.raises(ShapeError, match="knows its axes"):
         normals_from_depth(torch.zeros(9, 9), UNEVEN)
     with pytest.raises(ShapeError, match="expected depths"):
         normals_from_depth(torch.zeros(8, 9), grid)
     with pytest.raises(ShapeError, match="two planes"):
         normals_from_volume(torch.zeros(1, 9, 9), grid.at_depths([0.5]))
+
+
+SURFACES = {
+    "depth_map": lambda v, grid: depth_map(v, grid).depth,
+    "soft_depth": soft_depth,
+    "normals_from_volume": normals_from_volume,
+    "normals_from_depth": lambda v, grid: normals_from_depth(v[..., 0, :, :], grid),
+}
+each = pytest.mark.parametrize("name", SURFACES)
+
+
+@pytest.mark.parametrize("name", ["depth_map", "soft_depth", "normals_from_volume"])
+@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
+def test_half_precision_is_computed_in_single(name, half):
+    grid = grid_of(torch.linspace(0.3, 0.9, 512, dtype=F64))
+    volume = slanted(grid, 0.2, 0.1, 0.1)[0].to(half)
+    found, expected = SURFACES[name](volume, grid), SURFACES[name](volume.double(), grid)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
+    single = volume.float()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(SURFACES[name](single, grid), SURFACES[name](volume, grid), rtol=0, atol=0)
+
+
+@each
+def test_autocast_does_not_reach_in(name):
+    grid = grid_of(UNEVEN)
+    volume = torch.rand(2, *grid.shape, generator=torch.Generator().manual_seed(1))
+    expected = SURFACES[name](volume, grid)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(SURFACES[name](volume, grid), expected, rtol=0, atol=0)
+
+
+def test_planes_that_single_precision_does_not_tell_apart():
+    # A hundred metres away, where neighbouring numbers are 8e-6 m apart.
+    grid = grid_of(100 + 2.5e-6 * torch.arange(64, dtype=F64))
+    volume = torch.rand(grid.shape, generator=torch.Generator().manual_seed(1))
+    for function in (SURFACES["depth_map"], soft_depth):
+        found, expected = function(volume, grid), function(volume.double(), grid)
+        assert (found.double() - expected).abs().max() < 1e-5
+    torch.testing.assert_close(
+        normals_from_volume(volume, grid).double(), normals_from_volume(volume.double(), grid), rtol=0, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("strange", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
+    volume = torch.rand(2, 8, 3, 3, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    broken = volume.clone()
+    broken[0, 2, 1, 1] = strange
+    found, whole = depth_map(broken, UNEVEN), depth_map(volume, UNEVEN)
+    other = torch.ones(2, 3, 3, dtype=torch.bool)
+    other[0, 1, 1] = False
+    assert found.confidence[0, 1, 1] == 0 and not found.mask[0, 1, 1] and found.depth[0, 1, 1].isfinite()
+    torch.testing.assert_close(found.depth[other], whole.depth[other], rtol=0, atol=0)
+    assert torch.equal(found.mask[1], whole.mask[1]) and found.mask[0].sum() >= 7
+    (slope,) = torch.autograd.grad(found.depth.sum() + found.confidence.sum(), volume)
+    assert slope.isfinite().all()
+
+
+def test_confidence_of_the_dark_has_no_slope():
+    dark = torch.zeros(2, 8, 3, 3, requires_grad=True)
+    (slope,) = torch.autograd.grad(depth_map(dark, UNEVEN).confidence.sum(), dark, create_graph=True)
+    (again,) = torch.autograd.grad(slope.sum(), dark, allow_unused=True)
+    assert not slope.any() and (again is None or not again.any())
+
+
+@pytest.mark.parametrize("scale", [1e-38, 1e-25, 1e-12, 1.0, 1e12, 1e25])
+def test_nothing_depends_on_the_unit_of_the_volume(scale):
+    grid = grid_of(UNEVEN)
+    volume = slanted(grid, 0.2, 0.1, 0.1)[0].float()
+    for name in ("depth_map", "soft_depth", "normals_from_volume"):
+        found, expected = SURFACES[name](volume * scale, grid), SURFACES[name](volume, grid)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
+@each
+@pytest.mark.parametrize("lead", [(0,), (2, 0)])
+def test_batches_may_be_empty(name, lead):
+    grid = grid_of(UNEVEN)
+    like = SURFACES[name](torch.rand(grid.shape), grid)
+    volume = torch.zeros(*lead, *grid.shape, requires_grad=True)
+    found = SURFACES[name](volume, grid)
+    assert found.shape == (*lead, *like.shape)
+    assert torch.autograd.grad(found.sum(), volume)[0].shape == volume.shape
+    if name in ("depth_map", "soft_depth"):
+        assert SURFACES[name](torch.zeros(8, 0, 3), UNEVEN).shape == (0, 3)
+
+
+def test_depths_that_are_none():
+    for function in (depth_map, soft_depth):
+        for depths in ([1.0, 2.0, math.inf], [math.nan, 1.0, 2.0]):
+            with pytest.raises(UnitError, match="finite depths"):
+                function(torch.rand(3, 2, 2), depths)
+        with pytest.raises(ShapeError, match="expected depths"):
+            function(torch.rand(0, 2, 2), [])

@@ -1,13 +1,16 @@
 """Where the voxels of a grid stand."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.reconstruction import VoxelGrid
+from torchtransient.reconstruction import FK, VoxelGrid
 
 F64 = torch.float64
 WALL = Wall.plane(1.2, 0.8, center=(1.0, 2.0, 3.0), normal=(0.6, 0.0, 0.8))
@@ -104,3 +107,43 @@ def test_walls_that_are_at_right_angles_to_a_share_of_their_pitch_have_voxels():
     # The lean itself over seven rows; lengths along it are longer by its square.
     assert float(off.max()) == pytest.approx(5e-4 * 7 / 8, rel=5e-4)
     assert float(grid.along_x @ grid.along_y) == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_without_normals_voxels_stand_where_sensor_and_laser_do(turned, side):
+    points = SCAN.sensor_points.flip(1) if turned else SCAN.sensor_points
+    middle = points.mean((0, 1))
+    at, aside = middle + side * 0.7 * NORMAL, middle + side * 0.2 * NORMAL
+    scan = Scan.points(points, kind="confocal", sensor_origin=at, laser_origin=aside)
+    for grid in (
+        VoxelGrid.before(scan, [0.5]), VoxelGrid.before(scan, [0.5], size=3),
+        FK(scan, time_axis=TimeAxis(0.0, 0.1, 8)).grid,
+    ):  # fmt: skip
+        heights = (grid.points - middle) @ NORMAL
+        assert (side * heights > 0).all()
+    # Normals say it themselves; origins in the wall or on both sides do not.
+    assert (VoxelGrid.before(SCAN, [0.5]).normal - NORMAL).norm() < 1e-12
+    for sensor, laser in ((at, middle), (middle, middle), (at, middle - side * 0.2 * NORMAL)):
+        unknown = Scan.points(points, kind="confocal", sensor_origin=sensor, laser_origin=laser)
+        grid = VoxelGrid.before(unknown, [0.5])
+        assert torch.equal(grid.normal, torch.linalg.cross(grid.along_x, grid.along_y))
+
+
+def test_numbers_of_other_kinds():
+    box = [[0, 0, 0], [1, 1, 1]]
+    assert VoxelGrid.bounds(box, np.int64(2)) == VoxelGrid.bounds(box, 2.0) == VoxelGrid.bounds(box, (2, 2, 2))
+    assert VoxelGrid.bounds(box, torch.tensor([2, 3, 4])).shape == (4, 3, 2)
+    for size in ("2", None, [[1, 2, 3]], {}):
+        with pytest.raises(ShapeError, match="size"):
+            VoxelGrid.bounds(box, size)
+    for size in (2.5, True, math.nan, -1):
+        with pytest.raises((SceneError, ShapeError), match="size"):
+            VoxelGrid.bounds(box, size)
+    grid = VoxelGrid.before(SCAN, [0.1])
+    for name, value in (("size", 2), ("pitch", 0.1), ("size", (2, 2, 2)), ("pitch", None), ("size", "ab")):
+        with pytest.raises(ShapeError, match=f"VoxelGrid: {name}"):
+            replace(grid, **{name: value})
+    for name in ("first", "along_x", "normal"):
+        with pytest.raises(UnitError, match=f"{name} of finite"):
+            replace(grid, **{name: [math.nan, 0.0, 0.0]})

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import shown
-from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.quantities import positive, shown
+from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
 PRECISIONS = (torch.float32, torch.float64)
+# Signal-to-noise ratios that a Wiener filter in single precision tells from none and from infinite ones.
+SNR = (1e-20, 1e20)
 
 
 def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
@@ -21,6 +26,24 @@ def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
     if dtype not in PRECISIONS:
         raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {shown(dtype)}.")
     return dtype
+
+
+def within(name: str, value: Any, low: float, high: float) -> float:
+    """``value`` as a float. Raises UnitError unless it lies between the two, beyond which single precision has zero or
+    nothing left.
+    """
+    number = positive(name, value)
+    if not low <= number <= high:
+        raise UnitError(f"{name}: expected a number from {low:g} to {high:g}, got {shown(value)}.")
+    return number
+
+
+def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
+    """``value`` where it equals one of ``options``, texts or whole numbers. Raises SceneError for others."""
+    for option in options:
+        if isinstance(value, str | int | np.integer) and not isinstance(value, bool) and value == option:
+            return option
+    raise SceneError(f"{name}: expected one of {', '.join(map(str, options))}, got {shown(value)}.")
 
 
 def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
@@ -38,14 +61,29 @@ def checked_scan(scan: Scan, who: str) -> Scan:
 
 
 def checked_points(points: Any, who: str) -> Tensor:
-    """Points (..., 3), float64 on the CPU, detached. Raises ShapeError, and UnitError for some that are not finite."""
+    """A copy of points (..., 3), float64 on the CPU, detached. Raises ShapeError, and UnitError for some that are not
+    finite.
+    """
     if not isinstance(points, Tensor) or points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
         got = tuple(points.shape) if isinstance(points, Tensor) else shown(points)
         raise ShapeError(f"{who}: expected a VoxelGrid or points (..., 3) as a tensor, got {got}.")
-    plain = points.detach().to("cpu", torch.float64)
+    check_real(points, f"{who}: points")
+    plain = points.detach().to("cpu", torch.float64, copy=True)
     if not bool(torch.isfinite(plain).all()):
         raise UnitError(f"{who}: expected finite points in metres, got some that are not.")
     return plain
+
+
+def check_falloff(falloff: float, nearest: float, farthest: float, dtype: torch.dtype, who: str) -> None:
+    """Raises UnitError where powers of ``nearest`` to ``farthest``, products of two distances in m^2, are beyond what a
+    precision holds.
+    """
+    most = abs(falloff) * max(abs(math.log10(nearest)), abs(math.log10(max(farthest, nearest))))
+    if most > 0.8 * math.log10(torch.finfo(dtype).max):
+        raise UnitError(
+            f"{who}: expected a falloff whose factors {dtype} holds, got {falloff:g} at distances whose products are "
+            f"{nearest:.3g} to {farthest:.3g} m^2. Light falls with powers of 0 to 4."
+        )
 
 
 def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:

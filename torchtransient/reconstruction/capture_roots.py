@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import UnitError
-from torchtransient.quantities import finite
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import finite, shown
 
 COUNTS_FLOOR = 0.25
 """Floor for photon counts: the slope is at most 2, the root of one count 0.89, that of none zero."""
@@ -21,11 +21,15 @@ def stabilised_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
 
     ``floor``: in the unit of the transient, 1/4 for photon counts; a small part of the brightest bin for radiance. With
     0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero there.
-    Differentiable any number of times, in both modes. Whole numbers become float32. Raises UnitError for a floor below
-    zero.
+    Differentiable any number of times, in both modes. Whole numbers become float32. Values must be finite. Raises
+    UnitError for a floor below zero and for one that the transient's precision takes for zero, ShapeError for what is
+    no tensor of real numbers.
     """
-    floor = checked_floor(floor)
+    if not isinstance(transient, Tensor) or transient.is_complex():
+        got = transient.dtype if isinstance(transient, Tensor) else shown(transient)
+        raise ShapeError(f"stabilised_root: expected a transient as a tensor of real numbers, got {got}.")
     h = transient if transient.is_floating_point() else transient.to(torch.float32)
+    floor = checked_floor(floor, h.dtype)
     if floor:
         return h * torch.rsqrt(h.abs() + floor)
     empty = h == 0
@@ -48,9 +52,15 @@ class StabilisedRoot(nn.Module):
         return f"floor={self.floor:g}"
 
 
-def checked_floor(value: float) -> float:
-    """A floor of :func:`stabilised_root`. Raises UnitError."""
+def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
+    """A floor of :func:`stabilised_root` in a precision. Raises UnitError."""
     floor = finite("stabilised_root: floor", value)
     if floor < 0:
         raise UnitError(f"stabilised_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
+    # Smaller ones vanish or have few digits, and empty bins would be zero over zero.
+    if 0 < floor < (least := torch.finfo(dtype).tiny):
+        raise UnitError(
+            f"stabilised_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. Scale "
+            "the transient, or take double precision."
+        )
     return floor

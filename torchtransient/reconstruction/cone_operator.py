@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError
-from torchtransient.quantities import count, positive, shown
+from torchtransient.quantities import count
+from torchtransient.reconstruction.capture_checks import SNR, one_of, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator, chunk_rows
 from torchtransient.reconstruction.light_cone import ConeGrid, Resampling
 from torchtransient.reconstruction.linear import each
@@ -43,9 +43,7 @@ class ConeOperator(ConfocalOperator):
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
         who = type(self).__name__
-        if target not in FALL:
-            raise SceneError(f"{who}: expected target to be one of {', '.join(FALL)}, got {shown(target)}.")
-        self.target, self.snr = target, positive(f"{who}: snr", snr)
+        self.target, self.snr = one_of(f"{who}: target", target, FALL), within(f"{who}: snr", snr, *SNR)
         self.v_bins = time_axis.num_bins if v_bins is None else count(f"{who}: v_bins", v_bins, 4)
         self.cone = ConeGrid.of(time_axis, self.wall, self.v_bins, who)
         self._set_tables()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, Self
 
@@ -41,13 +42,14 @@ class ConfocalOperator(TransientOperator):
 
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         who = type(self).__name__
-        wall, bins = confocal_wall(scan, who), checked_axis(time_axis, who).num_bins
+        confocal_wall(scan, who)
+        bins = checked_axis(time_axis, who).num_bins
         if bins < LEAST_BINS:
             raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        self.wall = wall
-        self.grid = VoxelGrid.of_wall(wall, time_axis.centers_opl / 2)
-        self.data_shape = (bins, *wall.size)
+        self.wall = confocal_wall(self.scan, who)
+        self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
+        self.data_shape = (bins, *self.wall.size)
         self.volume_shape = self.data_shape
 
     @property
@@ -61,12 +63,16 @@ class ConfocalOperator(TransientOperator):
 
 class InverseOperator(LinearOperator):
     """A regularised inverse of an operator, itself a linear operator: from its data to its volume, whose
-    ``points``, ``depths`` and ``grid`` it has.
+    ``points``, ``depths`` and ``grid`` it has. It shares the operator's tables until one of them is moved or converted,
+    which leaves the other as it was.
     """
 
     def __init__(self, operator: ConfocalOperator) -> None:
         super().__init__()
-        self.operator = operator
+        # Modules that share tables but not the lists of them.
+        self.operator = copy.copy(operator)
+        for name in ("_buffers", "_parameters", "_modules"):
+            setattr(self.operator, name, dict(getattr(operator, name)))
         self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
         self.dtype = operator.dtype
 

@@ -19,11 +19,15 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import UnitError
 from torchtransient.quantities import finite, positive
+from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
 
 IMAGES = 20
+# Spacings to both sides that hold a Gaussian of two of them; steps of a sum in time; the least share of the light that
+# a record has to hold.
+NARROW, MOST_STEPS, SHARE_OF_LIGHT = 14, 1 << 15, 1e-30
 # Room-temperature foam of the paper: reduced scattering and absorption per metre, index, length behind its sides at
 # which the fluence vanishes.
 FOAM = (262.0, 0.53, 1.12, 0.0036)
@@ -69,8 +73,9 @@ class DiffusionDeconvolution(ConfocalOperator):
 
     ``thickness``, ``extrapolation`` in metres, ``reduced_scattering``, ``absorption`` per metre; the defaults are those
     of the paper's foam. ``snr``: power of the light over that of the noise where nothing is lost, at frequency zero;
-    what the slab takes more than that cannot come back. Light is kept: the kernel's sum is one. Time, height and width
-    are padded to twice their size.
+    what the slab takes more than that cannot come back. Light is kept: of all that comes through, however late and far
+    aside, the sum is one, and what comes into the record does not depend on its length. The convolutions are linear:
+    nothing wraps around in time or along the slab, between the two crossings either.
 
     Not supported: slabs apart from the wall, refraction at their far side, light that misses them. Raises ShapeError
     for scans it cannot take, UnitError for quantities out of range.
@@ -93,37 +98,71 @@ class DiffusionDeconvolution(ConfocalOperator):
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)
-        if passes not in (1, 2):
+        if isinstance(passes, bool) or not isinstance(passes, int) or passes not in (1, 2):
             raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={passes!r}.")
-        self.passes, self.snr = int(passes), positive(f"{who}: snr", snr)
+        self.passes, self.snr = passes, within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
         """``kernel`` (2 T, 2 Y, X + 1, 2): the transform of what the slab makes of one flash, real and imaginary."""
-        bins, rows, columns = self.data_shape
-        # Delays, whose origin is the moment when light enters: bin k of the capture gets light of bin k - l by delay l.
-        delay = self.axis.bin_width_opl * torch.arange(2 * bins, dtype=torch.float64)
-        y, x = (
-            torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64) * pitch
+        (bins, rows, columns), width = self.data_shape, self.axis.bin_width_opl
+        light, spread = self._flash(width * torch.arange(bins, dtype=torch.float64))
+        along = [
+            _gaussians(spread, torch.arange(self._reach(n, pitch, spread), dtype=torch.float64) * pitch)
             for n, pitch in zip((rows, columns), self.grid.pitch, strict=True)
-        )
+        ]
+        kernel = _crossed(light, *along, passes=self.passes, size=(rows + 1, columns + 1)).clamp_min_(0)
+        kernel /= max(self._total(), 1e-300) ** self.passes
+        if not float(kernel.sum()) > SHARE_OF_LIGHT:
+            raise UnitError(
+                f"DiffusionDeconvolution: expected a slab whose light falls into the record, got none within "
+                f"{bins * width:.3g} m of optical path. Let the time axis be longer, or the slab thinner."
+            )
+        # Later light than the record's would come round as early light; displacements are the same to both sides.
+        whole = torch.zeros(2 * bins, 2 * rows, 2 * columns, dtype=torch.float64)
+        whole[:bins, : rows + 1, : columns + 1] = kernel
+        whole[:bins, rows + 1 :] = whole[:bins, 1:rows].flip(1)
+        whole[..., columns + 1 :] = whole[..., 1:columns].flip(2)
+        return {"kernel": torch.view_as_real(torch.fft.rfftn(whole))}
+
+    def _flash(self, delay: Tensor) -> tuple[Tensor, Tensor]:
+        """Light (D,) of a pencil beam straight behind the slab by ``delay`` (D,), metres, and s (D,) of the Gaussian
+        exp(-rho^2 / s) over which it is spread.
+        """
         reduced_scattering, absorption, index, extrapolation = self.properties
-        flash = slab_transmittance(
-            delay[:, None, None],
-            y[:, None] ** 2 + x**2,
+        light = slab_transmittance(
+            delay,
+            torch.zeros((), dtype=torch.float64),
             thickness=self.thickness,
             reduced_scattering=reduced_scattering,
             absorption=absorption,
             index=index,
             extrapolation=extrapolation,
         ).clamp_min(0)
-        total = float(flash.sum())
-        if not total > 0:
-            raise UnitError(
-                f"DiffusionDeconvolution: expected a slab whose light falls into the record, got none within "
-                f"{float(delay[-1]):.3g} m of optical path. Let the time axis be longer, or the slab thinner."
-            )
-        return {"kernel": torch.view_as_real(torch.fft.rfftn(flash / total) ** self.passes)}
+        # Delay zero has no light: any width will do.
+        travelled = torch.where(delay > 0, delay, torch.ones_like(delay)) / index
+        return light, 4 / (3 * (absorption + reduced_scattering)) * travelled
+
+    def _total(self) -> float:
+        """The sum over all bins and points of light that passes once, however late and far aside."""
+        reduced_scattering, absorption, index, extrapolation = self.properties
+        diffusion = 1 / (3 * (absorption + reduced_scattering))
+        decay = (absorption + diffusion * (math.pi / (self.thickness + 2 * extrapolation)) ** 2) / index
+        # Sums of a smooth function do not depend on fine steps.
+        step = max(self.axis.bin_width_opl, 40 / decay / MOST_STEPS)
+        light, spread = self._flash(step * torch.arange(math.ceil(40 / (decay * step)) + 2, dtype=torch.float64))
+        for pitch in self.grid.pitch:
+            light = light * _sum_of_gaussians(spread, pitch)
+        return float(light.sum()) * step / self.axis.bin_width_opl
+
+    def _reach(self, points: int, pitch: float, spread: Tensor) -> int:
+        """Displacements on one side that light between two crossings of the slab may have: so many that what strays
+        farther is less than 1e-12 of what comes to the scan.
+        """
+        if self.passes == 1:
+            return points + 1
+        strays = 28 * float(spread.amax()) / pitch**2
+        return max(2 * points, math.ceil((points + math.sqrt(points**2 + strays)) / 2)) + 1
 
     def map_(self, x: Tensor) -> Tensor:
         return each(lambda item: self._filtered(item, torch.view_as_complex(self.kernel)), x, 3)
@@ -185,3 +224,42 @@ def _slab_properties(properties: tuple[float, float, float, float], who: str) ->
         positive(f"{who}: index", index),
         positive(f"{who}: extrapolation length", extrapolation),
     )
+
+
+def _gaussians(spread: Tensor, at: Tensor) -> Tensor:
+    """exp(-x^2 / spread), (D, N)."""
+    return torch.exp(-at.square() / spread[:, None])
+
+
+def _sum_of_gaussians(spread: Tensor, pitch: float) -> Tensor:
+    """The sum of exp(-(k pitch)^2 / spread) over all whole numbers k; wide ones as their integral, right to 1e-16."""
+    k = torch.arange(-NARROW, NARROW + 1, dtype=torch.float64)
+    wide = spread > (2 * pitch) ** 2
+    return torch.where(wide, torch.sqrt(math.pi * spread) / pitch, _gaussians(spread, k * pitch).sum(1))
+
+
+def _crossed(light: Tensor, along_y: Tensor, along_x: Tensor, *, passes: int, size: tuple[int, int]) -> Tensor:
+    """(D, *size): ``light`` (D,) times Gaussians (D, Ny) and (D, Nx) of displacements from zero on, which are the same
+    to both sides; ``passes=2``: convolved with itself in time and along the slab.
+    """
+    if passes == 1:
+        return light[:, None, None] * along_y[:, : size[0], None] * along_x[:, None, : size[1]]
+    # Cosine transforms, in which places are multiplied while delays are convolved.
+    (to_y, from_y), (to_x, from_x) = (_cosines(a.shape[1]) for a in (along_y, along_x))
+    of_y, of_x = along_y @ to_y, (along_x @ to_x) * light[:, None]
+    count = len(light)
+    found = light.new_empty(count, size[0], of_x.shape[1])
+    for k in range(of_x.shape[1]):
+        once = torch.fft.rfft((of_x[:, k, None] * of_y).T.contiguous(), n=2 * count)
+        twice = torch.fft.irfft(once.square_(), n=2 * count)[:, :count]
+        found[..., k] = twice.T @ from_y[:, : size[0]]
+    return found @ from_x[:, : size[1]]
+
+
+def _cosines(count: int) -> tuple[Tensor, Tensor]:
+    """Transform (N, N) of an even function of period 2 N - 2 from its values at 0 ... N - 1, and its inverse."""
+    k = torch.arange(count, dtype=torch.float64)
+    turns = k[:, None] * k / (2 * (count - 1))
+    matrix = torch.cos(2 * math.pi * (turns - turns.round())) * 2
+    matrix[0], matrix[-1] = matrix[0] / 2, matrix[-1] / 2
+    return matrix, matrix / (2 * (count - 1))

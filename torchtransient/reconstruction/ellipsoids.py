@@ -1,7 +1,7 @@
 """Rows of transients against voxels: light of one length comes from an ellipsoid around laser spot and sensor point.
 
 Nothing that has the size of voxels times pairs is ever held: lengths are computed anew, a few rows and a tile of voxels
-at a time, in units of bins.
+at a time, in units of samples.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import UnitError
 from torchtransient.quantities import finite
+from torchtransient.reconstruction.capture_checks import check_falloff
+from torchtransient.reconstruction.filters import sample_places
 from torchtransient.reconstruction.scan_operator import ScanOperator
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -28,8 +30,8 @@ CPU_TILE = 1 << 14
 GROUP_NUMBERS = 1 << 19
 # Laser spots of a group, whose distances to a tile are kept while sensor points take turns.
 MOST_SPOTS = 64
-# Zeros around each row: one before, two behind, so that interpolation beyond an end reads them.
-_PAD = 3
+# Zeros around each row: two before and two behind, so that interpolation beyond an end reads nothing but them.
+_BEFORE, _PAD = 2, 4
 
 
 @dataclass(frozen=True)
@@ -51,44 +53,64 @@ class EllipsoidOperator(ScanOperator):
     """Linear interpolation in time of what each pair of a scan measures of each voxel, and its transpose.
 
     ``falloff``: p of the factor (r_laser r_sensor)^-p, distances in metres, which no distance below half a bin makes
-    larger. Otherwise as :class:`ScanOperator`. Raises UnitError for a falloff that is not finite.
+    larger. ``samples``: how many values of a row stand in a bin (:func:`sample_places`). Otherwise as
+    :class:`ScanOperator`. Raises UnitError for a falloff that is not finite or beyond what the precision holds.
     """
 
     def __init__(
-        self, scan: Scan, points: VoxelGrid | Tensor, *, time_axis: TimeAxis, falloff: float, dtype: torch.dtype
+        self,
+        scan: Scan,
+        points: VoxelGrid | Tensor,
+        *,
+        time_axis: TimeAxis,
+        falloff: float,
+        dtype: torch.dtype,
+        samples: int = 1,
     ) -> None:
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         self.falloff = finite(f"{type(self).__name__}: falloff", falloff)
+        self.samples, self.step = samples, time_axis.bin_width_opl / samples
+        first, last = sample_places(time_axis.num_bins, samples)
+        self.row_length = last - first
         self._set_tables()
-        longest = 2.0 * float(self.voxels.abs().max() + self.sensors.abs().max() + self.lasers.abs().max())
-        if not longest < 1e9:
-            raise UnitError(
-                f"{type(self).__name__}: expected points within 1e9 bins of each other, got some {longest:.3g} bins "
-                "away. Lengths are in metres."
-            )
 
     def tables(self) -> dict[str, Tensor]:
-        """Coordinates (3, N) in bins, from the middle of the sensor points; the bin (plus one) that length zero of a
-        sensor point falls into, and how many bins the leg of each spot adds.
+        """Coordinates (3, N) in samples, from the middle of the sensor points; the place in a padded row that length
+        zero of a sensor point falls into, and how many samples the leg of each spot adds.
         """
-        scan, width = self.scan, self.axis.bin_width_opl
+        scan, width = self.scan, self.step
         sensors = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
         lasers = scan.laser_points.detach().to("cpu", torch.float64).reshape(-1, 3)
         middle = sensors.mean(0)
-        bins = torch.full((len(sensors),), 0.5 - self.axis.start_opl / width, dtype=torch.float64)
+        first, _ = sample_places(self.axis.num_bins, self.samples)
+        zero = _BEFORE - first - self.samples / 2 - self.axis.start_opl / width
+        bins = torch.full((len(sensors),), zero, dtype=torch.float64)
         spots = torch.zeros(len(lasers), dtype=torch.float64)
         if scan.first_and_last_leg:
             bins = bins + scan.sensor_legs.detach().cpu().reshape(-1) / width
             spots = scan.laser_legs.detach().cpu().reshape(-1) / width
         if scan.kind == "confocal":
             bins = bins + spots
+        voxels = self.points.reshape(-1, 3)
+        self._check_lengths(voxels - middle, sensors - middle, lasers - middle)
         return {
-            "voxels": ((self.points.reshape(-1, 3) - middle) / width).T.contiguous(),
+            "voxels": ((voxels - middle) / width).T.contiguous(),
             "sensors": ((sensors - middle) / width).T.contiguous(),
             "lasers": ((lasers - middle) / width).T.contiguous(),
             "sensor_bins": bins,
             "laser_bins": spots,
         }
+
+    def _check_lengths(self, voxels: Tensor, sensors: Tensor, lasers: Tensor) -> None:
+        who, half = type(self).__name__, self.axis.bin_width_opl / 2
+        longest = 2.0 * float(voxels.abs().max() + sensors.abs().max() + lasers.abs().max())
+        if not longest < 1e9 * self.step:
+            raise UnitError(
+                f"{who}: expected points within 1e9 bins of each other, got some {longest / self.step:.3g} bins away. "
+                "Lengths are in metres."
+            )
+        near = max(half, apart(voxels, sensors)) * max(half, apart(voxels, lasers))
+        check_falloff(self.falloff, near, longest**2, self.dtype, who)
 
     voxels: Tensor
     sensors: Tensor
@@ -101,7 +123,7 @@ class EllipsoidOperator(ScanOperator):
     def gather(self, rows_of: Rows, items: int) -> Tensor:
         """(items, V): the sum over all rows of their values at the lengths of each voxel.
 
-        ``rows_of(group)``: real rows (items, R, T) of a group.
+        ``rows_of(group)``: real rows (items, R, row_length) of a group.
         """
         out = self.voxels.new_zeros(items, self.voxels.shape[1])
         for group in self.groups():
@@ -117,8 +139,9 @@ class EllipsoidOperator(ScanOperator):
         return out
 
     def splat(self, volume: Tensor) -> Iterator[tuple[Group, Tensor]]:
-        """The transpose of :meth:`gather`: for each group its rows (items, R, T) of a real volume (items, V)."""
-        items, length = len(volume), self.axis.num_bins + _PAD
+        """The transpose of :meth:`gather`: for each group its rows (items, R, row_length) of a real volume
+        (items, V)."""
+        items, length = len(volume), self.row_length + _PAD
         for group in self.groups():
             rows = volume.new_zeros(items, math.prod(group.size) * length)
             for tile, index, fraction, weight in self._blocks(group):
@@ -130,18 +153,18 @@ class EllipsoidOperator(ScanOperator):
                     late = light * fraction
                     rows[n].index_add_(0, flat, (light - late).reshape(-1))
                     rows[n].index_add_(0, after, late.reshape(-1))
-            yield group, rows.view(items, -1, length)[..., 1 : 1 - _PAD]
+            yield group, rows.view(items, -1, length)[..., _BEFORE : _BEFORE - _PAD]
 
     def _padded(self, rows: Tensor) -> Tensor:
         out = rows.new_zeros(*rows.shape[:-1], rows.shape[-1] + _PAD)
-        out[..., 1 : 1 - _PAD] = rows
+        out[..., _BEFORE : _BEFORE - _PAD] = rows
         return out
 
     def _blocks(self, group: Group) -> Iterator[tuple[slice, Tensor, Tensor, Tensor | None]]:
         """Of each piece of a group: the voxels of a tile, and (rows, voxels) indices into the padded rows of the group,
         fractions of a bin, and weights unless all are one.
         """
-        length, (spots, points) = self.axis.num_bins + _PAD, group.size
+        length, (spots, points) = self.row_length + _PAD, group.size
         on_cpu = self.voxels.device.type == "cpu"
         block = CPU_BLOCK if on_cpu else GPU_BLOCK
         size = min(self.voxels.shape[1], CPU_TILE if on_cpu else GPU_BLOCK)
@@ -174,15 +197,16 @@ class EllipsoidOperator(ScanOperator):
     def _weight(self, last: Tensor, first: Tensor) -> Tensor | None:
         if not self.falloff:
             return None
-        near = last.clamp_min(0.5)
-        both = near * (near if first is last else first.clamp_min(0.5))
-        return both.pow_(-self.falloff).mul_(self.axis.bin_width_opl ** (-2.0 * self.falloff))
+        half = self.samples / 2
+        near = last.clamp_min(half)
+        both = near * (near if first is last else first.clamp_min(half))
+        return both.mul_(self.step**2).pow_(-self.falloff)
 
     # ---------------------------------------------------------------------------------------------- groups and layouts
 
     def groups(self) -> Iterator[Group]:
         """All rows, in pieces of :data:`GROUP_NUMBERS` numbers at most (a row at least)."""
-        rows = max(1, GROUP_NUMBERS // (self.axis.num_bins + _PAD))
+        rows = max(1, GROUP_NUMBERS // (self.row_length + _PAD))
         sensors, spots = self.sensors.shape[1], self._spots
         step = min(rows, sensors)
         many = min(max(1, rows // step), MOST_SPOTS)
@@ -208,6 +232,12 @@ class EllipsoidOperator(ScanOperator):
         """Write rows (items, R, T) to where :meth:`rows_of` has them from."""
         part = split[:, :, group.lasers, group.sensors]
         part.copy_(rows.transpose(1, 2).reshape(part.shape))
+
+
+def apart(a: Tensor, b: Tensor) -> float:
+    """What no distance between points (N, 3) and (M, 3) falls short of: that of the boxes around them."""
+    gaps = torch.maximum(a.amin(0) - b.amax(0), b.amin(0) - a.amax(0)).clamp_min(0)
+    return float(gaps.norm())
 
 
 def _distances(points: Tensor, voxels: Tensor) -> Tensor:

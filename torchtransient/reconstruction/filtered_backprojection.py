@@ -9,6 +9,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
 from torchtransient.quantities import shown
+from torchtransient.reconstruction.capture_checks import checked_axis
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
 from torchtransient.reconstruction.filters import ReconstructionFilter
 from torchtransient.reconstruction.transient_operator import reconstructed
@@ -34,7 +35,9 @@ class FilteredBackprojection(EllipsoidOperator):
     ``filter``: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019), or
     ``LaplacianFilter(sigma)`` (Velten et al. 2012), or what has the methods of :class:`ReconstructionFilter`. The other
     arguments, what scans are taken, time and memory are those of :class:`Backprojection`; rows are filtered a group at
-    a time. On planes before a flat, regular grid :class:`PhasorField` has the same result for less. Raises ShapeError
+    a time, those of wavelengths below 16 bins at more than one sample a bin. Lines between samples are within 1.7 % of
+    the pulse's own value at every length, at wavelengths of two bins as at long ones (1 % but for their common scale).
+    On planes before a flat, regular grid :class:`PhasorField` has the same result to that for less. Raises ShapeError
     and UnitError.
     """
 
@@ -48,12 +51,14 @@ class FilteredBackprojection(EllipsoidOperator):
         falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
         if not callable(getattr(filter, "rows_adjoint", None)):
             raise ShapeError(
                 f"FilteredBackprojection: expected filter as a PhasorFilter or a LaplacianFilter, got {shown(filter)}."
             )
-        filter.check(self.grid, time_axis.bin_width_opl, "FilteredBackprojection")
+        width = checked_axis(time_axis, "FilteredBackprojection").bin_width_opl
+        filter.check(points if isinstance(points, VoxelGrid) else None, width, "FilteredBackprojection")
+        samples = filter.samples(width)
+        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype, samples=samples)
         self.filter = filter
         self.real_volume = not filter.complex_volume
 
@@ -70,7 +75,7 @@ class FilteredBackprojection(EllipsoidOperator):
         volume = self.filter.volume_adjoint(x).reshape(-1, self.voxels.shape[1])
         for group, rows in self.splat(_real_items(volume)):
             complex_rows = _complex_items(rows) if volume.is_complex() else rows
-            self.put_rows(split, group, self.filter.rows_adjoint(complex_rows, width))
+            self.put_rows(split, group, self.filter.rows_adjoint(complex_rows, width, self.samples))
         return out
 
     def adjoint_(self, y: Tensor) -> Tensor:
@@ -78,7 +83,7 @@ class FilteredBackprojection(EllipsoidOperator):
         parts = 1 if self.real_volume else 2
 
         def rows_of(group: Group) -> Tensor:
-            return _real_items(self.filter.rows(self.rows_of(split, group), width))
+            return _real_items(self.filter.rows(self.rows_of(split, group), width, self.samples))
 
         found = self.gather(rows_of, parts * len(split))
         volume = found if self.real_volume else _complex_items(found)

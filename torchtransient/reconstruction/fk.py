@@ -26,8 +26,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import SceneError
-from torchtransient.quantities import shown
+from torchtransient.reconstruction.capture_checks import one_of
 from torchtransient.reconstruction.capture_roots import checked_floor, stabilised_root
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, chunk_rows
 from torchtransient.reconstruction.linear import each
@@ -74,11 +73,8 @@ class FK(ConfocalOperator):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        if target not in TARGETS:
-            raise SceneError(f"FK: expected target to be one of {', '.join(TARGETS)}, got {shown(target)}.")
-        if taps not in TAPS:
-            raise SceneError(f"FK: expected 2 or 4 taps, got {shown(taps)}.")
-        self.target, self.taps, self.floor = target, int(taps), checked_floor(floor)
+        self.target, self.taps = one_of("FK: target", target, TARGETS), one_of("FK: taps", taps, TAPS)
+        self.floor = checked_floor(floor, dtype)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:

@@ -29,7 +29,7 @@ class LCT(ConeOperator):
 
     Not supported: scans that are not confocal, curved walls, cosines of wall and hidden surfaces, hiding of points by
     others. Raises ShapeError for scans that it cannot take and for records that are far shorter than the wall is wide,
-    UnitError for time axes that begin before zero and for an ``snr`` that is not positive, SceneError for an unknown
+    UnitError for time axes that begin before zero and for an ``snr`` beyond 1e-20 to 1e20, SceneError for an unknown
     target.
     """
 

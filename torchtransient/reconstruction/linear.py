@@ -8,6 +8,7 @@ kept for it, so that memory does not grow with what lies between.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -21,8 +22,8 @@ class _Apply(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
-        with torch.no_grad():
-            return (operator.adjoint_ if adjoint else operator.map_)(x)
+        with torch.no_grad(), _own_precision(x.device):
+            return operator._mapped(x, adjoint)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -45,6 +46,13 @@ class _Apply(torch.autograd.Function):
         return _apply(x if dim is None else x.movedim(dim, 0), operator, adjoint), None if dim is None else 0
 
 
+def _own_precision(device: torch.device) -> AbstractContextManager[Any]:
+    """Without ``torch.autocast``: what measurements and phases lose by half precision is more than a network does."""
+    if device.type == "meta" or not torch.is_autocast_enabled(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
+
+
 def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
     result: Tensor = _Apply.apply(x, operator, adjoint)  # type: ignore[no-untyped-call]
     return result
@@ -61,7 +69,8 @@ class LinearOperator(nn.Module):
     called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
     part of it where one of the two is real by nature (:attr:`real_volume`, :attr:`real_data`). They take tensors of the
     operator's own precision (:attr:`dtype`, real; complex ones have the matching complex type); others are converted,
-    half precision to float32 tables as well.
+    half precision to float32 tables as well. ``torch.autocast`` does not reach into them. Leading dimensions may be of
+    size zero; then they are not called.
     """
 
     volume_shape: tuple[int, ...]
@@ -75,6 +84,17 @@ class LinearOperator(nn.Module):
 
     def adjoint_(self, y: Tensor) -> Tensor:
         raise NotImplementedError
+
+    def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
+        if x.numel():
+            return (self.adjoint_ if adjoint else self.map_)(x)
+        taken, shape, real = (
+            (self.data_shape, self.volume_shape, self.real_volume)
+            if adjoint
+            else (self.volume_shape, self.data_shape, self.real_data)
+        )
+        lead = x.shape[: x.ndim - len(taken)]
+        return x.new_zeros(*lead, *shape, dtype=self.dtype if real else self.dtype.to_complex())
 
     def forward(self, volume: Tensor) -> Tensor:
         """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
@@ -115,8 +135,6 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     if not lead:
         return function(x)
     items = x.reshape(-1, *x.shape[x.ndim - dims :])
-    if len(items) == 0:
-        raise ShapeError(f"expected at least one item in the leading dimensions, got {tuple(lead)}.")
     first = function(items[0])
     out = first.new_empty(len(items), *first.shape)
     out[0] = first

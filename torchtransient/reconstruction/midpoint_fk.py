@@ -31,8 +31,8 @@ class Midpoints(TransientOperator):
 
     ``operator(confocal)``: (..., T, 2 Y, 2 X) on a grid of half the sensors' pitch (:attr:`wall`) to the scan's
     (..., T, *scan.shape); ``operator.adjoint``: its adjoint, the mean over the pairs of each midpoint, moved to the
-    time of a confocal pair by linear interpolation. Midpoints are rounded to the grid; those of one spot stand on it.
-    Midpoints that no pair has are dark.
+    time of a confocal pair by linear interpolation between bins, zero before and behind the record. Midpoints are
+    rounded to the grid; those of one spot stand on it. Midpoints that no pair has are dark.
 
     Raises ShapeError for confocal scans, grids that are not regular or not flat, spots off their plane or beside the
     sensors' rectangle, and scans that count legs; UnitError for times before zero.
@@ -94,17 +94,17 @@ class Midpoints(TransientOperator):
     def _spread(self, confocal: Tensor) -> Tensor:
         bins = self.axis.num_bins
         of_place = (confocal.reshape(bins, -1) * self.share).T.contiguous()
-        out = confocal.new_zeros(len(self.place), bins + 2)
+        out = confocal.new_zeros(len(self.place), bins + 3)
         for first, last, low, high_share in self._pieces():
             light = of_place.index_select(0, self.place[first:last])
             late = light * high_share
             out[first:last].scatter_add_(1, low, light - late)
             out[first:last].scatter_add_(1, low + 1, late)
-        return out[:, 1:-1].T.reshape(self.data_shape)
+        return out[:, 1 : bins + 1].T.reshape(self.data_shape)
 
     def _gather(self, measured: Tensor) -> Tensor:
         bins = self.axis.num_bins
-        rows = torch.nn.functional.pad(measured.reshape(bins, -1).T, (1, 1))
+        rows = torch.nn.functional.pad(measured.reshape(bins, -1).T, (1, 2))
         out = measured.new_zeros(math.prod(self.wall.size), bins)
         for first, last, low, high_share in self._pieces():
             piece = rows[first:last]
@@ -115,14 +115,15 @@ class Midpoints(TransientOperator):
 
     def _pieces(self) -> Any:
         """Pairs ``first`` to ``last``, the bin (pairs, T) before the moment that light of each confocal time is from,
-        counted from a bin of zeros before the record, and the share of the bin after it.
+        counted from a bin of zeros before the record, and the share of the bin after it. What is from behind the record
+        is from the first of two bins of zeros there.
         """
         width, start, bins = self.axis.bin_width_opl, self.axis.start_opl, self.axis.num_bins
         step = chunk_rows(bins, self.times.device)
         for first in range(0, len(self.place), step):
             last = min(first + step, len(self.place))
             later = torch.sqrt(self.times.square() + self.distance_squared[first:last, None])
-            at = ((later - start) / width + 0.5).clamp_(0, bins)
+            at = ((later - start) / width + 0.5).clamp_(0, bins + 1)
             low = at.floor()
             yield first, last, low.to(torch.int64), at - low
 
@@ -152,7 +153,7 @@ class MidpointFK(TransientOperator):
         taps: int = 4,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        super().__init__(checked_scan(scan, "MidpointFK"), time_axis=time_axis, dtype=dtype)
         self.midpoints = Midpoints(scan, time_axis=time_axis, dtype=dtype)
         self.fk = FK(self.midpoints.wall, time_axis=time_axis, target=target, floor=floor, taps=taps, dtype=dtype)
         self.grid = self.fk.grid

@@ -14,6 +14,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.quantities import finite, shown
 from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
+from torchtransient.reconstruction.capture_checks import check_falloff
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
 from torchtransient.reconstruction.plane_waves import good_length, phase_pairs, waves
@@ -53,7 +54,9 @@ class PhasorField(ScanOperator):
     ``size`` and ``extent`` of the same pitch too. The convolution is linear: nothing wraps around, neither in space nor
     in time.
 
-    Frequencies within 4 standard deviations of the pulse's spectrum are kept, all but 2e-8 of its energy.
+    Frequencies within 4 standard deviations of the pulse's spectrum are kept, zero and below for pulses of less than
+    3.9 cycles: all but 2e-8 of its energy. What is left out is 3e-4 of the height of the spectrum at most; a steady
+    background is part of it. Distances below half a bin fall off as half a bin does.
     Time grows with planes times frequencies (times laser spots) times sensor points; spectra are made a chunk of
     frequencies and spots at a time. Raises ShapeError for other scans and grids, SceneError for a transient camera
     without one laser spot, UnitError for what is out of range.
@@ -78,7 +81,7 @@ class PhasorField(ScanOperator):
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         if not isinstance(pulse, PhasorFilter):
             raise ShapeError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
-        check_sampling(pulse.wavelength, time_axis.bin_width_opl, "PhasorField")
+        check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
         if not isinstance(self.camera, Camera):
             raise ShapeError(
@@ -96,6 +99,8 @@ class PhasorField(ScanOperator):
         self.lasers = self.wall.local(scan.laser_points).reshape(-1, 3)
         if self.camera.times is not None:
             self.volume_shape = (len(self.camera.times), *self.volume_shape)
+        near = max(self._nearest, float(self.heights.abs().min()))
+        check_falloff(self.falloff, near**2, self._lengths()[1] ** 2, dtype, "PhasorField")
         self.frequencies, self.band_weights = self._band()
         self.shape_fft = tuple(good_length(s + v - 1) for s, v in zip(self.wall.size, points.size, strict=True))
         self._set_tables()
@@ -140,7 +145,8 @@ class PhasorField(ScanOperator):
         end = self.axis.end_opl - float(spots.min() + points.min())
         period = max(high, end) - min(low, start) + self.pulse.cycles * self.pulse.wavelength
         middle, spread = 1 / self.pulse.wavelength, 1 / (2 * math.pi * self.pulse.sigma)
-        first = max(1, math.ceil((middle - BAND * spread) * period))
+        # Short pulses have frequencies of zero and below.
+        first = math.ceil((middle - BAND * spread) * period)
         last = math.floor((middle + BAND * spread) * period)
         frequencies = torch.arange(first, max(first, last) + 1, dtype=torch.float64) / period
         weights = torch.exp(-(((frequencies - middle) / spread) ** 2) / 2) * (self.axis.bin_width_opl / period)
@@ -299,7 +305,7 @@ class PhasorField(ScanOperator):
         falloff = self.falloff * (2 if confocal else 1)
         for height in self.heights.tolist():
             distances = (across + height**2).sqrt_()
-            yield torch.fft.fft2(waves(distances, frequencies, falloff, self.dtype.to_complex()))
+            yield torch.fft.fft2(waves(distances, frequencies, falloff, self.dtype.to_complex(), self._nearest))
 
     def _illumination(self, plane: int, band: slice, some: slice, device: torch.device) -> Tensor | None:
         """(F, L, Y, X): waves from some spots to the voxels of a plane; None where the laser is not focused."""
@@ -312,7 +318,13 @@ class PhasorField(ScanOperator):
             sides.append((places - spots[:, 1 - axis, None]).square())
         height = (float(self.heights[plane]) - spots[:, 2]).square()
         distances = (sides[0][:, :, None] + sides[1][:, None, :] + height[:, None, None]).sqrt_()
-        return waves(distances, self.frequencies[band].to(device), self.falloff, self.dtype.to_complex())
+        frequencies = self.frequencies[band].to(device)
+        return waves(distances, frequencies, self.falloff, self.dtype.to_complex(), self._nearest)
+
+    @property
+    def _nearest(self) -> float:
+        """Half a bin, metres."""
+        return self.axis.bin_width_opl / 2
 
     def extra_repr(self) -> str:
         return f"{super().extra_repr()}, {self.pulse}, {len(self.frequencies)} frequencies"

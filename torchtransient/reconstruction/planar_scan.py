@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,7 +35,8 @@ class PlanarScan:
         hidden side is; without them it is that of ``along_x`` times ``along_y``. Raises ShapeError for a list of
         points, and for grids that are not regular, not at right angles, or not flat: ``who`` cannot take them.
         """
-        p = points.detach().to("cpu", torch.float64)
+        check_real(points, f"{who}: {what}")
+        p = points.detach().to("cpu", torch.float64, copy=True)
         if p.ndim != 3 or p.shape[-1] != 3 or min(p.shape[:2]) < 2:
             raise ShapeError(f"{who}: expected {what} as a grid (Y, X, 3) of 2 x 2 at least, got {tuple(p.shape)}.")
         rows, columns = p.shape[:2]
@@ -56,16 +57,16 @@ class PlanarScan:
         along_y = along_y / along_y.norm()
         normal = torch.linalg.cross(along_x, along_y)
         if normals is not None:
-            mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
-            normal = normal if float(mean @ normal) >= 0 else -normal
+            normal = _with_normals(normal, normals)
         return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x, along_y, normal)
 
     @staticmethod
     def of_scan(scan: Scan, who: str) -> PlanarScan:
-        """The sensor points of a scan. Raises ShapeError."""
+        """The sensor points of a scan, and its :func:`hidden_side`. Raises ShapeError."""
         if not isinstance(scan, Scan):
             raise ShapeError(f"{who}: expected a tt.nlos.Scan, got {shown(scan)}.")
-        return PlanarScan.of(scan.sensor_points, scan.sensor_normals, who=who)
+        wall = PlanarScan.of(scan.sensor_points, who=who)
+        return replace(wall, normal=hidden_side(scan, wall.normal))
 
     @property
     def points(self) -> Tensor:
@@ -89,6 +90,31 @@ class PlanarScan:
         """Coordinates (..., 3) along x, y and the normal, from the first point, metres, float64."""
         off = points.detach().to("cpu", torch.float64) - self.first
         return torch.stack([off @ self.along_x, off @ self.along_y, off @ self.normal], -1)
+
+
+def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
+    """``normal`` (3,) of a scan's wall or its opposite, whichever points to the hidden side: that of the scan's
+    normals; without them, that on which its sensor and its laser stand. Where they stand in the wall or on both sides
+    of it nothing says which it is: ``normal`` as given.
+    """
+    if scan.sensor_normals is not None:
+        return _with_normals(normal, scan.sensor_normals)
+    points = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
+    middle, extent = points.mean(0), float((points.amax(0) - points.amin(0)).norm())
+    origins = (origin.detach().to("cpu", torch.float64) for origin in (scan.sensor_origin, scan.laser_origin))
+    heights = [float((origin - middle) @ normal) for origin in origins]
+    return -normal if max(heights) < -1e-6 * extent else normal
+
+
+def check_real(points: Tensor, what: str) -> None:
+    """Raises ShapeError for complex tensors and truth values, which a conversion would make real numbers of."""
+    if points.is_complex() or points.dtype == torch.bool:
+        raise ShapeError(f"{what}: expected real numbers, got {points.dtype}.")
+
+
+def _with_normals(normal: Tensor, normals: Tensor) -> Tensor:
+    mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+    return normal if float(mean @ normal) >= 0 else -normal
 
 
 def _angle(x: Tensor, y: Tensor) -> str:

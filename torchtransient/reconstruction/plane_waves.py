@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 
-def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype) -> Tensor:
+def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype, nearest: float = 0.0) -> Tensor:
     """``exp(2 pi i f r) / r^falloff``, (F, ...), of ``distances`` r (...) in metres and evenly spaced ``frequencies``
-    (F,) in cycles per metre, both float64; ``dtype``: a complex one.
+    (F,) in cycles per metre, both float64; ``dtype``: a complex one. Distances below ``nearest`` fall off as it does.
 
     Phases are those of double precision: single precision has none left for r of many wavelengths. A sine of each
     frequency would be most of the work of a plane, so waves follow from each other by products, which lose F ulp.
@@ -18,7 +18,7 @@ def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.d
     count = len(frequencies)
     wave = _turned(distances * frequencies[0])
     if falloff:
-        wave = wave * distances.pow(-falloff)
+        wave = wave * distances.clamp_min(nearest).pow(-falloff)
     out = torch.empty(count, *distances.shape, dtype=dtype, device=distances.device)
     out[0] = wave
     if count > 1:

@@ -1,7 +1,8 @@
 """Surfaces in a reconstructed volume: depth, how sure of it one can be, and normals.
 
 Volumes are (..., Z, Y, X) of real values, higher where something is, on a :class:`VoxelGrid` or on planes at given
-depths. Everything is differentiable by the volume.
+depths. Everything is differentiable by the volume. Volumes in half precision are taken, and depths and normals of them
+returned, in float32.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import positive, real_array, share, shown
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.errors import ShapeError
+from torchtransient.quantities import share, shown
+from torchtransient.reconstruction.capture_checks import within
+from torchtransient.reconstruction.voxels import VoxelGrid, checked_depths
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class DepthMap:
 def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1) -> DepthMap:
     """The depth of the highest value behind each pixel, between planes where its neighbours say so.
 
-    ``volume`` (..., Z, Y, X), ``depths``: a grid, or (Z,) in metres. A parabola through the maximum and the planes next
+    ``volume`` (..., Z, Y, X), ``depths``: a grid, or (Z,) in metres. A pixel with a value that is not finite is taken
+    for an empty one. A parabola through the maximum and the planes next
     to it has its top within half a step of it, evenly spaced planes or not; on the first and the last plane the depth
     is the plane's. ``confidence``: the maximum over that of the whole volume, zero where a volume holds nothing above
     zero; ``mask``: where it reaches ``threshold``. Gradients go through the three values of each parabola. Raises
@@ -40,15 +43,19 @@ def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1
     """
     z, volume = _checked(volume, depths, "depth_map")
     threshold = share("depth_map: threshold", threshold)
+    if volume.numel() == 0:
+        nothing = volume.sum(-3)
+        return DepthMap(nothing, nothing.clone(), torch.zeros_like(nothing, dtype=torch.bool))
+    volume = torch.where(volume.isfinite().all(-3, keepdim=True), volume, torch.zeros_like(volume))
     highest, index = volume.max(-3, keepdim=True)
     top = highest.amax((-2, -1), keepdim=True)
-    confidence = (highest / top.clamp_min(torch.finfo(volume.dtype).tiny)).clamp(0, 1)
-    count = volume.shape[-3]
-    depth = z[index]
+    confidence = torch.where(top > 0, highest / torch.where(top > 0, top, torch.ones_like(top)), 0.0).clamp(0, 1)
+    count, steps = volume.shape[-3], z.diff().to(volume.dtype)
+    depth = z.to(volume.dtype)[index]
     if count > 2:
         middle = index.clamp(1, count - 2)
         low, mid, high = (volume.gather(-3, middle + step) for step in (-1, 0, 1))
-        before, after = z[middle] - z[middle - 1], z[middle + 1] - z[middle]
+        before, after = steps[middle - 1], steps[middle]
         # Slopes to both sides of the maximum: the top is where the line between them is zero.
         rise, fall = (mid - low) / before, (mid - high) / after
         inside = (index == middle) & (rise >= 0) & (fall >= 0) & (rise + fall > 0)
@@ -69,11 +76,15 @@ def soft_depth(volume: Tensor, depths: VoxelGrid | Any, *, sharpness: float = 20
     have the mean of all planes. Raises ShapeError, UnitError.
     """
     z, volume = _checked(volume, depths, "soft_depth")
-    sharpness = positive("soft_depth: sharpness", sharpness)
+    sharpness = within("soft_depth: sharpness", sharpness, 1e-30, 1e30)
+    if volume.numel() == 0:
+        return volume.sum(-3)
     highest = volume.amax(-3, keepdim=True)
     scale = torch.where(highest > 0, highest, torch.ones_like(highest))
     level = torch.where(highest > 0, volume / scale, torch.zeros_like(volume))
-    return (torch.softmax(sharpness * level, -3) * z[:, None, None]).sum(-3)
+    # From the first plane on: far away, single precision has few digits left between planes.
+    behind = (z - z[0]).to(volume.dtype)[:, None, None]
+    return (torch.softmax(sharpness * level, -3) * behind).sum(-3) + float(z[0])
 
 
 def normals_from_depth(depth: Tensor, grid: VoxelGrid) -> Tensor:
@@ -104,12 +115,14 @@ def normals_from_volume(volume: Tensor, grid: VoxelGrid) -> Tensor:
     z, volume = _checked(volume, grid, "normals_from_volume")
     if min(grid.shape) < 2:
         raise ShapeError(f"normals_from_volume: expected two planes, rows and columns at least, got {grid.shape}.")
+    if volume.numel() == 0:
+        return volume.sum(-3)[..., None, :, :].expand(*volume.shape[:-3], 3, *grid.size)
     front = torch.arange(len(z), device=volume.device)[:, None, None] <= volume.argmax(-3, keepdim=True)
-    steps = torch.gradient(z)[0][:, None, None]
+    steps = torch.gradient(z)[0].to(volume.dtype)[:, None, None]
     gradients = (
         _slope(volume, -1, grid.pitch[1]),
         _slope(volume, -2, grid.pitch[0]),
-        torch.gradient(volume, spacing=(z,), dim=-3)[0],
+        torch.gradient(volume, spacing=((z - z[0]).to(volume.dtype),), dim=-3)[0],
     )
     sums = [(gradient * steps * front).sum(-3) for gradient in gradients]
     # The gradient points into the surface.
@@ -122,12 +135,16 @@ def normals_from_volume(volume: Tensor, grid: VoxelGrid) -> Tensor:
 def _world(x: Tensor, y: Tensor, z: Tensor, grid: VoxelGrid) -> Tensor:
     axes = torch.stack([grid.along_x, grid.along_y, grid.normal]).to(x.device, x.dtype)
     local = torch.stack([x, y, z], -3)
+    # Lengths do not matter, and squares of small ones vanish.
+    scale = local.detach().abs().amax(-3, keepdim=True)
+    local = local / torch.where(scale > 0, scale, torch.ones_like(scale))
     squares = local.square().sum(-3, keepdim=True)
     # Where there is no gradient nothing says how the surface lies: it faces the wall. The root has no slope at zero.
     known = squares > 0
     facing = torch.tensor([0.0, 0.0, -1.0], device=x.device, dtype=x.dtype)[:, None, None]
     unit = torch.where(known, local * torch.where(known, squares, torch.ones_like(squares)).rsqrt(), facing)
-    return torch.einsum("...ayx,ab->...byx", unit, axes)
+    # No product of matrices, which autocast would round.
+    return (unit.unsqueeze(-3) * axes[:, :, None, None]).sum(-4)
 
 
 def _slope(field: Tensor, dim: int, step: float) -> Tensor:
@@ -142,14 +159,8 @@ def _check_grid(grid: Any, who: str) -> None:
 
 
 def _checked(volume: Any, depths: Any, who: str) -> tuple[Tensor, Tensor]:
-    """Depths as a tensor like the volume, and the volume, real."""
-    given = depths.depths if isinstance(depths, VoxelGrid) else depths
-    plain = real_array(given)
-    if plain is None or plain.ndim != 1:
-        raise ShapeError(f"{who}: expected depths (Z,) or a VoxelGrid, got {shown(depths)}.")
-    z = torch.from_numpy(plain)
-    if len(z) > 1 and not bool((z.diff() > 0).all()):
-        raise UnitError(f"{who}: expected depths that increase, got {shown(plain.tolist())}.")
+    """Depths in double precision where the volume is, and the volume, real, in single precision at least."""
+    z = depths.depths if isinstance(depths, VoxelGrid) else checked_depths(depths, who)
     shape = depths.shape if isinstance(depths, VoxelGrid) else (len(z), "Y", "X")
     fits = isinstance(volume, Tensor) and volume.ndim >= 3 and volume.shape[-3] == len(z)
     if not fits or (isinstance(depths, VoxelGrid) and tuple(volume.shape[-3:]) != shape):
@@ -157,4 +168,4 @@ def _checked(volume: Any, depths: Any, who: str) -> tuple[Tensor, Tensor]:
         raise ShapeError(f"{who}: expected a volume (..., {shape[0]}, {shape[1]}, {shape[2]}), got {got}.")
     if not volume.is_floating_point():
         raise ShapeError(f"{who}: expected a volume of real numbers, got {volume.dtype}. Give its squared modulus.")
-    return z.to(volume.device, volume.dtype), volume
+    return z.to(volume.device), volume if volume.dtype == torch.float64 else volume.float()

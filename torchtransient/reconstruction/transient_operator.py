@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -26,8 +27,9 @@ from torchtransient.reconstruction.voxels import VoxelGrid
 class TransientOperator(LinearOperator):
     """A linear operator between a volume and transients (..., T, *scan points).
 
-    ``scan``, ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes stand on, None for points that stand on
-    none. Tables are built in double precision and kept in ``dtype``; ``operator.double()`` builds them anew.
+    ``scan``: a copy of what was given, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes
+    stand on, None for points that stand on none. Tables are built in double precision and kept in ``dtype``;
+    ``operator.double()`` builds them anew.
 
     Classes say :meth:`tables` and call ``_set_tables()`` once their arguments are there. Raises ShapeError for what is
     no axis, UnitError for a dtype other than float32 and float64.
@@ -39,7 +41,7 @@ class TransientOperator(LinearOperator):
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         super().__init__()
         who = type(self).__name__
-        self.scan, self.axis = scan, checked_axis(time_axis, who)
+        self.scan, self.axis = _kept(scan), checked_axis(time_axis, who)
         self.dtype = checked_precision(dtype, who)
 
     @property
@@ -69,7 +71,7 @@ class TransientOperator(LinearOperator):
         of the old.
         """
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point()}
+        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point() or buffer.is_complex()}
         if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
             device = self.device
             try:
@@ -100,6 +102,12 @@ class TransientOperator(LinearOperator):
     def extra_repr(self) -> str:
         volume = " x ".join(map(str, self.volume_shape))
         return f"{volume} voxels, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
+
+
+def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:
+    """A copy that later changes of the caller's tensors do not reach."""
+    copies: dict[str, Any] = {k: v.detach().clone() for k, v in vars(scan).items() if isinstance(v, Tensor)}
+    return replace(scan, **copies)
 
 
 def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from torchtransient.capture import Scan, Wall
 from torchtransient.capture.distances import bounds_of
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import count, positive, real_array, shown
-from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +35,17 @@ class VoxelGrid:
     normal: Tensor
 
     def __post_init__(self) -> None:
-        depths = _depths(self.depths, "VoxelGrid")
-        size = tuple(count("VoxelGrid: size", n) for n in self.size)
-        pitch = tuple(positive("VoxelGrid: pitch", p) for p in self.pitch)
-        if len(size) != 2 or len(pitch) != 2:
-            raise ShapeError(f"VoxelGrid: expected two sizes and pitches, got {shown(self.size)}, {shown(self.pitch)}.")
+        depths = checked_depths(self.depths, "VoxelGrid")
+        size = tuple(count("VoxelGrid: size", n) for n in _numbers("VoxelGrid: size", self.size, 2, one=False))
+        pitch = tuple(positive("VoxelGrid: pitch", p) for p in _numbers("VoxelGrid: pitch", self.pitch, 2, one=False))
         for name, value in {"depths": depths, "size": size, "pitch": pitch}.items():
             object.__setattr__(self, name, value)
         for name in ("first", "along_x", "along_y", "normal"):
             plain = real_array(getattr(self, name))
             if plain is None or plain.shape != (3,):
                 raise ShapeError(f"VoxelGrid: expected {name} as a vector (3,), got {shown(getattr(self, name))}.")
+            if not np.isfinite(plain).all():
+                raise UnitError(f"VoxelGrid: expected {name} of finite numbers, got {plain.tolist()}.")
             object.__setattr__(self, name, torch.from_numpy(plain))
         axes = torch.stack([self.along_x, self.along_y, self.normal])
         if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64), atol=1e-6):
@@ -73,18 +74,21 @@ class VoxelGrid:
         Raises ShapeError for a list of points of a scan without a wall, where nothing says which way is up (give
         :meth:`bounds` or the class its axes), for a wall that is not flat where size and extent are missing, and for
         sizes that are none; UnitError for depths that do not increase.
+
+        Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
+        stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
         """
         if not isinstance(scan, Scan):
             raise ShapeError(f"VoxelGrid.before: expected a tt.nlos.Scan, got {shown(scan)}.")
-        depths = _depths(depths, "VoxelGrid.before")
+        depths = checked_depths(depths, "VoxelGrid.before")
         if size is None and extent is None:
             wall = PlanarScan.of_scan(scan, "VoxelGrid.before without size and extent")
             return cls.of_wall(wall, depths)
         points = scan.sensor_points.detach().to("cpu", torch.float64)
         along_x, along_y, normal = _wall_axes(scan, points)
-        shape = _pair("VoxelGrid.before: size", size) if size is not None else tuple(reversed(points.shape[:-1]))
-        if len(shape) != 2:
+        if size is None and points.ndim != 3:
             raise ShapeError(f"VoxelGrid.before: expected size= for a list of points, got {shown(size)}.")
+        shape = reversed(points.shape[:-1]) if size is None else _numbers("VoxelGrid.before: size", size, 2)
         columns, rows = (count("VoxelGrid.before: size", n) for n in shape)
         flat = points.reshape(-1, 3)
         spans = []
@@ -94,7 +98,7 @@ class VoxelGrid:
             # Each sensor point of a grid has a cell around it.
             cells = n / (n - 1) if points.ndim == 3 and n > 1 else 1.0
             spans.append((float(along.max() + along.min()) / 2, spread * cells))
-        given = (spans[0][1], spans[1][1]) if extent is None else _pair("VoxelGrid.before: extent", extent)
+        given = (spans[0][1], spans[1][1]) if extent is None else _numbers("VoxelGrid.before: extent", extent, 2)
         width, height = (positive("VoxelGrid.before: extent", value) for value in given)
         dx, dy = width / columns, height / rows
         first = (
@@ -117,10 +121,7 @@ class VoxelGrid:
         voxels are the middles of equal cells. Raises ShapeError and UnitError.
         """
         low, high = bounds_of(bounds, "VoxelGrid.bounds")
-        given = (size,) * 3 if isinstance(size, int) else tuple(size)
-        if len(given) != 3:
-            raise ShapeError(f"VoxelGrid.bounds: expected size as (X, Y, Z) or one number, got {shown(size)}.")
-        sizes = [count("VoxelGrid.bounds: size", n) for n in given]
+        sizes = [count("VoxelGrid.bounds: size", n) for n in _numbers("VoxelGrid.bounds: size (X, Y, Z)", size, 3)]
         dx, dy, dz = (
             positive("VoxelGrid.bounds: a side", (b - a) / n) for a, b, n in zip(low, high, sizes, strict=True)
         )
@@ -167,7 +168,8 @@ class VoxelGrid:
         return f"VoxelGrid({self.shape}, {dy:.4g} x {dx:.4g} m apart, depths {near:.4g} to {far:.4g} m)"
 
 
-def _depths(values: Any, who: str) -> Tensor:
+def checked_depths(values: Any, who: str) -> Tensor:
+    """Depths (Z,) of planes, float64 on the CPU. Raises ShapeError and UnitError."""
     plain = real_array(values)
     if plain is None or plain.ndim != 1 or len(plain) == 0:
         raise ShapeError(f"{who}: expected depths (Z,) in metres, got {shown(values)}.")
@@ -177,12 +179,13 @@ def _depths(values: Any, who: str) -> Tensor:
     return depths
 
 
-def _pair(name: str, value: Any) -> tuple[Any, Any]:
+def _numbers(name: str, value: Any, many: int, *, one: bool = True) -> list[float]:
+    """``many`` numbers; ``one``: or one that stands for all. Raises ShapeError."""
     plain = real_array(value)
-    if plain is None or plain.shape not in ((), (2,)):
-        raise ShapeError(f"{name}: expected two numbers or one for both, got {shown(value)}.")
-    pair = plain.tolist() if plain.ndim else [plain.item()] * 2
-    return pair[0], pair[1]
+    if plain is None or (plain.shape != (many,) and not (one and plain.shape == ())):
+        raise ShapeError(f"{name}: expected {many} numbers{' or one for all' * one}, got {shown(value)}.")
+    numbers: list[float] = plain.tolist() if plain.ndim else [plain.item()] * many
+    return numbers
 
 
 def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -201,7 +204,4 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     y = y - (y @ along_x) * along_x
     along_y = y / y.norm()
     normal = torch.linalg.cross(along_x, along_y)
-    if scan.sensor_normals is not None:
-        mean = scan.sensor_normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
-        normal = normal if float(mean @ normal) >= 0 else -normal
-    return along_x, along_y, normal
+    return along_x, along_y, hidden_side(scan, normal)
