@@ -21,7 +21,7 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
-    "transform_bins": 0,
+    "transform_bins": 0, "yaml_numbers": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
@@ -38,6 +38,7 @@ FORBIDDEN = {
     "errors": {"torch", *MITSUBA},
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
+    "yaml_numbers": {"torch", *MITSUBA},
     "units": MITSUBA,
     "axes": MITSUBA,
     "capture": MITSUBA,
