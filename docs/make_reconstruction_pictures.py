@@ -89,7 +89,8 @@ def draw_simulated(kind: str) -> None:
         capture, volumes = through_a_file(simulated), {}
         for method in METHODS[kind]:
             began = time.perf_counter()
-            volumes[method] = tt.nlos.reconstruct(capture, method, depths=DEPTHS, progress=False, **OPTIONS.get(method, {}))
+            settings = {"depths": DEPTHS, "progress": False, **OPTIONS.get(method, {})}
+            volumes[method] = tt.nlos.reconstruct(capture, method, **settings)
             seconds = time.perf_counter() - began
             print(f"{kind}, turned by {turn} degrees, {method}: {seconds:.1f} s", flush=True)
         rows.append(volumes)
