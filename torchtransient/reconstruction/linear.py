@@ -169,10 +169,11 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     items = x.reshape(-1, *x.shape[x.ndim - dims :])
     first = function(items[0])
     out = first.new_empty(len(items), *first.shape)
-    out[0] = first
+    out[0], shape = first, first.shape
+    del first  # not held beside the next one
     for i in range(1, len(items)):
         out[i] = function(items[i])
-    return out.reshape(*lead, *first.shape)
+    return out.reshape(*lead, *shape)
 
 
 def _words(shape: tuple[int, ...]) -> str:
