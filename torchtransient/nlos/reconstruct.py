@@ -121,7 +121,7 @@ def default_grid(
         near, far = checked_depths(depths)
     if planes is None:
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
-    middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64) + 0.5) / planes
+    middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
     if size is None and extent is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
@@ -292,4 +292,4 @@ def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | Confoca
     if times is None:
         raise SceneError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
     start, stop, number = times
-    return cameras[name](torch.linspace(float(start), float(stop), int(number), dtype=torch.float64))
+    return cameras[name](torch.linspace(float(start), float(stop), int(number), dtype=torch.float64, device="cpu"))

@@ -84,7 +84,8 @@ class ConeGrid:
         """Transform (V' / 2 + 1, 2 count, 2) along one side of the wall of q^moment exp(-i w q^2) for every frequency
         w of v, real and imaginary; ``windowed``: times :meth:`window`.
         """
-        w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu") * (2 * math.pi / (self.padded * self.width))
+        w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
+        w = w * (2 * math.pi / (self.padded * self.width))
         q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
         size = (q**moment) * (self.window()[:, None] if windowed else 1.0)
         size = size.expand(len(w), -1).clone()

@@ -77,7 +77,9 @@ class TransientOperator(LinearOperator):
         self._set_tables(self.device or "cpu")
 
     def get_extra_state(self) -> Tensor:
-        """What the operator was made from, as bytes; see :mod:`operator_state`."""
+        """What the operator was made from, as bytes: its settings are those arguments of the class that it keeps under
+        their own names, records and tensors among them; of other objects it is their class alone.
+        """
         return packed(self._described())
 
     def set_extra_state(self, state: Any) -> None:
