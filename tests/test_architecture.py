@@ -20,7 +20,8 @@ TESTS = Path(__file__).parent
 BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
-    "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0,
+    "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
+    "transform_bins": 0, "yaml_numbers": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
@@ -35,6 +36,9 @@ FORBIDDEN = {
     "plugins": {"torch", "kornia"},
     "scenes": {"torch", "kornia", *MITSUBA},
     "errors": {"torch", *MITSUBA},
+    "volume_methods": {"torch", *MITSUBA},
+    "transform_bins": {"torch", *MITSUBA},
+    "yaml_numbers": {"torch", *MITSUBA},
     "units": MITSUBA,
     "axes": MITSUBA,
     "capture": MITSUBA,

@@ -107,16 +107,27 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _number(value: Any) -> float:
-    """NaN for what is no real number."""
+def with_article(word: str) -> str:
+    """"a confocal", "an exhaustive"."""
+    return f"{'an' if word[:1] in 'aeiou' else 'a'} {word}"
+
+
+def as_number(value: Any) -> float | None:
+    """``value`` as a float, infinities and NaN too; None for what is no real number."""
     if _is_truth(value) or isinstance(value, (str, bytes)) or getattr(value, "ndim", None):
-        return math.nan
+        return None
     try:
         return float(value)
     except OverflowError:
         return math.inf
     except (TypeError, ValueError, RuntimeError):
-        return math.nan
+        return None
+
+
+def _number(value: Any) -> float:
+    """NaN for what is no real number."""
+    number = as_number(value)
+    return math.nan if number is None else number
 
 
 def _is_truth(value: Any) -> bool:

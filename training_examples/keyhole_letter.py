@@ -56,34 +56,30 @@ class Track:
     axis: tt.TimeAxis
 
 
-def array(folder: Path, pattern: str, name: str) -> np.ndarray:
-    """One array of the file that fits a pattern."""
-    import h5py
-
+def read(folder: Path, pattern: str, start_s: float) -> tt.nlos.Capture:
+    """The record of the file that fits a pattern, whose first bin begins at ``start_s``."""
     found = sorted(folder.glob(pattern))
     if not found:
         raise SystemExit(f"keyhole_letter: expected {pattern} in {folder}, got none. Give the folder of one letter.")
-    with h5py.File(found[0]) as file:
-        return np.array(file[name], dtype=np.float64)
+    return tt.nlos.Capture.read(found[0], start_s=start_s)
 
 
 def read_track(folder: Path) -> Track:
     """The measured track of a folder, with time zero when light is back from the wall."""
-    direct = array(folder, "direct_after.mat", "direct_after").ravel()
+    direct = read(folder, "direct_after.mat", 0.0).transient[0, :, 0].double()
     zero = int(direct.argmax())
-    data = array(folder, "scan_*.mat", "data")
-    dark = array(folder, "LongExpNoObject_after.mat", "LongExpNoObject_after").ravel()
-    x, z = (array(folder, "scan_*.mat", name).ravel() for name in ("xpos", "zpos"))
-    counts = summed(torch.from_numpy(data[:, zero : zero + BINS]))
-    background = summed(torch.from_numpy(dark[None, zero : zero + BINS])).expand_as(counts)
+    data = read(folder, "scan_*.mat", -zero * BIN_S)
+    dark = read(folder, "LongExpNoObject_after.mat", -zero * BIN_S)
+    x, z = (np.array(data.metadata[name]) for name in ("xpos", "zpos"))
+    counts, background = (summed(record) for record in (data, dark))
     response = torch.zeros(2 * (BEHIND // SUMMED) + 3, dtype=torch.float64)
     lags = torch.round(torch.arange(-BEFORE, BEHIND) / SUMMED).long() + len(response) // 2
-    response.index_add_(0, lags, torch.from_numpy(direct[zero - BEFORE : zero + BEHIND]))
+    response.index_add_(0, lags, direct[zero - BEFORE : zero + BEHIND])
     # The letter moves to the right: as seen from it, the point moves to the left.
     points = np.stack([TRACK_X * (0.5 - share(x)), np.full_like(x, TRACK_Y), TRACK_Z * share(z)], -1)
     scan = tt.nlos.Scan.points(points, kind="confocal", sensor_origin=(0, 0, 2), laser_origin=(0, 0, 2))
     axis = tt.TimeAxis.from_seconds(0.0, BIN_S * SUMMED, BINS // SUMMED)
-    return Track(counts, background, response / response.sum(), scan, axis)
+    return Track(counts, background.expand_as(counts), response / response.sum(), scan, axis)
 
 
 def share(values: np.ndarray) -> np.ndarray:
@@ -91,9 +87,10 @@ def share(values: np.ndarray) -> np.ndarray:
     return (values - values.min()) / max(float(np.ptp(values)), 1e-9)
 
 
-def summed(rows: Tensor) -> Tensor:
-    """(N, bins) to (T, N), some bins added up."""
-    return rows.reshape(len(rows), -1, SUMMED).sum(2).T.contiguous()
+def summed(record: tt.nlos.Capture) -> Tensor:
+    """(T, N): the bins that are used, some of them added up."""
+    used = record.crop(0.0, tt.units.seconds_to_opl(BINS * BIN_S))
+    return tt.nlos.sum_bins(used, SUMMED).transient[0].double().contiguous()
 
 
 def plane(resolution: int) -> Tensor:

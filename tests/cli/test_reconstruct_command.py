@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -59,12 +61,13 @@ def test_a_point_is_found_by_every_method(folder, kind, method):
 
 @pytest.mark.parametrize(("kind", "method"), [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor")])
 def test_without_a_method_the_one_that_suits_is_taken(folder, kind, method):
+    article = "an" if kind == "exhaustive" else "a"
     captured(kind).write("a.npz")
     result = run("a.npz", "-o", "v.npz", "--depths", 0.4, 1.0)
     assert result.exit_code == 0, result.output
-    assert f"--method {method}: a {kind} scan" in result.stderr and "volume: 100%" in result.stderr
+    assert f"--method {method}: {article} {kind} scan" in result.stderr and "volume: 100%" in result.stderr
     volume = tt.nlos.read_volume("v.npz")
-    assert volume.method == method and volume.metadata["reason"].startswith(f"a {kind} scan")
+    assert volume.method == method and volume.metadata["reason"].startswith(f"{article} {kind} scan")
     assert volume.metadata["capture"] == "a.npz"
     assert "v.npz: 1 x " in result.stdout and (folder / "v.png").stat().st_size > 5000
 
@@ -113,7 +116,9 @@ def test_options_are_those_of_the_function(folder):
     ).reconstruct(capture)
     assert found.grid == grid
     torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-6 * float(expected.max()))
-    assert found.metadata["settings"] == {"wavelength": 0.3, "cycles": 5.0, "falloff": 1.0}
+    assert found.metadata["settings"] == {
+        "wavelength": 0.3, "cycles": 5.0, "falloff": 1.0, "filter": "phasor",
+    }  # fmt: skip
 
 
 def test_cut_and_summed_bins(folder):
@@ -157,6 +162,16 @@ def test_what_a_file_leaves_open_is_asked_for(folder):
     assert result.exit_code == 0, result.output
     volume = tt.nlos.read_volume("foam_fk.h5")
     assert volume.metadata["assumed"]["bin_width_s"] == 16e-12 and volume.metadata["prepared"]["slab"] == 0.01
+    told = run("foam.mat", "--wall-size", 0.6, "--format", "cdt", "--taps", 2, "--no-picture").stderr
+    assert "assumed, since the file does not say it: " in told
+    assert "--start-s 0" in told and "--bin-width-s 1.6e-11" in told
+    assert tt.nlos.read_volume("foam_fk.h5").metadata["settings"]["taps"] == 2
+
+
+def test_the_module_of_the_command_runs():
+    words = [sys.executable, "-m", "torchtransient.cli.main", "reconstruct", "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "--method" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -175,6 +190,18 @@ def test_what_a_file_leaves_open_is_asked_for(folder):
         (("a.h5", "--times", 0, 1, 3), "--camera"),
         (("a.h5", "--method", "phasor", "--camera", "transient", "--times", 0, 1, 3), "one laser spot"),
         (("a.h5", "--slab-snr", 3), "--slab"),
+        (("a.h5", "--slab", 0.02, "--slab-snr", 0), "snr: expected a finite number greater than zero"),
+        (("a.h5", "--gamma", 0), "--gamma: expected a finite number greater than zero"),
+        (("a.h5", "--gamma", "nan"), "--gamma: expected a finite number"),
+        (("a.h5", "--threshold", 5), "--threshold: expected a number between 0 and 1"),
+        (("a.h5", "--slab", 25.4), "--slab: expected a slab that is thinner"),
+        (("a.h5", "--record", 0, 2000), "--record: expected lengths within the record, 0 to 2.56 m"),
+        (("a.h5", "--taps", 3), "taps"),
+        (("a.h5", "--method", "lct", "--v-bins", 2), "v_bins"),
+        (("a.h5", "--method", "bp", "--extent", 600), "within the record"),
+        (("a.h5", "--method", "fbp", "--wavelength", 60), "wavelength of"),
+        (("a.h5", "--method", "bp", "--voxels", "9000,9000,9000"), "TiB at least"),
+        ((".",), "is a directory"),
         (("a.h5", "--depths", 1, 0.5), "near < far"),
         (("a.h5", "--depths", 5, 6), "within the record"),
         (("a.h5", "--record", 9, 10), "hold no bin"),

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
+import functools
+import inspect
 import pickle
 
 import pytest
 import torch
 
-from support.loss_cases import CASES
-from torchtransient import losses
-from torchtransient.errors import ShapeError, UnitError
+from support.loss_cases import CASES, OTHERS
+from torchtransient import FrequencyAxis, losses
+from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 
 every = pytest.mark.parametrize("case", CASES, ids=str)
 HALVES = (torch.float16, torch.bfloat16)
@@ -35,9 +38,32 @@ def mask_of(y):
     return torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
 
 
+def public(kind):
+    return {thing for name, thing in vars(losses).items() if not name.startswith("_") and kind(thing)}
+
+
 def test_every_loss_is_in_the_list():
-    named = {name for name in dir(losses) if name.endswith("Loss")} - {"PairLoss"}
-    assert named | {"MeasurementConsistency", "TotalVariation"} == {case.module.__name__ for case in CASES}
+    """Every function of the room is a case or one of the others, which reduce nothing; every module is a case."""
+    functions = public(inspect.isfunction)
+    reducing = {function for function in functions if "reduction" in inspect.signature(function).parameters}
+    assert reducing == {case.function for case in CASES}
+    assert functions - reducing == set(OTHERS)
+    modules = public(lambda thing: inspect.isclass(thing) and issubclass(thing, torch.nn.Module))
+    assert modules == {case.module for case in CASES}
+
+
+@pytest.mark.parametrize("call", OTHERS.values(), ids=[function.__name__ for function in OTHERS])
+def test_the_others(call):
+    """Precision, autocast, derivatives, and errors with the name of what was called."""
+    x = 0.1 + torch.rand(1, 8, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    wanted = call(x)
+    assert wanted.dtype.to_real() == torch.float64
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(call(x.float()), call(x.float().clone()), rtol=0, atol=0)
+        torch.testing.assert_close(call(x.float()).to(wanted.dtype), wanted, rtol=1e-5, atol=1e-5)
+    if wanted.requires_grad is False and call is not losses.relative_floor:  # it has no gradient
+        assert torch.autograd.gradcheck(call, x.clone().requires_grad_(), fast_mode=True)
+    assert call(x.to("meta")).device.type == "meta"
 
 
 @every
@@ -47,7 +73,7 @@ def test_modules_hold_the_options_of_functions(case):
     torch.testing.assert_close(case.as_module(x, y, mask, "sum"), case(x, y, mask, "sum"), rtol=0, atol=0)
     module = case.module(**case.options)
     again = pickle.loads(pickle.dumps(module))
-    arguments = (x, y) if case.pair else (x,)
+    arguments = case.arguments(x, y)
     for other in (again, copy.deepcopy(module)):
         torch.testing.assert_close(other(*arguments), case(x, y), rtol=0, atol=0)
     assert module.state_dict() == {}
@@ -261,22 +287,87 @@ def test_whole_numbers_as_targets(case):
 def test_on_the_device_of_the_tensors(case):
     x, y = (t.to("cuda") for t in case.tensors())
     mask = mask_of(y).cuda()
-    found = case.module(**case.options).cuda()(*((x, y) if case.pair else (x,)), mask=mask)
+    found = case.module(**case.options).cuda()(*case.arguments(x, y), mask=mask)
     assert found.device.type == "cuda"
     torch.testing.assert_close(found.cpu(), case(x.cpu(), y.cpu(), mask.cpu()))
 
 
-@every
-def test_errors(case):
+def wrong_calls(case):
+    """What is wrong with any loss, and what else with those that have such an option."""
     x, y = case.tensors()
-    with pytest.raises(ShapeError, match="reduction"):
-        case(x, y, reduction="median")
-    with pytest.raises(UnitError, match="mask of truth values"):
-        case(x, y, torch.ones_like(y))
-    with pytest.raises(ShapeError, match="mask that broadcasts"):
-        case(x, y, torch.ones(3, *y.shape, dtype=torch.bool))
-    with pytest.raises(ShapeError, match="expected"):
-        case(x.tolist() if not case.pair else x, y.tolist())
+    yield ShapeError, "reduction", lambda: case(x, y, reduction="median")
+    yield UnitError, "mask of truth values", lambda: case(x, y, torch.ones_like(y))
+    yield ShapeError, "mask that broadcasts", lambda: case(x, y, torch.ones(3, *y.shape, dtype=torch.bool))
+    yield DeviceError, "mask", lambda: case(x, y, torch.ones(y.shape, dtype=torch.bool, device="meta"))
+    yield ShapeError, "expected", lambda: case(x.tolist() if not case.pair else x, y.tolist())
+    yield ShapeError, "sparse", lambda: case(x.to_sparse(), y)
     if case.pair:
-        with pytest.raises(ShapeError, match="shape"):
-            case(x, y[..., :-1])
+        yield ShapeError, "shape", lambda: case(x, y[..., :-1])
+        yield DeviceError, "device", lambda: case(x, y.to("meta"))
+    if real(x) and case.function is not losses.total_variation and case.function not in EVEN_COMPLEX:
+        yield UnitError, "real", lambda: case(x, y + 1j)
+    for name, values in WRONG_OPTIONS.items():
+        if name in inspect.signature(case.function).parameters:
+            for value in values:
+                yield TorchTransientError, "expected", lambda name=name, value=value: replaced(case, name, value)(x, y)
+
+
+EVEN_COMPLEX = (losses.squared_loss, losses.measurement_consistency)
+LEVELS = (-1.0, float("nan"), float("inf"), True, "a", [1.0])
+WRONG_OPTIONS = {
+    **dict.fromkeys(("floor", "background", "smoothing", "value_range", "creation_cost_opl"), LEVELS),
+    **dict.fromkeys(("bin_width_opl", "read_noise"), (*LEVELS, 0.0, None)),
+    **dict.fromkeys(("cycles", "periods", "window"), (0, -4, 2.5, float("nan"), True, "a", None)),
+    **dict.fromkeys(("phase_only", "isotropic", "shot_noise", "scale_invariant", "constant"), ("no", 1, None)),
+    **dict.fromkeys(("axis", "frequencies"), (None, [1.0], FrequencyAxis((1e9,)))),
+    **dict.fromkeys(("operator", "compare", "root"), (None, "a", 3)),
+    "dead_bins": (-1.0, 0.0, 0.2, float("nan"), float("inf"), "a", True),
+    "spacing": (1.0, (1.0, 2.0), (1.0, 0.0, 1.0), "abc", None),
+    "dim": (1.5, True, "time"),
+    "reduction": ("median", None, True),
+}
+
+
+def replaced(case, name, value):
+    options = {**case.options, name: value}
+    return dataclasses.replace(case, options=options) if name != "reduction" else functools.partial(
+        case, reduction=value
+    )  # fmt: skip
+
+
+@every
+def test_errors_say_who_was_called(case):
+    for error, match, call in wrong_calls(case):
+        with pytest.raises(error, match=match) as caught:
+            call()
+        assert str(caught.value).startswith(case.function.__name__ + ":"), str(caught.value)
+
+
+@every
+def test_modules_check_their_options_when_made(case):
+    """Whatever a function refuses of options, its module does before it is called, by its own name."""
+    names = inspect.signature(case.module).parameters
+    assert set(names) - {"reduction", "dim"} <= set(WRONG_OPTIONS)
+    for name in names:
+        for value in WRONG_OPTIONS[name]:
+            with pytest.raises(TorchTransientError, match="expected") as caught:
+                case.module(**{**case.options, name: value})
+            assert str(caught.value).startswith(case.module.__name__ + ":"), str(caught.value)
+
+
+@pytest.mark.slow
+@every
+def test_compiled(case):
+    """Values and gradients; likelihoods break the graph where they look at their values."""
+    x, y = case.tensors()
+    torch.compiler.reset()
+    leaf, mask = x.clone().requires_grad_(), mask_of(y)
+    module = case.module(**case.options, reduction="sum")
+    compiled = torch.compile(module, backend="aot_eager")
+    found = compiled(*case.arguments(leaf, y), mask=mask)
+    torch.testing.assert_close(found, case(x, y, mask, "sum"))
+    found.backward()
+    torch.testing.assert_close(leaf.grad, gradient(case, x, y, mask))
+    if case.function is not losses.read_noise_nll and case.draw_target is not None:
+        with pytest.raises(UnitError, match="expected rates"):
+            compiled(*case.arguments(-x, y))

@@ -66,7 +66,7 @@ def test_every_layout_has_the_numbers_of_images(case, dim, laid_out):
             torch.testing.assert_close(found, wanted)
             torch.testing.assert_close(case(*given, reduction, dim=dim + given[0].ndim), found)
     module = case.module(**case.options, dim=dim)
-    torch.testing.assert_close(module(*given[:2]), case(*given[:2], dim=dim))
+    torch.testing.assert_close(module(*case.arguments(*given[:2])), case(*given[:2], dim=dim))
 
 
 def value_or_error(call):

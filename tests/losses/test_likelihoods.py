@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 
 import pytest
 import torch
 
+from support import loss_cases
+from torchtransient import losses
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses import (
     FirstPhotonNLL,
@@ -20,7 +23,7 @@ from torchtransient.losses import (
     poisson_nll,
     read_noise_nll,
 )
-from torchtransient.losses.likelihoods import armed_periods
+from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD, coates
 
 BINS = 20
@@ -256,3 +259,65 @@ def test_model_first():
     torch.testing.assert_close(poisson_loss(r, n, floor=1e-3), poisson_nll(n, r, floor=1e-3), rtol=0, atol=0)
     found = first_photon_loss(r, n, CYCLES, dead_bins=4.5)
     torch.testing.assert_close(found, first_photon_nll(n, r, CYCLES, dead_bins=4.5), rtol=0, atol=0)
+
+
+# --------------------------------------------------------------------------------- one rule for what counts may be
+
+COUNTED = [case for case in loss_cases.CASES if case.draw_target is not None]
+counted = pytest.mark.parametrize("case", COUNTED, ids=str)
+
+
+@counted
+def test_counts_below_zero_enter_the_same_formula(case):
+    """Poisson, first photons and free-running detectors are linear in the counts, so the mean over +n and -n is that of
+    none; read noise is a normal distribution anyway. Under masks, too. The constant has no such formula.
+    """
+    x, y = case.tensors()
+    y = 0.3 * y
+    mask = torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
+    for given in (None, mask):
+        up, down, none = (case(x, sign * y, given, "none") for sign in (1, -1, 0))
+        if case.function is losses.read_noise_nll:
+            none = none + (y**2 / (2 * (x + 0.7**2)) if given is None else mask * y**2 / (2 * (x + 0.7**2)))
+        torch.testing.assert_close(up + down, 2 * none)
+    if "constant" in inspect.signature(case.function).parameters and case.function is not losses.read_noise_nll:
+        with pytest.raises(UnitError, match=f"{case.function.__name__}: expected counts >= 0 with constant=True"):
+            case(x, -y, constant=True)
+        hidden = torch.where(mask.any(2, keepdim=True), y, -y)
+        assert bool(torch.isfinite(case(x, hidden, mask.any(2, keepdim=True), constant=True)))
+
+
+@counted
+@pytest.mark.parametrize("whose", ["counts", "model"])
+def test_nan_that_counts_is_nan(case, whose):
+    """Where a mask leaves it out it has no part, but for the detectors that were dead after it."""
+    x, y = case.tensors()
+    broken = (x if whose == "model" else y).clone()
+    broken[0, 0, 3, 1, 2] = float("nan")
+    pair = (broken, y) if whose == "model" else (x, broken)
+    assert bool(case(*pair).isnan())
+    mask = torch.ones_like(y, dtype=torch.bool)
+    mask[0, 0, 3, 1, 2] = False
+    found = case(*pair, mask, "none")
+    dead = whose == "counts" and any(name in case.options for name in ("cycles", "periods"))
+    assert bool(found[0, 0, 4, 1, 2].isnan()) == dead
+    elsewhere = torch.ones_like(mask)
+    elsewhere[0, 0, :, 1, 2] = False
+    for seen in (elsewhere, mask.all(2, keepdim=True)):
+        found = case(*pair, seen.expand_as(mask), "none")
+        assert bool(torch.isfinite(found).all())
+        torch.testing.assert_close(found, case(x, y, seen.expand_as(mask), "none"), rtol=0, atol=0)
+        leaf = pair[0].clone().requires_grad_()
+        case(leaf, pair[1], seen.expand_as(mask)).backward()
+        assert bool(torch.isfinite(leaf.grad).all())
+
+
+@counted
+def test_errors_of_values_say_who_was_called(case):
+    x, y = case.tensors()
+    if case.function is not losses.read_noise_nll:
+        with pytest.raises(UnitError, match=f"^{case.function.__name__}: expected rates"):
+            case(-x, y)
+    if {"cycles", "periods"} & set(case.options):
+        with pytest.raises(UnitError, match=f"^{case.function.__name__}: expected counts"):
+            case(x, 1000 * y)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import re
 
 import pytest
 import torch
 
+from support.loss_cases import CASES
 from torchtransient import TimeAxis, losses
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ShapeError
@@ -111,3 +113,60 @@ def test_says_what_the_operator_did_not_make():
         losses.measurement_consistency([1.0], draw(1, 4, 3, 3), lambda v: v)
     with pytest.raises(ShapeError, match="the operator to be a function"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), 3)
+
+
+# ------------------------------------------------------------------------------------------------------------- compare
+
+PAIRS = [case for case in CASES if case.pair and case.target_shape is None and not case.measurement_first]
+
+
+@pytest.mark.parametrize("case", PAIRS, ids=str)
+def test_compares_by_every_module_of_the_room(case):
+    """As by the function; the module is a part of this one, and its `reduction` is the same."""
+    x, y = case.tensors()
+    mask = torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
+    for reduction in ("mean", "none"):
+        wanted = case(2 * x, y, mask, reduction)
+        module = case.module(**case.options, reduction=reduction)
+        function = functools.partial(case.function, **case.options)
+        for compare in (module, function):
+            loss = losses.MeasurementConsistency(lambda v: 2 * v, compare, reduction=reduction)
+            torch.testing.assert_close(loss(x, y, mask), wanted, rtol=0, atol=0)
+        assert module in losses.MeasurementConsistency(lambda v: v, module, reduction=reduction).modules()
+    with pytest.raises(ShapeError, match=r"reduction 'sum' of compare, too, got .* with 'none'"):
+        losses.MeasurementConsistency(lambda v: v, module, reduction="sum")
+
+
+def swallows(input, target, **options):
+    return (input - target).square().mean()
+
+
+def returns_a_list(input, target, mask, reduction):
+    return [0.0]
+
+
+NO_COMPARES = {
+    "bin_width_opl": losses.wasserstein_loss,
+    "cycles": losses.first_photon_loss,
+    "L1Loss": torch.nn.L1Loss(),
+    "mask": torch.nn.functional.mse_loss,
+    "target, mask=": losses.TotalVariation(),
+    "positional": losses.total_variation,
+    "takes counts": losses.poisson_nll,
+    "PoissonNLL, which takes counts": losses.PoissonNLL(),
+    "takes measured": functools.partial(losses.read_noise_nll, read_noise=1.0),
+    "heed reduction 'none', got ()": swallows,
+    "heed reduction 'none', got list": returns_a_list,
+}
+
+
+@pytest.mark.parametrize("says, compare", NO_COMPARES.items(), ids=NO_COMPARES.keys())
+def test_says_what_compare_lacks(says, compare):
+    volume = draw(1, 4, 3, 3)
+    if isinstance(compare, torch.nn.Module):
+        compare.reduction = "none"
+    with pytest.raises(ShapeError, match=r"measurement_consistency: expected compare .*" + re.escape(says)):
+        losses.measurement_consistency(volume, volume, lambda v: v, compare=compare, reduction="none")
+    if "heed" not in says:
+        with pytest.raises(ShapeError, match=r"MeasurementConsistency: expected compare .*" + re.escape(says)):
+            losses.MeasurementConsistency(lambda v: v, compare, reduction="none")

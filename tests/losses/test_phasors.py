@@ -71,7 +71,7 @@ def test_brightness_has_no_part_in_phases():
 
 def test_parseval():
     a, b = (torch.rand(1, 64, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
-    whole = FrequencyAxis.uniform(0.0, 1 / (64 * 0.05), 64)
+    whole = FrequencyAxis.uniform(-0.5 / 0.05, 1 / (64 * 0.05), 64)
     found = losses.transient_phasor_loss(a, b, AXIS, whole)
     torch.testing.assert_close(found, 64 * losses.squared_loss(a, b))
 
@@ -105,6 +105,33 @@ def test_a_window_of_time_by_a_mask():
     window = TimeAxis(3.0 + 0.5, 0.05, 20)
     found = losses.transient_phasor_loss(a, b, AXIS, BAND, mask=mask)
     torch.testing.assert_close(found, losses.transient_phasor_loss(a[:, 10:30], b[:, 10:30], window, BAND))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_frequencies_above_half_of_one_over_the_bin(sign):
+    """10 per metre for bins of 5 cm: above, records of whole bins have the phasors of lower frequencies."""
+    record = pulse(3, 20)
+    calls = [
+        lambda band: losses.transient_phasors(record, AXIS, band),
+        lambda band: losses.transient_phasor_loss(record, record, AXIS, band),
+        lambda band: losses.TransientPhasorLoss(AXIS, band),
+    ]
+    for call in calls:
+        for frequency in (10.001, 20.5, 1e9):
+            with pytest.raises(UnitError, match="two bins at least, frequencies of 10 per metre"):
+                call(FrequencyAxis((1.0, sign * frequency)))
+        call(FrequencyAxis((sign * 10.0,)))
+    # of a discrete transform, however it is computed
+    for bins, width in ((64, 0.05), (30, 0.1), (7, 0.3), (1000, 0.0299792458 / 3)):
+        axis, whole = TimeAxis(0.0, width, bins), FrequencyAxis(torch.fft.rfftfreq(bins, width, dtype=torch.float64))
+        record = torch.rand(1, bins, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        found = losses.transient_phasors(record, axis, whole, dim=1)
+        middle = torch.polar(torch.ones(len(whole.frequencies)).double(), -math.pi * width * whole.per_metre)
+        torch.testing.assert_close(found.flatten(), torch.fft.rfft(record.flatten()) * middle)
+    # at two bins even the sign of a delay is lost, one below it is not
+    for nu, alike in ((10.0, True), (9.0, False)):
+        up, down = (losses.transient_phasors(pulse(10 + k), AXIS, FrequencyAxis((nu,), 3.525)) for k in (1, -1))
+        assert torch.allclose(up, down, atol=1e-9) == alike
 
 
 def test_errors():

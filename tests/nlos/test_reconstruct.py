@@ -12,9 +12,9 @@ from click.testing import CliRunner
 import torchtransient as tt
 from torchtransient.capture import Wall
 from torchtransient.cli.main import main
-from torchtransient.cli.reconstruct import METHODS as NAMES
 from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
 from torchtransient.nlos.methods import METHODS, default_wavelength
+from torchtransient.nlos.reconstruct import camera_of
 from torchtransient.testing.point_captures import point_capture
 
 PAGE = Path(__file__).parents[2] / "docs" / "nlos_reconstruction.md"
@@ -49,9 +49,8 @@ def test_from_the_simulation_through_a_file_to_the_volume(tmp_path, kind, method
 
 
 def test_every_method_of_the_command_is_known():
-    assert tuple(METHODS) == NAMES
     told = re.findall(r"^\| `([\w-]+)` \| `(\w+)`", TEXT, flags=re.MULTILINE)
-    assert {name for name, _ in told} == set(NAMES) and all(hasattr(tt.nlos, operator) for _, operator in told)
+    assert {name for name, _ in told} == set(METHODS) and all(hasattr(tt.nlos, operator) for _, operator in told)
 
 
 def test_curved_walls_are_backprojected():
@@ -128,6 +127,66 @@ def test_mistakes_have_types(tmp_path):
         tt.nlos.normals_of(tt.nlos.reconstruct(capture))
 
 
+PAIR = (0, 1)
+STRANGE = (
+    {}, [], "", "x", 0, -1, 2.5, True, float("nan"), 1j, object(), torch.zeros(2), PAIR, ("a", "b"), (1, 0), b"x",
+)  # fmt: skip
+
+
+def test_strange_arguments_have_types_too():
+    captures = {kind: point_capture(scanned(kind, 4), [PLATE], time_axis=AXIS) for kind in ("confocal", "single")}
+    confocal, single = captures.values()
+    calls = {
+        "method": lambda v: tt.nlos.reconstruct(confocal, v),
+        "grid": lambda v: tt.nlos.reconstruct(confocal, "bp", grid=v),
+        "depths": lambda v: tt.nlos.reconstruct(confocal, "fk", depths=v),
+        "target": lambda v: tt.nlos.reconstruct(confocal, "lct", target=v),
+        "filter": lambda v: tt.nlos.reconstruct(confocal, "fbp", filter=v),
+        "planes": lambda v: tt.nlos.default_grid(single, planes=v),
+        "times": lambda v: camera_of("transient", v),
+        "camera": lambda v: camera_of(v, (0, 1, 3)),
+        "bins": lambda v: tt.nlos.sum_bins(single, v),
+        "capture": lambda v: tt.nlos.sum_bins(v, 2),
+        "any capture": lambda v: tt.nlos.default_grid(v),
+    }
+    for name, call in calls.items():
+        for value in STRANGE:
+            if name == "depths" and value is PAIR:
+                continue
+            with pytest.raises(tt.errors.TorchTransientError):
+                call(value)
+    for times in ((0, 1), (0, 1, 2.7), (0, 1, -1), (0, 1, 0), (0, float("inf"), 3), 5):
+        with pytest.raises((SceneError, UnitError), match="times"):
+            camera_of("transient", times)
+    assert len(camera_of("confocal", (0, 1, 3.0)).times) == 3
+    for planes in (2.5, 0, -3):
+        with pytest.raises(SceneError, match="planes"):
+            tt.nlos.default_grid(single, planes=planes)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 1), (1, 5)])
+def test_scans_of_one_line_are_asked_how_large_the_volume_is(size):
+    capture = point_capture(tt.nlos.Scan.grid(WALL, size, kind="confocal"), [PLATE], time_axis=AXIS)
+    with pytest.raises(SceneError, match=r"one line.*extent=\(width, height\)"):
+        tt.nlos.reconstruct(capture)
+    volume = tt.nlos.reconstruct(capture, grid=tt.nlos.default_grid(capture, extent=1.0, size=6, depths=(0.4, 0.8)))
+    assert volume.values.shape[-2:] == (6, 6) and float(volume.values.max()) > 0
+
+
+def test_a_cut_capture_goes_into_an_operator_of_its_bins():
+    """Three times .1 is not .3, and the bins are the same."""
+    capture = point_capture(scanned("confocal", 4), [PLATE], time_axis=tt.TimeAxis(0.0, 0.1, 30))
+    for start in (0.1, 0.3, 0.6, 0.7):
+        axis = tt.TimeAxis(start, 0.1, 20)
+        operator = tt.nlos.Backprojection(capture.scan, tt.nlos.VoxelGrid.before(capture.scan, [0.5]), time_axis=axis)
+        cut = capture.crop(start, start + 2.0)
+        assert cut.axis.start_opl == start
+        inside = capture.crop(start + 0.03, start + 1.96)
+        assert torch.equal(operator.reconstruct(cut), operator.reconstruct(inside))
+    with pytest.raises(ShapeError, match="as the operator has"):
+        operator.reconstruct(capture.crop(0.6, 2.6))
+
+
 def test_the_page(tmp_path, monkeypatch):
     """Its blocks run, its command reads what they wrote, its links lead somewhere."""
     monkeypatch.chdir(tmp_path)
@@ -146,3 +205,14 @@ def test_the_page(tmp_path, monkeypatch):
     assert set(re.findall(r"--[a-z][\w-]+", TEXT)) <= options
     for picture in (PAGE.parent / "images" / "reconstruction").iterdir():
         assert picture.stat().st_size < 150_000
+
+
+def test_public_names_in_texts_are_there():
+    """`tt.nlos.X` and `tt.losses.X` of pages, docstrings and messages."""
+    package = Path(tt.__file__).parent
+    files = [*PAGE.parent.glob("*.md"), package.parent / "README.md", *package.rglob("*.py")]
+    named = {name for path in files for name in re.findall(r"\btt\.((?:nlos|losses)\.\w+)", path.read_text("utf-8"))}
+    assert len(named) > 20
+    for name in sorted(named):
+        room, attribute = name.split(".")
+        assert hasattr(getattr(tt, room), attribute), name

@@ -75,6 +75,10 @@ def test_yaml(tmp_path):
     preset.to_yaml(tmp_path / "device.yaml")
     assert Device.from_yaml(tmp_path / "device.yaml") == preset
     assert Device.from_yaml(preset.to_yaml()) == preset
+    # Numbers without a point, as JSON writes them.
+    plain = "name: d\ndescription: d\nsources: ['assumed: all']\nstages: [{kind: GaussianResponse, fwhm_s: %s}]\n"
+    assert Device.from_yaml(plain % "1e-10").stages[0]["fwhm_s"] == 1e-10
+    assert Device.from_yaml(plain % "'1e-10'").stages[0]["fwhm_s"] == "1e-10"
     with pytest.raises(StorageError, match="expected"):
         Device.from_yaml("name: [1\n")
     with pytest.raises(StorageError, match="expected"):

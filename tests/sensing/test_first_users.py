@@ -356,6 +356,13 @@ def test_floor_of_an_item_in_the_dark_is_usable():
     assert bool(torch.isfinite(loss)) and float(mean.grad.abs().max()) < 1e4
 
 
+@pytest.mark.parametrize("value", [True, "100", torch.tensor(True), torch.tensor([100.0]), None])
+def test_numbers_are_those_of_the_whole_library(value):
+    """Python makes 1 of a truth value and a number of a text."""
+    with pytest.raises(UnitError, match="cycles to be one number"):
+        sensing.SynchronousSPAD(value)
+
+
 def test_counts_below_zero_keep_their_weight():
     """A normal surrogate goes below 0: the mean loss over +n and -n is that of no counts."""
     mean = 0.1 + light(1, 6, 1, 1)

@@ -55,15 +55,20 @@ class LossCase:
     mapped: bool = True  # torch.vmap
     floors_detached: bool = False  # the scale of an item goes in without gradient
     dim: int | None = None  # where time is, of losses that want to know it
+    measurement_first: bool = False  # likelihoods (counts, mean)
 
     def tensors(self, seed=0, dtype=torch.float64):
         generator = torch.Generator().manual_seed(seed)
         x = self.draw(self.input_shape, generator, dtype)
         return x, (self.draw_target or self.draw)(self.target_shape or self.input_shape, generator, dtype)
 
+    def arguments(self, input, target):
+        if not self.pair:
+            return (input,)
+        return (target, input) if self.measurement_first else (input, target)
+
     def __call__(self, input, target, mask=None, reduction="mean", **more):
-        arguments = (input, target) if self.pair else (input,)
-        return self.function(*arguments, **self.options, **more, mask=mask, reduction=reduction)
+        return self.function(*self.arguments(input, target), **self.options, **more, mask=mask, reduction=reduction)
 
     @property
     def said(self):
@@ -72,7 +77,7 @@ class LossCase:
 
     def as_module(self, input, target, mask=None, reduction="mean"):
         module = self.module(**self.options, reduction=reduction)
-        return module(*((input, target) if self.pair else (input,)), mask=mask)
+        return module(*self.arguments(input, target), mask=mask)
 
     def __str__(self):
         return self.name
@@ -96,8 +101,15 @@ def _phasors(name, **options):
 def _likelihood(name, function, module, **options):
     return LossCase(
         name, function, module, {"floor": 1e-3, **options}, draw_target=counts, crop=PIXELS, symmetric=False,
-        zero_at_equality=False, mapped=False, dim=-3,
+        zero_at_equality=False, mapped=False, dim=-3, measurement_first=function.__name__.endswith("nll"),
     )  # fmt: skip
+
+
+def _mesh(points):
+    """A triangle of any three numbers, and one at its side."""
+    corners = torch.stack([points[..., :3].flatten()[:9].reshape(3, 3), torch.eye(3).to(points)])
+    faces = torch.tensor([[0, 1, 2]], device=points.device)
+    return losses.surface_distance(corners[0], faces, corners[1], faces)
 
 
 WIDTH = {"bin_width_opl": 0.05}
@@ -142,4 +154,17 @@ CASES = [
     _likelihood("first photon", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES),
     _likelihood("first photon, dead time", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES,
                 dead_bins=2.0),
-]  # fmt: skip
+    _likelihood("Poisson, counts first", losses.poisson_nll, losses.PoissonNLL),
+    _likelihood("first photon, counts first", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES),
+    _likelihood("free running", losses.free_running_nll, losses.FreeRunningNLL, periods=CYCLES, dead_bins=2.5),
+    LossCase("read noise", losses.read_noise_nll, losses.ReadNoiseNLL, {"read_noise": 0.7}, draw_target=counts,
+             symmetric=False, zero_at_equality=False, measurement_first=True),
+]
+# What is public and no loss of (input, target): parts of losses and losses of other things, of one tensor each.
+OTHERS = {
+    losses.surface_distance: _mesh,
+    losses.relative_floor: losses.relative_floor,
+    losses.anscombe: losses.anscombe,
+    losses.transient_phasors: lambda x: losses.transient_phasors(x, AXIS, BAND),
+    losses.maximum_projections: lambda x: torch.cat([view.flatten() for view in losses.maximum_projections(x)]),
+}  # fmt: skip

@@ -39,6 +39,35 @@ def test_brightness():
     vis.volume_views(torch.full((2, 2, 2), torch.nan))
 
 
+def test_uneven_planes_stand_where_they_are():
+    """Each voxel between the middles to its neighbours, seen from the top and from the side."""
+    depths = [0.1, 0.2, 2.0]
+    values = torch.arange(1.0, 4.0)[:, None, None].expand(3, 2, 2)
+    figure = vis.volume_views(values, depths=depths, extent=(1.0, 1.0))
+    front, top, side = figure.axes[:3]
+    assert front.images and not top.images and not side.images
+    edges = [0.05, 0.15, 1.1, 2.9]
+    for panel, axis in ((top, 1), (side, 0)):
+        (mesh,) = panel.collections
+        corners = mesh.get_coordinates()
+        np.testing.assert_allclose(np.unique(corners[..., axis]), edges, rtol=1e-6)
+        np.testing.assert_allclose(np.unique(corners[..., 1 - axis]), [-0.5, 0.0, 0.5], atol=1e-6)
+        drawn = np.asarray(mesh.get_array()).reshape(corners.shape[0] - 1, corners.shape[1] - 1)
+        np.testing.assert_allclose(drawn if axis else drawn.T, np.array([[1, 1], [2, 2], [3, 3]]) / 3)
+    for wrong in ([0.2, 0.1, 0.3], [0.1, 0.1, 0.2], [0.1, float("nan"), 0.2], [0.1, 0.2, float("inf")]):
+        with pytest.raises(UnitError, match="increase"):
+            vis.volume_views(values, depths=wrong)
+
+
+def test_what_is_no_number_is_seen():
+    """NaN is neither black nor white, infinity is white, and the others keep their brightness."""
+    values = torch.tensor([0.0, 1.0, 2.0, torch.inf, torch.nan, -torch.inf]).reshape(1, 1, 6)
+    panel = vis.volume_views(values).axes[0].images[0]
+    drawn = panel.get_array()
+    np.testing.assert_allclose(np.ma.filled(drawn, -1.0), [[0.0, 0.5, 1.0, 1.0, -1.0, 0.0]])
+    assert tuple(panel.get_cmap()(np.ma.masked)) not in [(0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0)]
+
+
 def test_depth_and_normals_beside_them(tmp_path):
     depth, mask = torch.full((5, 6), 0.7), torch.zeros(5, 6, dtype=torch.bool)
     mask[1, 0] = True
@@ -64,6 +93,8 @@ def test_what_cannot_be_drawn(tmp_path):
         vis.volume_views(volume(), depths=[0.1])
     with pytest.raises(UnitError, match="extent"):
         vis.volume_views(volume(), extent=(1.0, 0.0))
+    with pytest.raises(UnitError, match="extent"):
+        vis.volume_views(volume(), extent=(1.0, float("inf")))
     with pytest.raises(UnitError, match="gamma"):
         vis.volume_views(volume(), gamma=0.0)
     with pytest.raises(ShapeError, match="depth"):

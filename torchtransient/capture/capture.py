@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,9 +13,11 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.arithmetic import summed
 from torchtransient.capture.files import reader, writer
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import finite, flag, shown
 from torchtransient.tensor_record import TensorRecord
 
@@ -36,8 +37,8 @@ class Capture(TensorRecord):
 
     ``steady``: (C, ...) without the time, all light. ``polarized``: the four Stokes components come before C in all of
     them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (what
-    JSON can hold); that of a batch is a list under ``batch``. ``axis`` is in metres of optical path, counted as the
-    scan's ``first_and_last_leg`` says.
+    JSON can hold; names are texts, tuples come back as lists); that of a batch is a list under ``batch``. ``axis`` is
+    in metres of optical path, counted as the scan's ``first_and_last_leg`` says.
 
     Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory where they can.
     Two captures are equal when all but ``metadata`` is.
@@ -75,10 +76,7 @@ class Capture(TensorRecord):
             self._check("phasor", self.phasor, count, "frequencies")
         if self.steady is not None:
             self._check_shape("steady", self.steady, ("C",), self.scan.shape)
-        try:
-            json.dumps(self.metadata, default=_refuse_plain)
-        except (TypeError, ValueError) as error:
-            raise StorageError(f"Capture: expected metadata of plain data that JSON can hold: {error}.") from None
+        metadata_text(self.metadata, "Capture")
 
     def _check_settings(self) -> None:
         if not isinstance(self.scan, Scan):
@@ -89,8 +87,6 @@ class Capture(TensorRecord):
                 raise ShapeError(f"Capture: expected {name} as a {kind.__name__} or None, got {shown(given)}.")
         if not isinstance(self.channels, tuple) or not all(isinstance(name, str) for name in self.channels):
             raise ShapeError(f"Capture: expected channels as a tuple of names, got {shown(self.channels)}.")
-        if not isinstance(self.metadata, Mapping):
-            raise StorageError(f"Capture: expected metadata as names and values, got {shown(self.metadata)}.")
         flag("Capture: polarized", self.polarized)
 
     def _check(self, name: str, tensor: Tensor, count: int | None, axis: str) -> None:
@@ -137,8 +133,10 @@ class Capture(TensorRecord):
     # -------------------------------------------------------------------------------------------------- measurements
 
     def total(self) -> Tensor:
-        """All light that the transient holds: its sum over time, (C, *scan.shape). Raises ShapeError without one."""
-        return self._cube("total").sum(self._time)
+        """All light that the transient holds: its sum over time, (C, *scan.shape). Whole numbers stay whole (int64),
+        half precision becomes float32. Raises ShapeError without one.
+        """
+        return summed(self._cube("total"), self._time)
 
     def peak_time(self) -> Tensor:
         """Centre of the bin in which most light (sum over channels, S0 of a polarized capture) arrives at each pair,
@@ -147,7 +145,7 @@ class Capture(TensorRecord):
         cube = self._cube("peak_time").detach()
         if self.polarized:
             cube = cube.select(self._time - _CHANNEL_AND_TIME, 0)
-        highest, index = cube.sum(self._time - 1).max(self._time)
+        highest, index = summed(cube, self._time - 1).max(self._time)
         assert self.axis is not None  # a transient has one
         return torch.where(highest > 0, self.axis.centers_opl.to(cube.device)[index], torch.nan)
 
@@ -162,7 +160,7 @@ class Capture(TensorRecord):
         start_opl, end_opl = finite("Capture.crop: start_opl", start_opl), finite("Capture.crop: end_opl", end_opl)
         if not start_opl < end_opl:
             raise UnitError(f"Capture.crop: expected a start before an end in metres, got {start_opl!r}, {end_opl!r}.")
-        # An edge that was computed in another way belongs to the bin that it is meant for.
+        # An edge that was computed in another way belongs to the bin that it is meant for, and keeps its digits.
         first = max(0, math.floor((start_opl - axis.start_opl) / axis.bin_width_opl + 1e-6))
         last = min(axis.num_bins, math.ceil((end_opl - axis.start_opl) / axis.bin_width_opl - 1e-6))
         if last <= first:
@@ -170,7 +168,9 @@ class Capture(TensorRecord):
                 f"Capture.crop: expected lengths between {axis.start_opl:.6g} and {axis.end_opl:.6g} m, got "
                 f"{start_opl:.6g} to {end_opl:.6g} m, which hold no bin."
             )
-        kept = TimeAxis(axis.start_opl + first * axis.bin_width_opl, axis.bin_width_opl, last - first)
+        start = axis.start_opl + first * axis.bin_width_opl
+        start = start_opl if abs(start - start_opl) < 1e-6 * axis.bin_width_opl else start
+        kept = TimeAxis(start, axis.bin_width_opl, last - first)
         return replace(self, transient=cube.narrow(self._time, first, last - first), axis=kept)
 
     # ---------------------------------------------------------------------------------------------- parts of a scan
@@ -216,12 +216,10 @@ class Capture(TensorRecord):
         return self.transient
 
 
-def _refuse_plain(value: object) -> Any:
-    raise TypeError(f"{type(value).__name__} is not plain data")
-
-
 def _measured(name: str, values: Any) -> Tensor | None:
     """Numbers of any library as a tensor. Raises ShapeError for what holds none."""
+    if isinstance(values, Tensor) and values.layout != torch.strided:
+        raise ShapeError(f"Capture: expected {name} as a dense tensor, got {values.layout}. Use tensor.to_dense().")
     if values is None or isinstance(values, Tensor):
         return values
     try:

@@ -36,9 +36,10 @@ class Scan:
     optical path lengths count from the laser's origin to the sensor's; False, from the spot to the sensor point.
     ``wall``: Mitsuba's dictionary of the relay wall, None when a scene holds it.
 
-    Points may carry gradients. Frozen and picklable; two scans are equal when all of this is. Most scans are made by
-    :meth:`grid` or :meth:`points`. Raises ShapeError for shapes that do not belong together, UnitError for numbers that
-    are not finite, SceneError for an unknown kind, points off the wall and origins behind it.
+    Points may carry gradients; float64 tensors are kept, not copied: do not change them in place. Frozen and picklable;
+    two scans are equal when all of this is. Most scans are made by :meth:`grid` or :meth:`points`. Raises ShapeError
+    for shapes that do not belong together, UnitError for numbers that are not finite, SceneError for an unknown kind,
+    points off the wall and origins behind it.
     """
 
     kind: str

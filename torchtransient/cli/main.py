@@ -84,3 +84,7 @@ def _show_warning(otherwise: Any, message: Any, category: type[Warning], *where:
 @click.version_option(__version__, prog_name="torchtransient")
 def main(debug: bool) -> None:
     """Time-resolved light transport as differentiable PyTorch tensors."""
+
+
+if __name__ == "__main__":
+    main()

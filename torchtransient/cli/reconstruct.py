@@ -8,17 +8,14 @@ from typing import Any, TypeVar
 
 import click
 
+from torchtransient.volume_methods import CAMERAS, FILTERS, METHODS, SETTINGS, SLAB_SNR, TARGETS
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-METHODS = ("fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor")
-CAMERAS = ("direct", "confocal", "transient")
 _XYZ = (float, float, float)
 _SIX = (float,) * 6
 # Arguments of read_capture that a file may leave open.
 _OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin")
-# What methods are asked for by the options of the same names.
-_SETTINGS = ("target", "floor", "snr", "wavelength", "cycles", "falloff", "filter")
-_FREE = ("bp", "fbp", "phasor")
 
 
 class Numbers(click.ParamType):
@@ -61,9 +58,7 @@ def capture_options(command: Command) -> Command:
         click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
         click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
         click.option("--slab", type=float, metavar="METRES", help="Take off a slab of foam so thick (confocal scans)."),
-        click.option(
-            "--slab-snr", type=float, help="Light over noise in power where the slab lost none.  [default: 1e4]"
-        ),
+        click.option("--slab-snr", type=float, help=f"Its light over noise, in power.  [default: {SLAB_SNR:g}]"),
     )
     for option in reversed(options):
         command = option(command)
@@ -71,7 +66,7 @@ def capture_options(command: Command) -> Command:
 
 
 @click.command()
-@click.argument("capture", type=click.Path(path_type=Path))
+@click.argument("capture", type=click.Path(path_type=Path, dir_okay=False))
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="Volume, .h5 or .npz.  [default: CAPTURE_METHOD.h5]"
 )
@@ -82,7 +77,7 @@ def capture_options(command: Command) -> Command:
     "--flip", type=click.Choice(("x", "y", "xy")), help="Turn the picture over; files may count rows downwards."
 )
 @click.option("--threshold", type=float, default=0.1, show_default=True, help="Least brightness that has a depth.")
-@click.option("--method", type=click.Choice(METHODS), help="[default: what suits the capture]")
+@click.option("--method", type=click.Choice(tuple(METHODS)), help="[default: what suits the capture]")
 @click.option("--depths", type=(float, float), metavar="NEAR FAR", help="Before the wall, metres.  [default: all]")
 @click.option(
     "--voxels", type=Numbers(int, 3, "N or X,Y[,Z]"), help="bp, fbp; Z of phasor.  [default: as the scan, 64]"
@@ -90,14 +85,16 @@ def capture_options(command: Command) -> Command:
 @click.option("--extent", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the planes, metres (bp, fbp).")
 @click.option("--bounds", type=_SIX, metavar="X Y Z X Y Z", help="Lowest and highest corner of the voxels (bp, fbp).")
 @click.option(
-    "--target", type=click.Choice(("diffuse", "retroreflective")), help="f-k and light-cone.  [default: diffuse]"
+    "--target", type=click.Choice(TARGETS), help="f-k and light-cone.  [default: diffuse]"
 )
 @click.option("--floor", type=float, help="Of the root of f-k: 0.25 for counts.  [default: 0]")
+@click.option("--taps", type=int, help="Of f-k: 4 interpolate finely, 2 in less time.  [default: 4]")
 @click.option("--snr", type=float, help="Of the light-cone transforms; larger is sharper.  [default: 10]")
+@click.option("--v-bins", type=int, help="Of light-cone transforms: bins of squared depth.  [default: as of time]")
 @click.option("--wavelength", type=float, help="Metres (fbp, phasor).  [default: the shortest without ghosts]")
 @click.option("--cycles", type=float, help="Waves of a pulse (fbp, phasor).  [default: 4]")
 @click.option("--falloff", type=float, help="-2 makes up for distance (bp, fbp, phasor).  [default: 0]")
-@click.option("--filter", "filter", type=click.Choice(("phasor", "laplacian")), help="Of fbp.  [default: phasor]")
+@click.option("--filter", "filter", type=click.Choice(FILTERS), help="Of fbp.  [default: phasor]")
 @click.option("--camera", type=click.Choice(CAMERAS), help="Of phasor: one picture, or films.  [default: direct]")
 @click.option("--times", type=(float, float, int), metavar="START STOP N", help="Of a film, metres after the focus.")
 @capture_options
@@ -115,10 +112,11 @@ def command(capture: Path, **options: Any) -> None:
     from torchtransient.errors import TorchTransientError
 
     _check_together(options)
+    names = (*_OPEN, *SETTINGS, "format", "camera", "depths")
     try:
         _run(capture, options)
     except TorchTransientError as error:
-        raise type(error)(arguments_as_options(str(error), (*_OPEN, *_SETTINGS, "format", "camera"))) from error
+        raise type(error)(arguments_as_options(str(error), names)) from error
 
 
 def _run(capture: Path, options: dict[str, Any]) -> None:
@@ -129,11 +127,11 @@ def _run(capture: Path, options: dict[str, Any]) -> None:
     measured = tt.nlos.read_capture(capture, options["layout"], **{**told, **_wall_size(told)})
     choice = _choice(measured, options["method"])
     if not options["quiet"]:
-        click.echo(f"--method {choice.name}: {choice.reason}", err=True)
+        _tell(measured, choice)
     target = check_volume_target(options["output"] or capture.with_name(f"{capture.stem}_{choice.name}.h5"))
     picture = _picture(options, target)
     prepared = _prepared(measured, options)
-    settings: dict[str, Any] = {name: options[name] for name in _SETTINGS}
+    settings: dict[str, Any] = {name: options[name] for name in SETTINGS}
     if options["camera"] is not None:
         settings["camera"] = _camera(options)
     grid = _grid(prepared, choice.name, options)
@@ -151,8 +149,27 @@ def _run(capture: Path, options: dict[str, Any]) -> None:
         click.echo(f"{picture}: front, top, side and depth")
 
 
+def _tell(measured: Any, choice: Any) -> None:
+    """On stderr: the method, and what neither the file nor the command line said."""
+    click.echo(f"--method {choice.name}: {choice.reason}", err=True)
+    assumed = measured.metadata.get("assumed") or {}
+    if assumed:
+        values = ", ".join(f"--{name.replace('_', '-')} {_as_words(value)}" for name, value in assumed.items())
+        click.echo(f"assumed, since the file does not say it: {values}", err=True)
+
+
+def _as_words(value: Any) -> str:
+    if not isinstance(value, list):
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return " ".join(_as_words(round(part, 9) + 0.0 if isinstance(part, float) else part) for part in value)
+
+
 def _check_together(options: dict[str, Any]) -> None:
-    """Usage errors that need no file."""
+    """Mistakes that can be told without the file."""
+    from torchtransient.quantities import positive, share
+
+    positive("--gamma", options["gamma"])
+    share("--threshold", options["threshold"])
     if options["no_picture"] and options["picture"]:
         raise click.UsageError("--no-picture writes none; leave out --picture, or --no-picture.")
     if options["bounds"] and (options["depths"] or options["extent"]):
@@ -187,12 +204,15 @@ def _picture(options: dict[str, Any], target: Path) -> Path | None:
 def _prepared(capture: Any, options: dict[str, Any]) -> Any:
     """The capture as the method gets it: cut, summed, without its slab, on its device."""
     from torchtransient.nlos.preparation import moved_to, sum_bins, without_slab
+    from torchtransient.reconstruction.proportions import check_record
 
     if options["record"] is not None:
+        check_record(capture.axis, options["record"][1], "--record")
         capture = capture.crop(*options["record"])
     capture = moved_to(sum_bins(capture, options["sum_bins"]), options["device"])
     if options["slab"] is not None:
-        capture = without_slab(capture, options["slab"], options["slab_snr"] or 1e4)
+        snr = options["slab_snr"]
+        capture = without_slab(capture, options["slab"], SLAB_SNR if snr is None else snr)
     return capture
 
 
@@ -212,7 +232,7 @@ def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
     given = [f"--{name}" for name in ("voxels", "extent", "bounds") if options[name] is not None]
     if not given:
         return None
-    if method not in _FREE:
+    if not METHODS[method].free_grid:
         raise click.UsageError(
             f"--method {method} has a voxel behind each point and a plane for each bin; leave out "
             f"{' and '.join(given)}, or take bp or fbp."
@@ -235,6 +255,8 @@ def _noted(volume: Any, path: Path, measured: Any, reason: str, options: dict[st
     from dataclasses import replace
 
     said = {name: options[name] for name in ("record", "sum_bins", "slab", "slab_snr") if options[name] is not None}
+    if "slab" in said:
+        said.setdefault("slab_snr", SLAB_SNR)
     notes = {"capture": path.name, "reason": reason, "prepared": said}
     assumed = measured.metadata.get("assumed")
     return replace(volume, metadata={**volume.metadata, **notes, **({"assumed": assumed} if assumed else {})})

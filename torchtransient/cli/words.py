@@ -36,6 +36,7 @@ def in_options(message: str) -> str:
 _RECONSTRUCTION = {
     " to read_capture": "",
     "reconstruct: ": "",
+    "DiffusionDeconvolution: ": "--slab: ",
     "method '": "--method '",
     "Use VoxelGrid.bounds, or VoxelGrid with axes of its own.": "Give --bounds and --voxels.",
     "Use Backprojection, which takes any points.": "Take --method bp or fbp.",
@@ -47,7 +48,10 @@ _RECONSTRUCTION = {
 def arguments_as_options(message: str, names: Sequence[str]) -> str:
     """The message with ``name=`` as ``--name`` for these arguments, and without calls of reconstruction."""
     for name in names:
-        message = re.sub(rf"\b{name}=", f"--{name.replace('_', '-')}", message)
+        option = f"--{name.replace('_', '-')}"
+        # With a value behind it, or as a name alone.
+        message = re.sub(rf"\b{name}=(?=['\"\w])", f"{option} ", message)
+        message = re.sub(rf"\b{name}=", option, message)
     for python, option in _RECONSTRUCTION.items():
         message = message.replace(python, option)
     return message

@@ -6,13 +6,15 @@ that no second copy of them is needed, and a file takes its place once it is who
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
+import shutil
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.data.hdf5_limits import read_attributes, read_dataset
-from torchtransient.errors import StorageError
+from torchtransient.data.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.data.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")
@@ -36,11 +39,25 @@ _DAMAGED = (
 
 
 def path_of(path: Any, what: str) -> Path:
-    """`path` as a Path. Raises StorageError for what is no name of a file."""
+    """`path` as a Path. Raises StorageError for what is no name of a file, on this disk for instance."""
     try:
-        return Path(path)
-    except TypeError:
-        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}.") from None
+        found = Path(path)
+        os.lstat(found)
+    except (FileNotFoundError, NotADirectoryError):
+        return found
+    except (TypeError, ValueError, OSError) as error:
+        reason = "" if isinstance(error, TypeError) else f": {error}"
+        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}{reason}.") from None
+    return found
+
+
+def check_source(path: Any, what: str) -> Path:
+    """`path`, or StorageError where there is no file to read: nothing, a folder, a device or a pipe."""
+    source = path_of(path, what)
+    if source.is_file():
+        return source
+    problem = "is a folder" if source.is_dir() else "is no file on a disk" if source.exists() else "does not exist"
+    raise StorageError(f"{what}: '{source}' {problem}. Give the name of a file.")
 
 
 def check_target(path: str | Path, what: str) -> Path:
@@ -58,14 +75,18 @@ def check_target(path: str | Path, what: str) -> Path:
 
 
 def check_folder(path: str | Path, what: str) -> None:
-    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
+    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is there and no file that may
+    be written: a folder, a device, a pipe, a file without permission.
+    """
     target = path_of(path, what)
-    folder = target.parent
-    if not folder.is_dir():
-        raise StorageError(f"{what}: the folder '{folder}' does not exist. Create it first.")
-    if target.is_dir() or not os.access(folder, os.W_OK):
-        problem = "is a folder" if target.is_dir() else f"cannot be written: no permission in '{folder}'"
-        raise StorageError(f"{what}: '{target}' {problem}. Choose another place.")
+    # What a link points to is replaced, not the link.
+    place = Path(os.path.realpath(target)) if target.is_symlink() else target
+    if not place.parent.is_dir():
+        raise StorageError(f"{what}: the folder '{place.parent}' does not exist. Create it first.")
+    closed = next((p for p in (place.parent, place) if p.exists() and not os.access(p, os.W_OK)), None)
+    if place.is_dir() or closed or (place.exists() and not place.is_file()):
+        problem = f"cannot be written: no permission for '{closed}'" if closed else "is no file on a disk"
+        raise StorageError(f"{what}: '{target}' {'is a folder' if place.is_dir() else problem}. Choose another place.")
 
 
 def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
@@ -82,18 +103,20 @@ def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapp
             np.savez(file, **everything)
 
 
-def read_arrays(path: str | Path, form: str, what: str) -> dict[str, Any]:
-    """Everything by name, arrays and entries, of a file whose entry `format` is `form`.
+def read_arrays(
+    path: str | Path, form: str, what: str, known: Callable[[str], bool] = lambda name: True
+) -> dict[str, Any]:
+    """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is `form`.
 
     Raises StorageError for a file that is missing, of another format, or damaged.
     """
     source = path_of(path, what)
     if source.suffix.lower() not in ENDINGS:
         raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
-    if not source.is_file():
-        raise StorageError(f"{what}: '{source}' does not exist.")
+    check_source(source, what)
     with damage_said(source, what):
-        values = _read_hdf5(source, what) if source.suffix.lower() in HDF5 else _read_npz(source)
+        hdf5 = source.suffix.lower() in HDF5
+        values = _read_hdf5(source, what, known) if hdf5 else _read_npz(source, what, known)
         found = str(values["format"])
         if found != form:
             raise StorageError(f"{what}: '{source}' is of format '{found}'; this version reads '{form}'.")
@@ -102,7 +125,9 @@ def read_arrays(path: str | Path, form: str, what: str) -> dict[str, Any]:
 
 @contextmanager
 def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
-    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected."""
+    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected of a file
+    of another program, where the library's own errors are repeated as they are: arguments may have been wrong.
+    """
     try:
         yield
     except MemoryError as error:
@@ -110,12 +135,21 @@ def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
     except _DAMAGED as error:
         if isinstance(error, StorageError):
             raise
+        if isinstance(error, TorchTransientError) and kind:
+            raise StorageError(f"{what}: '{source}': {error}") from error
         kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
-        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {error}.") from error
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {str(error).rstrip('.')}.") from error
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
-    """A tensor as an array on the CPU. Raises StorageError for dtypes that NumPy does not have."""
+    """A tensor as an array on the CPU. Raises StorageError for dtypes that NumPy does not have, and for tensors whose
+    numbers do not stand in memory one behind another.
+    """
+    if tensor.layout != torch.strided or tensor.device.type == "meta":
+        raise StorageError(
+            f"{what}: expected a tensor with all its numbers, got one {_lacking(tensor)}. Use tensor.to_dense(), or "
+            "compute it on a device."
+        )
     plain = tensor.detach().resolve_conj().resolve_neg().cpu()
     try:
         array: NDArray[Any] = plain.numpy()
@@ -124,13 +158,29 @@ def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
     return array
 
 
+def _lacking(tensor: torch.Tensor) -> str:
+    return "on the device meta" if tensor.device.type == "meta" else f"of layout {tensor.layout}"
+
+
+def tensor_in(array: Any) -> torch.Tensor:
+    """An array of a file as a tensor, on its memory where its bytes have this machine's order."""
+    found = np.asarray(array)
+    return torch.from_numpy(found.astype(found.dtype.newbyteorder("="), copy=False))
+
+
 @contextmanager
 def replacing(target: Path, what: str) -> Iterator[Path]:
-    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails."""
-    unfinished = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails. Of a
+    link, the file that it points to is replaced; permissions stay.
+    """
+    place = Path(os.path.realpath(target))
+    # No longer than names may be.
+    unfinished = place.with_name(f".{place.name[:40]}.{secrets.token_hex(4)}.part")
     try:
         yield unfinished
-        unfinished.replace(target)
+        if place.exists():
+            shutil.copymode(place, unfinished)
+        unfinished.replace(place)
     except OSError as error:
         raise StorageError(f"{what}: '{target}' could not be written: {error}.") from error
     finally:
@@ -138,7 +188,7 @@ def replacing(target: Path, what: str) -> Iterator[Path]:
 
 
 def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
-    with hdf5_package(what).File(path, "w") as file:
+    with new_hdf5(path, what) as file:
         for name, value in entries.items():
             file.attrs[name] = value
         for name, array in arrays.items():
@@ -158,23 +208,32 @@ def _parts(array: NDArray[Any]) -> Iterator[Any]:
         yield ..., slice(row, row + step), slice(None)
 
 
-def _read_hdf5(path: Path, what: str) -> dict[str, Any]:
+def _read_hdf5(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
     with hdf5_package(what).File(path, "r") as file:
-        return {**{name: read_dataset(file, name, what) for name in file}, **read_attributes(file, what)}
+        arrays = {name: read_dataset(file, name, what) for name in file if known(name)}
+        return {**arrays, **read_attributes(file, what, [name for name in file.attrs if known(name)])}
 
 
-def _read_npz(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+def _read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    with zipfile.ZipFile(path) as file:
+        for entry in file.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if known(name):
+                _check_member(file, entry, f"{what}: '{name}'")
+                with file.open(entry) as stream:
+                    found[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    return found
 
 
-def hdf5_package(what: str) -> Any:
-    """The module h5py. Raises StorageError where it is missing."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise StorageError(
-            f"{what}: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
-            "or choose a name that ends in .npz."
-        ) from error
-    return h5py
+def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str) -> None:
+    """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise StorageError(f"{what} is packed as NumPy packs nothing (method {entry.compress_type}). Use np.savez.")
+    with file.open(entry) as stream:
+        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        version = np.lib.format.read_magic(stream)
+        if version not in read_header:
+            raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
+        shape, _, dtype = read_header[version](stream)
+    check_size(math.prod(shape) * dtype.itemsize, entry.compress_size, f"{what} {shape}")

@@ -23,14 +23,20 @@ from numpy.typing import NDArray
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.data.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.data.plain_data import plain, restored
 from torchtransient.errors import StorageError
 
 FORMAT = "torchtransient capture 1"
 _WHAT = "capture file"
 _MEASURED = ("transient", "phasor", "steady")
+_ENTRIES = (
+    "format", "metadata", "channels", "kind", "polarized", "first_and_last_leg", "start_opl", "bin_width_opl",
+    "num_bins", "frequencies_per_metre", "phasor_start_opl", "wall",
+)  # fmt: skip
 _POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
 
 
@@ -49,12 +55,9 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
     target = check_capture_target(path)
     if not isinstance(capture, Capture):
         raise StorageError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
-    if not isinstance(metadata, Mapping | None):
-        raise StorageError(f"capture file: expected metadata as names and values, got {type(metadata).__name__}.")
-    try:
-        note = json.dumps({**(metadata or {}), **capture.metadata})
-    except (TypeError, ValueError) as error:
-        raise StorageError(f"capture file: metadata must be plain data ({error}).") from error
+    metadata = {} if metadata is None else metadata
+    metadata_text(metadata, _WHAT)
+    note = metadata_text({**metadata, **capture.metadata}, _WHAT)
     scan = capture.scan
     entries: dict[str, Any] = {
         "format": FORMAT, "metadata": note, "channels": json.dumps(capture.channels), "kind": scan.kind,
@@ -78,30 +81,36 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
 
 
 def read_capture(path: str | Path) -> Capture:
-    """Read what `write_capture` wrote, bit by bit, as tensors on the CPU.
+    """Read what `write_capture` wrote, bit by bit, as tensors on the CPU. What somebody put beside it is left alone.
 
     Raises StorageError when the file is missing, damaged or not a capture.
     """
-    values = read_arrays(path, FORMAT, _WHAT)
+    values = read_arrays(path, FORMAT, _WHAT, _is_known)
     with damage_said(Path(path), _WHAT):
         return _capture(values)
 
 
+def _is_known(name: str) -> bool:
+    return name in (*_MEASURED, *_POINTS, *_ENTRIES) or name.startswith("wall_")
+
+
 def _capture(values: Mapping[str, Any]) -> Capture:
     def tensor(name: str) -> torch.Tensor | None:
-        return torch.from_numpy(np.asarray(values[name])) if name in values else None
+        return tensor_in(values[name]) if name in values else None
 
     axis = frequencies = None
     if "num_bins" in values:
-        axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+        start, width = number_of(values, "start_opl"), number_of(values, "bin_width_opl")
+        axis = TimeAxis(start, width, whole_of(values, "num_bins"))
     if "frequencies_per_metre" in values:
         found = tuple(np.asarray(values["frequencies_per_metre"]).tolist())
-        frequencies = FrequencyAxis(found, float(values["phasor_start_opl"]))
-    wall = restored(json.loads(str(values["wall"])), values) if "wall" in values else None
+        frequencies = FrequencyAxis(found, number_of(values, "phasor_start_opl"))
+    wall = restored(json.loads(text_of(values, "wall")), values) if "wall" in values else None
     points = {name: tensor(name) for name in _POINTS}
-    scan = Scan(str(values["kind"]), **points, first_and_last_leg=bool(values["first_and_last_leg"]), wall=wall)  # type: ignore[arg-type]
+    legs = flag_of(values, "first_and_last_leg")
+    scan = Scan(text_of(values, "kind"), **points, first_and_last_leg=legs, wall=wall)  # type: ignore[arg-type]
     return Capture(
-        transient=tensor("transient"), axis=axis, scan=scan, metadata=json.loads(str(values["metadata"])),
+        transient=tensor("transient"), axis=axis, scan=scan, metadata=notes_of(values, "metadata"),
         phasor=tensor("phasor"), frequencies=frequencies, steady=tensor("steady"),
-        channels=tuple(json.loads(str(values["channels"]))), polarized=bool(values["polarized"]),
+        channels=names_of(values, "channels"), polarized=flag_of(values, "polarized"),
     )  # fmt: skip

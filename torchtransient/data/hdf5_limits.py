@@ -91,6 +91,11 @@ def check_size(declared: int, stored: int, what: str) -> None:
     """Raise StorageError where an array of ``declared`` bytes cannot come from ``stored`` ones, or does not fit."""
     if declared > max(_FREE_BYTES, _SLACK * MOST_BYTES_OF_ONE * stored):
         raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: the file is damaged.")
+    check_memory(declared, what)
+
+
+def check_memory(declared: int, what: str) -> None:
+    """Raise StorageError where an array of ``declared`` bytes does not fit into memory."""
     if declared < _LARGE_BYTES:
         return
     available = available_bytes("scalar_rgb")
@@ -109,7 +114,7 @@ def _text(dataset: Any, what: str) -> str:
     else:
         check_size(dataset.nbytes, dataset.id.get_storage_size(), f"{what}: the text '{dataset.name}'")
     try:
-        value = dataset.asstr()[()]
+        value = dataset.asstr("utf-8")[()]  # whatever the file says of its letters
     except UnicodeDecodeError as error:
         raise StorageError(f"{what}: '{dataset.name}' is no text of UTF-8: {error}.") from None
     return str(value.reshape(-1)[0] if isinstance(value, np.ndarray) else value)

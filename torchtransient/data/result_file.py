@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
 from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
 from torchtransient.errors import StorageError
@@ -87,10 +88,7 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
             "have no axis; write them with torch.save."
         )
     own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
-    try:
-        note = json.dumps({**(metadata or {}), **own})
-    except TypeError as error:
-        raise StorageError(f"result file: metadata must be plain data ({error}).") from error
+    note = metadata_text({**(metadata or {}), **own}, _WHAT)
     film = of_output(output)
     tensor = None if film is None else film.tensor(output)
     if film is None or tensor is None:

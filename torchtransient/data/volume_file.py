@@ -9,67 +9,21 @@ are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
-from torchtransient.errors import ShapeError, StorageError
-from torchtransient.quantities import shown
+from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.data.entries import notes_of, text_of
+from torchtransient.errors import StorageError
+from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 FORMAT = "torchtransient volume 1"
 _WHAT = "volume file"
 _VECTORS = ("first", "along_x", "along_y", "normal")
-
-
-@dataclass(frozen=True, eq=False)
-class HiddenVolume:
-    """What a method found behind a corner.
-
-    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), metres of optical path, a film
-    (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
-    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
-    data. Raises ShapeError where tensors and grid do not fit.
-    """
-
-    values: Tensor
-    grid: VoxelGrid
-    method: str
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    times: Tensor | None = None
-    directions: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.grid, VoxelGrid):
-            raise ShapeError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(self.grid)}.")
-        frames = () if self.times is None else (len(self.times),)
-        self._check("values", self.values, (*frames, *self.grid.shape))
-        if self.directions is not None:
-            self._check("directions", self.directions, (3, *self.grid.shape))
-
-    def _check(self, name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-        fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-        if not fits or tensor.is_complex():
-            got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
-            sizes = ", ".join(map(str, shape))
-            raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
-
-    def picture(self) -> Tensor:
-        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
-        per_item = 4 if self.times is None else 5
-        values = self.values.detach()
-        while values.ndim > per_item:
-            values = values[0]
-        summed = values.sum(0)
-        return summed if self.times is None else summed.amax(0)
 
 
 def check_volume_target(path: str | Path) -> Path:
@@ -86,10 +40,7 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
     target = check_volume_target(path)
     if not isinstance(volume, HiddenVolume):
         raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
-    try:
-        note = json.dumps(dict(volume.metadata))
-    except (TypeError, ValueError) as error:
-        raise StorageError(f"volume file: metadata must be plain data ({error}).") from error
+    note = metadata_text(volume.metadata, _WHAT)
     grid = volume.grid
     given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
     given |= {name: getattr(grid, name) for name in _VECTORS}
@@ -100,17 +51,18 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
 
 
 def read_volume(path: str | Path) -> HiddenVolume:
-    """Read what `write_volume` wrote, as tensors on the CPU.
+    """Read what `write_volume` wrote, as tensors on the CPU. What somebody put beside it is left alone.
 
     Raises StorageError when the file is missing, damaged or not a volume.
     """
-    found = read_arrays(path, FORMAT, _WHAT)
+    needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
+    known = {*needed, *optional, "format", "method", "metadata"}
+    found = read_arrays(path, FORMAT, _WHAT, known.__contains__)
     with damage_said(Path(path), _WHAT):
-        values = {name: torch.from_numpy(np.asarray(found[name])) for name in ("values", "depths", "pitch", *_VECTORS)}
-        more = {name: torch.from_numpy(np.asarray(found[name])) for name in ("times", "directions") if name in found}
+        values = {name: tensor_in(found[name]) for name in needed}
+        more = {name: tensor_in(found[name]) for name in optional if name in found}
         rows, columns = values["values"].shape[-2:]
         dy, dx = values["pitch"].tolist()
         vectors = {name: values[name] for name in _VECTORS}
         grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
-        metadata = json.loads(str(found["metadata"]))
-        return HiddenVolume(values["values"], grid, str(found["method"]), metadata, **more)
+        return HiddenVolume(values["values"], grid, text_of(found, "method"), notes_of(found, "metadata"), **more)

@@ -3,17 +3,17 @@
 Torch only, never Mitsuba. Functions `(input, target)` first, thin modules that hold their options under them.
 """
 
+from torchtransient.losses.dead_time_likelihoods import FirstPhotonLoss as FirstPhotonLoss
+from torchtransient.losses.dead_time_likelihoods import FirstPhotonNLL as FirstPhotonNLL
+from torchtransient.losses.dead_time_likelihoods import FreeRunningNLL as FreeRunningNLL
+from torchtransient.losses.dead_time_likelihoods import first_photon_loss as first_photon_loss
+from torchtransient.losses.dead_time_likelihoods import first_photon_nll as first_photon_nll
+from torchtransient.losses.dead_time_likelihoods import free_running_nll as free_running_nll
 from torchtransient.losses.depth import DepthLoss as DepthLoss
 from torchtransient.losses.depth import depth_loss as depth_loss
-from torchtransient.losses.likelihoods import FirstPhotonLoss as FirstPhotonLoss
-from torchtransient.losses.likelihoods import FirstPhotonNLL as FirstPhotonNLL
-from torchtransient.losses.likelihoods import FreeRunningNLL as FreeRunningNLL
 from torchtransient.losses.likelihoods import PoissonLoss as PoissonLoss
 from torchtransient.losses.likelihoods import PoissonNLL as PoissonNLL
 from torchtransient.losses.likelihoods import ReadNoiseNLL as ReadNoiseNLL
-from torchtransient.losses.likelihoods import first_photon_loss as first_photon_loss
-from torchtransient.losses.likelihoods import first_photon_nll as first_photon_nll
-from torchtransient.losses.likelihoods import free_running_nll as free_running_nll
 from torchtransient.losses.likelihoods import poisson_loss as poisson_loss
 from torchtransient.losses.likelihoods import poisson_nll as poisson_nll
 from torchtransient.losses.likelihoods import read_noise_nll as read_noise_nll

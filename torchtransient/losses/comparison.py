@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
-from torchtransient.quantities import finite, shown
+from torchtransient.quantities import finite, flag, shown
 
 Reduction = Literal["none", "sum", "mean"]
 
@@ -90,32 +90,63 @@ def check_level(
     not looked at in `torch.vmap` over them.
     """
     dtype = like.real.dtype if like.is_complex() else like.dtype
-    if isinstance(value, Tensor):
-        if value.is_complex() or value.dtype == torch.bool:
-            raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
-        if value.ndim:
-            check_device(value, like, where, f"{name} and tensors")
-        try:
-            value.expand(like.shape)
-        except RuntimeError:
-            raise ShapeError(
-                f"{where}: expected {name} to be a number or a tensor that broadcasts to {tuple(like.shape)}, got "
-                f"{tuple(value.shape)}."
-            ) from None
-        level = value.detach()
-    else:
-        level = torch.tensor(finite(f"{where}: {name}", value), dtype=torch.float64)
     limits = torch.finfo(dtype)
     least, most = (math.sqrt(limits.tiny), math.sqrt(limits.max)) if square else (limits.tiny, limits.max)
-    wide = level if level.dtype == torch.float64 else level.to(dtype)
-    fits = (wide >= least) & (wide <= most)
-    if not holds(fits | (wide == 0) if zero else fits):
+    if isinstance(value, Tensor):
+        _check_fit(name, value, like, where)
+        # of whole numbers and narrower ones in the precision they are used in
+        level = value.detach() if value.dtype == torch.float64 else value.detach().to(dtype)
+        fits = holds((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
+    else:
+        number = finite(f"{where}: {name}", value)
+        fits = least <= number <= most or (zero and number == 0)
+    if not fits:
         got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
         raise UnitError(
             f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero that {dtype} holds "
             f"({least:.1g} to {most:.1g}), got {got}."
         )
-    return (value if isinstance(value, Tensor) else level).to(like.device, dtype)
+    return value.to(like.device, dtype) if isinstance(value, Tensor) else like.new_full((), number, dtype=dtype)
+
+
+def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
+    if value.is_complex() or value.dtype == torch.bool:
+        raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
+    if value.ndim:
+        check_device(value, like, where, f"{name} and tensors")
+    try:
+        value.expand(like.shape)
+    except RuntimeError:
+        raise ShapeError(
+            f"{where}: expected {name} to be a number or a tensor that broadcasts to {tuple(like.shape)}, got "
+            f"{tuple(value.shape)}."
+        ) from None
+
+
+def check_option(
+    name: str,
+    value: Tensor | float | None,
+    where: str,
+    *,
+    needed: bool = False,
+    zero: bool = False,
+    square: bool = False,
+) -> None:
+    """`check_level` of what a module holds, before there are tensors that it goes with: in double precision.
+
+    None is the default of what is not `needed`.
+    """
+    if value is None:
+        if needed:
+            raise UnitError(f"{where}: expected {name}, a number, got None.")
+        return
+    shape, device = (value.shape, value.device) if isinstance(value, Tensor) else ((), None)
+    check_level(name, value, torch.empty(shape, dtype=torch.float64, device=device), where, zero=zero, square=square)
+
+
+def check_flag(name: str, value: bool, where: str) -> None:
+    """Raises SceneError for what is no truth value: a text that says no is true."""
+    flag(f"{where}: {name}", value)
 
 
 def holds(condition: Tensor) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchtransient.losses.comparison import Reduction, check_mask, check_pair, counted, reduce
+from torchtransient.losses.comparison import Reduction, check_mask, check_pair, check_reduction, counted, reduce
 
 
 def depth_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
@@ -15,6 +15,7 @@ def depth_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, red
     out; without any that counts the loss is 0. The gradient is 0 where the two agree. Raises ShapeError, UnitError.
     """
     where = "depth_loss"
+    check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
     surface = torch.isfinite(target)
     given = check_mask(mask, target, where)
@@ -27,6 +28,7 @@ class DepthLoss(nn.Module):
 
     def __init__(self, reduction: Reduction = "mean") -> None:
         super().__init__()
+        check_reduction(reduction, "DepthLoss")
         self.reduction = reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -15,6 +15,7 @@ import operator
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
+from torchtransient.losses.comparison import Reduction, check_reduction
 from torchtransient.quantities import shown
 
 _IMAGES = -3
@@ -34,16 +35,32 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
                 f"Without it (C, T, Y, X) and (B, C, T, Y, X) of {_FEWEST_BINS} bins or more are taken, no others."
             )
         return _IMAGES
+    number = check_dim(dim, where)
+    if not -x.ndim <= number < x.ndim:
+        raise ShapeError(
+            f"{where}: expected a tensor with time as its dimension {number}, got {tuple(x.shape)}. dim is {_LAYOUTS}."
+        )
+    return number - x.ndim if number >= 0 else number
+
+
+def check_dim(dim: int, where: str) -> int:
+    """Raises ShapeError for what is no number of a dimension."""
     try:
         number = None if isinstance(dim, bool) else operator.index(dim)
     except TypeError:
         number = None
-    if number is None or not -x.ndim <= number < x.ndim:
+    if number is None:
         raise ShapeError(
-            f"{where}: expected a tensor with time as its dimension {shown(dim)}, got {tuple(x.shape)}. dim is "
-            f"{_LAYOUTS}."
+            f"{where}: expected dim, the dimension of time, to be a whole number, got {shown(dim)}. It is {_LAYOUTS}."
         )
-    return number - x.ndim if number >= 0 else number
+    return number
+
+
+def check_held(reduction: Reduction, dim: int | None, where: str) -> None:
+    """The options that most modules hold. Raises ShapeError."""
+    check_reduction(reduction, where)
+    if dim is not None:
+        check_dim(dim, where)
 
 
 def bins_dim(x: Tensor, dim: int | None, where: str) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -12,13 +14,19 @@ from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_device,
+    check_flag,
     check_function,
     check_mask,
     check_pair,
+    check_reduction,
     counted,
     reduce,
 )
-from torchtransient.losses.layouts import item_dims
+from torchtransient.losses.layouts import check_held, item_dims
+
+# The first argument of likelihoods that are not losses (input, target): a model there would be taken for counts.
+_MEASUREMENT_FIRST = {"counts", "measured", "target"}
 
 
 class PairLoss(Protocol):
@@ -27,8 +35,17 @@ class PairLoss(Protocol):
     def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
 
 
+class PairModule(Protocol):
+    """A loss of this room as a module, which holds a `reduction` of its own."""
+
+    reduction: Reduction
+
+    def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
+
+
 def squared_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
     """`|input - target|^2` of each element, real or complex, any shape. Symmetric. Raises ShapeError, UnitError."""
+    check_reduction(reduction, "squared_loss")
     input, target = check_pair(input, target, "squared_loss", complex_too=True)
     mask = check_mask(mask, input, "squared_loss")
     return reduce(_power(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
@@ -39,7 +56,7 @@ def measurement_consistency(
     measured: Tensor,
     operator: Callable[[Tensor], Tensor],
     *,
-    compare: PairLoss = squared_loss,
+    compare: PairLoss | PairModule = squared_loss,
     scale_invariant: bool = False,
     dim: int | None = None,
     mask: Tensor | None = None,
@@ -47,19 +64,21 @@ def measurement_consistency(
 ) -> Tensor:
     """`compare(A volume, measured)`: what a volume would have measured against what was.
 
-    `operator` is `A`: a `LinearOperator` of `tt.nlos` or any function from `volume` (..., C, Z, Y, X) to the shape of
-    `measured` (..., C, T, Y, X); `compare` any loss (input, target) with `mask` and `reduction`, `mask` of the
-    measurement. With `scale_invariant` A volume is first multiplied by the real number that brings each item nearest to
-    the measurement in least squares: powers of lasers and albedos are seldom calibrated. `dim`, where time is in the
-    measurement, then says what is an item (`losses.layouts`). That number may be negative, so keep volumes non-negative
-    where their sign matters; it is 1 for a volume that is dark altogether, whose gradient then leads out of the dark.
+    `operator` is `A`: an operator of `tt.nlos` such as `FK`, or any function from `volume` (..., C, Z, Y, X) to the
+    shape of `measured` (..., C, T, Y, X); `mask` is one of the measurement. `compare`: a function (input, target) with
+    `mask` and `reduction`, of which `functools.partial` holds what else it wants, or a module of this room that holds
+    the same `reduction`. Losses of torch.nn take no mask: write a function. With `scale_invariant` A volume is first
+    multiplied by the real number that brings each item nearest to the measurement in least squares: powers of lasers
+    and albedos are seldom calibrated. `dim`, where time is in the measurement, then says what is an item
+    (`losses.layouts`). That number may be negative, so keep volumes non-negative where their sign matters; it is 1 for
+    a volume that is dark altogether, whose gradient then leads out of the dark.
     Not symmetric; zero where A volume is the measurement. Raises ShapeError where A volume is no tensor of the
-    measurement's shape.
+    measurement's shape, and for another `compare`.
     """
     where = "measurement_consistency"
+    check_held(reduction, dim, where)
+    compared = _checked(operator, compare, scale_invariant, reduction, where)
     check_dense((volume, measured), where)
-    check_function("the operator", operator, where)
-    check_function("compare", compare, where)
     prediction = operator(volume)
     if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
         got = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
@@ -67,10 +86,62 @@ def measurement_consistency(
             f"{where}: expected the operator to make a tensor of the measurement's shape {tuple(measured.shape)} of a "
             f"volume {tuple(volume.shape)}, got {got}."
         )
+    check_device(prediction, measured, where, "what the operator makes and the measurement")
+    check_mask(mask, measured, where)
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)
         prediction = _scaled(*pair, check_mask(mask, measured, where), item_dims(measured, dim, where))
-    return compare(prediction, measured, mask=mask, reduction=reduction)
+    value = compared(prediction, measured, mask)
+    # of a tensor of one dimension, a record, even what is not reduced may be one number
+    dims = value.ndim if isinstance(value, Tensor) else -1
+    if dims < 0 or (dims > 0 if reduction != "none" else dims == 0 and measured.ndim > 1):
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise ShapeError(f"{where}: expected compare to heed reduction {reduction!r}, got {got} of it.")
+    return value
+
+
+def _checked(
+    operator: object, compare: PairLoss | PairModule, scale_invariant: bool, reduction: Reduction, where: str
+) -> Callable[[Tensor, Tensor, Tensor | None], Tensor]:
+    """`compare` as a function (input, target, mask) with that reduction. Raises ShapeError."""
+    check_function("the operator", operator, where)
+    check_function("compare", compare, where)
+    check_flag("scale_invariant", scale_invariant, where)
+    if not isinstance(compare, nn.Module):
+        _check_arguments(compare, {"mask": None, "reduction": reduction}, getattr(compare, "__name__", ""), where)
+        return functools.partial(_compared, cast(PairLoss, compare), reduction)
+    title = type(compare).__name__
+    _check_arguments(compare.forward, {"mask": None}, title, where)
+    held = getattr(compare, "reduction", None)
+    if held != reduction:
+        raise ShapeError(
+            f"{where}: expected reduction {reduction!r} of compare, too, got {title} with {held!r}. Give both the same."
+        )
+    return cast(PairModule, compare)
+
+
+def _compared(
+    compare: PairLoss, reduction: Reduction, input: Tensor, target: Tensor, mask: Tensor | None
+) -> Tensor:
+    return compare(input, target, mask=mask, reduction=reduction)
+
+
+def _check_arguments(function: Callable[..., object], names: dict[str, object], title: str, where: str) -> None:
+    """Raises ShapeError unless it is a function (model, measurement) with what is named, and of nothing else."""
+    title, wanted = title or type(function).__name__, ", ".join(f"{name}=" for name in names)
+    try:
+        bound = inspect.signature(function).bind(None, None, **names)
+    except (TypeError, ValueError) as error:
+        raise ShapeError(
+            f"{where}: expected compare to take (input, target, {wanted}) and no more, got "
+            f"{title}: {error}. functools.partial holds further arguments of a loss of tt.losses."
+        ) from None
+    first = next(iter(bound.arguments))
+    if first in _MEASUREMENT_FIRST:
+        raise ShapeError(
+            f"{where}: expected compare to take the model first, (input, target), got {title}, which takes {first} "
+            "first. Take poisson_loss or first_photon_loss, or turn it round in a function."
+        )
 
 
 def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:
@@ -103,6 +174,7 @@ class SquaredLoss(nn.Module):
 
     def __init__(self, reduction: Reduction = "mean") -> None:
         super().__init__()
+        check_reduction(reduction, "SquaredLoss")
         self.reduction = reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -118,12 +190,14 @@ class MeasurementConsistency(nn.Module):
     def __init__(
         self,
         operator: Callable[[Tensor], Tensor],
-        compare: PairLoss = squared_loss,
+        compare: PairLoss | PairModule = squared_loss,
         scale_invariant: bool = False,
         dim: int | None = None,
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
+        check_held(reduction, dim, "MeasurementConsistency")
+        _checked(operator, compare, scale_invariant, reduction, "MeasurementConsistency")
         self.operator, self.compare = operator, compare
         self.scale_invariant, self.dim, self.reduction = scale_invariant, dim, reduction
 

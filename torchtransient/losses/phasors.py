@@ -18,19 +18,24 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_flag,
     check_level,
     check_mask,
+    check_option,
     check_pair,
+    check_reduction,
     counted,
     item_scale,
     reduce,
     working_dtype,
 )
-from torchtransient.losses.layouts import bins_dim, item_dims
+from torchtransient.losses.layouts import bins_dim, check_held, item_dims
 from torchtransient.sensing.layout import without_autocast
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
 _PHASE_FLOOR = 1e-3
+# The highest frequency of a discrete transform is half of one over the bin, however that was computed.
+_ROUNDING = 1e-9
 
 
 def transient_phasors(
@@ -40,14 +45,15 @@ def transient_phasors(
 
     `dim`: where time is, and frequency then (`losses.layouts`). As from a renderer with
     `frequencies=`, but for the bins: those count as at their middles, which lacks a factor `sinc(nu bin_width_opl)`.
-    Phases are computed in double precision. Raises ShapeError where T is not that of the axis, UnitError.
+    Phases are computed in double precision. Raises ShapeError where T is not that of the axis; UnitError for
+    wavelengths below two bins, whose phasors are those of longer ones. Two bins, the last frequency of a discrete
+    transform, are taken: the phasor there does not know the sign of a delay.
     """
-    where = "transient_phasors"
-    if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
-        raise UnitError(
-            f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
-            f"{type(frequencies).__name__}."
-        )
+    return _phasors(transient, axis, frequencies, dim, "transient_phasors")
+
+
+def _phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, dim: int | None, where: str) -> Tensor:
+    _check_axes(axis, frequencies, where)
     check_dense((transient,), where)
     place = bins_dim(transient, dim, where) + transient.ndim
     lead, bins, trail = transient.shape[:place], transient.shape[place], transient.shape[place + 1 :]
@@ -62,6 +68,21 @@ def transient_phasors(
     cos, sin = (table.to(transient.device, dtype) for table in (angle.cos(), angle.sin()))
     record = transient.to(dtype).reshape(*lead, bins, math.prod(trail))
     return _transformed(record, cos, sin).reshape(*lead, frequencies.num_frequencies, *trail)
+
+
+def _check_axes(axis: TimeAxis, frequencies: FrequencyAxis, where: str) -> None:
+    """Raises UnitError for no axes, and for frequencies that bins cannot tell from lower ones."""
+    if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
+        raise UnitError(
+            f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
+            f"{type(frequencies).__name__}."
+        )
+    highest, most = max(abs(f) for f in frequencies.frequencies), 0.5 / axis.bin_width_opl
+    if highest > most * (1 + _ROUNDING):
+        raise UnitError(
+            f"{where}: expected a wavelength of two bins at least, frequencies of {most:.4g} per metre at most, got "
+            f"{highest:.4g}. Take narrower bins or lower frequencies; in hertz with FrequencyAxis.from_hertz."
+        )
 
 
 @without_autocast
@@ -87,7 +108,21 @@ def phasor_loss(
     `dim`, where frequency is, then says what is an item (`losses.layouts`). Raises ShapeError for two shapes, UnitError
     for real numbers.
     """
-    where = "phasor_loss"
+    return _phasor_loss(input, target, (phase_only, floor, dim), mask, reduction, "phasor_loss")
+
+
+def _phasor_loss(
+    input: Tensor,
+    target: Tensor,
+    phases: tuple[bool, Tensor | float | None, int | None],
+    mask: Tensor | None,
+    reduction: Reduction,
+    where: str,
+) -> Tensor:
+    phase_only, floor, dim = phases
+    check_flag("phase_only", phase_only, where)
+    check_held(reduction, dim, where)
+    check_option("floor", floor, where)
     input, target = check_pair(input, target, where, complex_too=True)
     if not input.is_complex():
         raise UnitError(f"{where}: expected complex phasors, got {input.dtype}. See transient_phasor_loss.")
@@ -131,12 +166,13 @@ def transient_phasor_loss(
     `transient_phasors` and `phasor_loss`. `dim`: where time is (`losses.layouts`).
     """
     where = "transient_phasor_loss"
+    check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
-    ours, theirs = (transient_phasors(counted(x, mask), axis, frequencies, dim=dim) for x in (input, target))
+    ours, theirs = (_phasors(counted(x, mask), axis, frequencies, dim, where) for x in (input, target))
     pixels = None if mask is None else mask.any(dim, keepdim=True)
-    return phasor_loss(ours, theirs, phase_only=phase_only, floor=floor, dim=dim, mask=pixels, reduction=reduction)
+    return _phasor_loss(ours, theirs, (phase_only, floor, dim), pixels, reduction, where)
 
 
 class PhasorLoss(nn.Module):
@@ -150,6 +186,9 @@ class PhasorLoss(nn.Module):
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
+        check_held(reduction, dim, "PhasorLoss")
+        check_flag("phase_only", phase_only, "PhasorLoss")
+        check_option("floor", floor, "PhasorLoss")
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -177,6 +216,10 @@ class TransientPhasorLoss(nn.Module):
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
+        check_held(reduction, dim, "TransientPhasorLoss")
+        _check_axes(axis, frequencies, "TransientPhasorLoss")
+        check_flag("phase_only", phase_only, "TransientPhasorLoss")
+        check_option("floor", floor, "TransientPhasorLoss")
         self.axis, self.frequencies = axis, frequencies
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 

@@ -15,13 +15,15 @@ from torchtransient.losses.comparison import (
     check_function,
     check_level,
     check_mask,
+    check_option,
     check_pair,
+    check_reduction,
     counted,
     item_scale,
     reduce,
     working_dtype,
 )
-from torchtransient.losses.layouts import item_dims
+from torchtransient.losses.layouts import check_held, item_dims
 
 _OFFSET = 3 / 8
 _BACKGROUND = 1e-3
@@ -57,9 +59,11 @@ def root_loss(
     """`(root(input) - root(target))^2` of each element, any shape, in photon counts. Symmetric.
 
     With `anscombe` about 1 on average where `input` is the mean that `target` was drawn of: a fit is as good as the
-    noise lets it be when its loss is. Take `tt.nlos.stabilised_root`, `H / sqrt(|H| + 1/4)`, for what f-k migration
-    sees of counts, or `functools.partial` of either. Raises ShapeError, UnitError.
+    noise lets it be when its loss is. Take `torchtransient.reconstruction.stabilised_root` with a floor of 1/4,
+    `H / sqrt(|H| + 1/4)`, for what f-k migration sees of counts: `functools.partial` holds options of a root. Raises
+    ShapeError, UnitError.
     """
+    check_reduction(reduction, "root_loss")
     check_function("root", root, "root_loss")
     input, target = check_pair(input, target, "root_loss")
     mask = check_mask(mask, input, "root_loss")
@@ -89,6 +93,7 @@ def log_ratio_loss(
     UnitError for a background that is not above zero.
     """
     where = "log_ratio_loss"
+    check_held(reduction, dim, where)
     input, target = check_pair(input, target, where)
     mask = check_mask(mask, input, where)
     input, target = counted(input, mask), counted(target, mask)
@@ -110,6 +115,8 @@ class RootLoss(nn.Module):
 
     def __init__(self, root: Callable[[Tensor], Tensor] = anscombe, reduction: Reduction = "mean") -> None:
         super().__init__()
+        check_reduction(reduction, "RootLoss")
+        check_function("root", root, "RootLoss")
         self.root, self.reduction = root, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -123,6 +130,8 @@ class LogRatioLoss(nn.Module):
         self, background: float | None = None, dim: int | None = None, reduction: Reduction = "mean"
     ) -> None:
         super().__init__()
+        check_held(reduction, dim, "LogRatioLoss")
+        check_option("background", background, "LogRatioLoss")
         self.background, self.dim, self.reduction = background, dim, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:

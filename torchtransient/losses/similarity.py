@@ -10,6 +10,7 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_level,
     check_mask,
+    check_option,
     check_pair,
     check_reduction,
     check_whole,
@@ -38,15 +39,30 @@ def ssim_loss(
     reach them, so a mask is not quite a smaller picture. Single precision holds values up to 1e9 times the range.
     Raises ShapeError, UnitError.
     """
+    return _ssim(input, target, (window, value_range), mask, reduction, "ssim_loss")
+
+
+def _check_window(window: int, where: str) -> int:
+    number = check_whole("an odd window", window, where)
+    if number % 2 == 0:
+        raise ShapeError(f"{where}: expected an odd window, got {number}.")
+    return number
+
+
+def _ssim(
+    input: Tensor,
+    target: Tensor,
+    options: tuple[int, float | None],
+    mask: Tensor | None,
+    reduction: Reduction,
+    where: str,
+) -> Tensor:
     from kornia.metrics import ssim
 
-    where = "ssim_loss"
     check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
-    window = check_whole("an odd window", window, where)
+    window, value_range = _check_window(options[0], where), options[1]
     half = window // 2
-    if window % 2 == 0:
-        raise ShapeError(f"{where}: expected an odd window, got {window}.")
     if input.ndim < 3 or min(input.shape[-2:]) <= half:
         raise ShapeError(
             f"{where}: expected pictures (..., C, Y, X) with Y and X above {half} for a window of {window}, got "
@@ -72,9 +88,13 @@ def maximum_projections(volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     Gradients go to the brightest voxel of each line, in equal parts to equal ones. Raises ShapeError.
     """
+    return _projections(volume, "maximum_projections")
+
+
+def _projections(volume: Tensor, where: str) -> tuple[Tensor, Tensor, Tensor]:
     if not isinstance(volume, Tensor) or volume.ndim < 3 or volume.is_complex() or not all(volume.shape[-3:]):
         got = f"{tuple(volume.shape)} {volume.dtype}" if isinstance(volume, Tensor) else type(volume).__name__
-        raise ShapeError(f"maximum_projections: expected a real volume (..., Z, Y, X), got {got}.")
+        raise ShapeError(f"{where}: expected a real volume (..., Z, Y, X), got {got}.")
     return volume.amax(-3), volume.amax(-2), volume.amax(-1)
 
 
@@ -98,11 +118,11 @@ def projection_ssim_loss(
     if input.ndim < 4:
         raise ShapeError(f"{where}: expected volumes (..., C, Z, Y, X), got {tuple(input.shape)}.")
     mask = check_mask(mask, input, where)
-    ours, theirs = maximum_projections(counted(input, mask)), maximum_projections(counted(target, mask))
+    ours, theirs = (_projections(counted(x, mask), where) for x in (input, target))
     masks = (None,) * 3 if mask is None else tuple(mask.any(dim) for dim in (-3, -2, -1))
     values = []
     for a, b, seen in zip(ours, theirs, masks, strict=True):
-        each = ssim_loss(a, b, window=window, value_range=value_range, mask=seen, reduction="none")
+        each = _ssim(a, b, (window, value_range), seen, "none", where)
         if reduction == "none":
             number = each.shape[-2] * each.shape[-1] if seen is None else seen.sum((-2, -1)).clamp_min(1)
             values.append(each.sum((-2, -1)) / number)
@@ -116,7 +136,9 @@ class SSIMLoss(nn.Module):
 
     def __init__(self, window: int = WINDOW, value_range: float | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
-        self.window, self.value_range, self.reduction = window, value_range, reduction
+        check_reduction(reduction, "SSIMLoss")
+        check_option("value_range", value_range, "SSIMLoss")
+        self.window, self.value_range, self.reduction = _check_window(window, "SSIMLoss"), value_range, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return ssim_loss(
@@ -129,7 +151,10 @@ class ProjectionSSIMLoss(nn.Module):
 
     def __init__(self, window: int = WINDOW, value_range: float | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
-        self.window, self.value_range, self.reduction = window, value_range, reduction
+        check_reduction(reduction, "ProjectionSSIMLoss")
+        check_option("value_range", value_range, "ProjectionSSIMLoss")
+        self.window = _check_window(window, "ProjectionSSIMLoss")
+        self.value_range, self.reduction = value_range, reduction
 
     def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return projection_ssim_loss(

@@ -11,8 +11,11 @@ from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_flag,
     check_level,
     check_mask,
+    check_option,
+    check_reduction,
     counted,
     item_scale,
     reduce,
@@ -35,9 +38,10 @@ def total_variation(
 ) -> Tensor:
     """Modulus of the gradient of each voxel of a volume (..., Z, Y, X), real or complex (Rudin, Osher, Fatemi 1992).
 
-    Differences to the next voxel along Z, Y, X over `spacing`, metres between voxels; none past the end, none to voxels
-    that do not count. `isotropic`: the root of the sum of their squares; else the sum of their moduli, which favours
-    faces along the axes. Times the volume of a voxel, its sum is the area of a surface times the step across it
+    Differences to the next voxel along Z, Y, X over `spacing`, metres between voxels (of a `VoxelGrid` with even depths
+    `(depths[1] - depths[0], *pitch)`; without it per voxel); none past the end, none to voxels that do not count.
+    `isotropic`: the root of the sum of their squares; else the sum of their moduli, which favours faces along the axes.
+    Times the volume of a voxel, its sum is the area of a surface times the step across it
     (anisotropic: of its projections onto the axes).
 
     `smoothing`, in units of the volume per metre, makes `sqrt(d^2 + s^2) - s` of a modulus d, whose gradient is zero in
@@ -45,15 +49,13 @@ def total_variation(
     spacing; 0: the modulus itself, with gradient zero in flat places. Raises ShapeError, UnitError.
     """
     where = "total_variation"
+    check_reduction(reduction, where)
+    check_flag("isotropic", isotropic, where)
     check_dense((volume,), where)
     if volume.ndim < 3:
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
-    if not hasattr(spacing, "__len__") or len(spacing) != 3:
-        raise ShapeError(f"{where}: expected the spacing along Z, Y and X, three numbers, got {shown(spacing)}.")
     volume = volume.to(working_dtype((volume,), where, complex_too=True))
-    for step in spacing:
-        check_level("spacing", step, volume.new_empty(()), where, square=True)
-    steps = [float(step) for step in spacing]
+    steps = _check_spacing(spacing, volume, where)
     mask = check_mask(mask, volume, where)
     seen = counted(volume, mask)
     if not volume.numel():
@@ -67,6 +69,18 @@ def total_variation(
         squares = [torch.stack(squares).sum(0)]
     value = torch.stack([_smooth_root(square, smooth) for square in squares]).sum(0)
     return reduce(value, reduction, where, mask)
+
+
+def _check_spacing(spacing: Sequence[float], like: Tensor, where: str) -> tuple[float, float, float]:
+    if not hasattr(spacing, "__len__") or len(spacing) != 3:
+        raise ShapeError(
+            f"{where}: expected the spacing along Z, Y and X, three numbers, got {shown(spacing)}. For a VoxelGrid "
+            "take the distance of its planes and *grid.pitch."
+        )
+    for step in spacing:
+        check_level("spacing", step, like.new_empty(()), where, square=True)
+    z, y, x = (float(step) for step in spacing)
+    return z, y, x
 
 
 def _squared_difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -> Tensor:
@@ -98,7 +112,11 @@ class TotalVariation(nn.Module):
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        self.spacing, self.isotropic = tuple(spacing), isotropic
+        check_reduction(reduction, "TotalVariation")
+        check_flag("isotropic", isotropic, "TotalVariation")
+        check_option("smoothing", smoothing, "TotalVariation", zero=True, square=True)
+        self.spacing = _check_spacing(spacing, torch.empty((), dtype=torch.float64), "TotalVariation")
+        self.isotropic = isotropic
         self.smoothing, self.reduction = smoothing, reduction
 
     def forward(self, volume: Tensor, mask: Tensor | None = None) -> Tensor:

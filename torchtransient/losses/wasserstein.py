@@ -14,13 +14,13 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_level,
     check_mask,
+    check_option,
     check_pair,
-    check_reduction,
     counted,
     item_scale,
     reduce,
 )
-from torchtransient.losses.layouts import bins_dim, item_dims
+from torchtransient.losses.layouts import bins_dim, check_held, item_dims
 
 # Pixels below this share of the mean light of a pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3
@@ -54,7 +54,8 @@ def wasserstein_loss(
     that do not count are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "wasserstein_loss"
-    check_reduction(reduction, where)
+    check_held(reduction, dim, where)
+    check_option("floor", floor, where)
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
@@ -117,6 +118,10 @@ class WassersteinLoss(nn.Module):
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
+        check_held(reduction, dim, "WassersteinLoss")
+        check_option("bin_width_opl", bin_width_opl, "WassersteinLoss", needed=True)
+        check_option("creation_cost_opl", creation_cost_opl, "WassersteinLoss")
+        check_option("floor", floor, "WassersteinLoss")
         self.bin_width_opl, self.creation_cost_opl = bin_width_opl, creation_cost_opl
         self.floor, self.dim, self.reduction = floor, dim, reduction
 

@@ -15,6 +15,9 @@
 - `LCT`, `lct`: the light-cone transform with its Wiener inverse
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
+- `stabilised_root`, `StabilisedRoot`: roots of light, as f-k takes them, with a slope at empty bins
+- `LinearOperator`: what all of these are
+- `PlanarScan`: a regular grid of a flat wall, which transforms take in place of a scan
 - `subtract_legs`: a capture without the first and the last leg of its light
 - `VoxelGrid`: where the points of a hidden volume stand
 - `Backprojection`, `backproject`: linear operator between such a volume and captures of any kind, and of one capture
@@ -30,7 +33,7 @@
 - `choose_method`: which one suits it, and why
 - `default_grid`: voxels before the wall of a capture
 - `sum_bins`, `without_slab`: captures of fewer bins; without the foam before them
-- `HiddenVolume`: what `reconstruct` returns
+- `HiddenVolume`: what `reconstruct` returns, a record of tensors as captures are
 - `normals_of`: its unit normals, of methods that find them
 - `read_volume`, `write_volume`: such volumes on disk
 
@@ -43,7 +46,6 @@ from torchtransient.capture import Scan as Scan
 from torchtransient.capture import Wall as Wall
 from torchtransient.data.captures.formats import read_capture as read_capture
 from torchtransient.data.captures.formats import write_capture as write_capture
-from torchtransient.data.volume_file import HiddenVolume as HiddenVolume
 from torchtransient.data.volume_file import read_volume as read_volume
 from torchtransient.data.volume_file import write_volume as write_volume
 from torchtransient.nlos.methods import choose_method as choose_method
@@ -66,10 +68,14 @@ from torchtransient.reconstruction import DiffusionDeconvolution as DiffusionDec
 from torchtransient.reconstruction import DirectionalLCT as DirectionalLCT
 from torchtransient.reconstruction import DirectLight as DirectLight
 from torchtransient.reconstruction import FilteredBackprojection as FilteredBackprojection
+from torchtransient.reconstruction import HiddenVolume as HiddenVolume
 from torchtransient.reconstruction import LaplacianFilter as LaplacianFilter
+from torchtransient.reconstruction import LinearOperator as LinearOperator
 from torchtransient.reconstruction import MidpointFK as MidpointFK
 from torchtransient.reconstruction import PhasorField as PhasorField
 from torchtransient.reconstruction import PhasorFilter as PhasorFilter
+from torchtransient.reconstruction import PlanarScan as PlanarScan
+from torchtransient.reconstruction import StabilisedRoot as StabilisedRoot
 from torchtransient.reconstruction import TransientCamera as TransientCamera
 from torchtransient.reconstruction import VoxelGrid as VoxelGrid
 from torchtransient.reconstruction import backproject as backproject
@@ -83,4 +89,5 @@ from torchtransient.reconstruction import normals_from_depth as normals_from_dep
 from torchtransient.reconstruction import normals_from_volume as normals_from_volume
 from torchtransient.reconstruction import phasor_image as phasor_image
 from torchtransient.reconstruction import soft_depth as soft_depth
+from torchtransient.reconstruction import stabilised_root as stabilised_root
 from torchtransient.reconstruction import subtract_legs as subtract_legs

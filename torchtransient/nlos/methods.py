@@ -1,4 +1,4 @@
-"""Which methods there are for hidden volumes, which captures each takes, and which one suits a capture."""
+"""Which captures each method for hidden volumes takes, and which one suits a capture."""
 
 from __future__ import annotations
 
@@ -8,41 +8,13 @@ import torch
 
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import shown
+from torchtransient.quantities import shown, with_article
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.volume_methods import METHODS as METHODS
+from torchtransient.volume_methods import Method as Method
 
 # Sensor points whose neighbours are looked for where points are no grid.
 _LOOKED_AT = 256
-
-
-@dataclass(frozen=True)
-class Method:
-    """``kinds`` of scan that it takes, ``planar``: only regular grids of flat walls; ``options`` of its own; whether
-    voxels stand where whoever calls wants them (``free_grid``), and whether lengths may count first and last legs.
-    """
-
-    title: str
-    kinds: tuple[str, ...]
-    options: tuple[str, ...]
-    planar: bool = True
-    free_grid: bool = False
-
-    @property
-    def takes_legs(self) -> bool:
-        return self.free_grid
-
-
-_ALL = ("single", "confocal", "exhaustive")
-_BAND = ("wavelength", "cycles", "falloff")
-METHODS = {
-    "fk": Method("f-k migration", ("confocal",), ("target", "floor", "taps")),
-    "midpoint-fk": Method("f-k migration by midpoints", ("single", "exhaustive"), ("target", "floor", "taps")),
-    "lct": Method("light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
-    "directional-lct": Method("directional light-cone transform", ("confocal",), ("target", "snr", "v_bins")),
-    "bp": Method("backprojection", _ALL, ("falloff",), planar=False, free_grid=True),
-    "fbp": Method("filtered backprojection", _ALL, (*_BAND, "filter"), planar=False, free_grid=True),
-    "phasor": Method("phasor field", _ALL, (*_BAND, "camera"), free_grid=True),
-}
 
 
 @dataclass(frozen=True)
@@ -58,18 +30,19 @@ def choose_method(capture: Capture) -> Choice:
     if not isinstance(capture, Capture):
         raise ShapeError(f"choose_method: expected a tt.nlos.Capture, got {shown(capture)}.")
     kind = capture.scan.kind
+    this = with_article(kind)
     if not is_planar(capture.scan):
-        reason = f"a {kind} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
+        reason = f"{this} scan whose points are not a regular grid of a flat wall, which only backprojection takes"
         return Choice("fbp", f"{reason}; the filter removes its haze")
     if kind == "confocal":
         return Choice("fk", "a confocal scan of a regular grid on a flat wall: the sharpest for it, in seconds")
     more = "midpoint-fk is quicker, and approximate"
-    return Choice("phasor", f"a {kind} scan of a regular grid on a flat wall, from plane to plane; {more}")
+    return Choice("phasor", f"{this} scan of a regular grid on a flat wall, from plane to plane; {more}")
 
 
 def check_method(name: str, capture: Capture) -> Method:
     """The method of a name. Raises SceneError for unknown ones and for scans that it does not take."""
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise SceneError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
     if kind not in method.kinds:

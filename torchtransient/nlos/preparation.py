@@ -9,43 +9,51 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
+from torchtransient.capture.arithmetic import precision_of, summed
 from torchtransient.errors import DeviceError, ShapeError
+from torchtransient.nlos.measured_light import checked_light
 from torchtransient.quantities import count, shown
 from torchtransient.reconstruction import DiffusionDeconvolution, subtract_legs
+from torchtransient.reconstruction.capture_checks import checked_capture
 
 
 def sum_bins(capture: Capture, number: int) -> Capture:
     """The capture with so many neighbouring bins added up; what is left over at the record's end is dropped.
 
-    Phasors beside a transient stay. Raises ShapeError without a transient and for more bins than there are, UnitError
-    for a number that is none.
+    Counts stay whole (int64), half precision becomes float32; phasors beside a transient stay. Raises ShapeError
+    without a transient and for more bins than there are, SceneError for a number that is none.
     """
     number = count("sum_bins: number", number)
-    transient, axis = capture.transient, capture.axis
-    if transient is None or axis is None:
-        raise ShapeError("sum_bins: expected a capture with a transient, got phasors alone.")
+    transient, axis = checked_capture(capture, "sum_bins")
     if number == 1:
         return capture
     bins = axis.num_bins // number
     if bins < 1:
         raise ShapeError(f"sum_bins: expected {axis.num_bins} bins at most, got {number}.")
     dim = transient.ndim - len(capture.scan.shape) - 1
-    summed = transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)).sum(dim + 1)
-    return replace(capture, transient=summed, axis=TimeAxis(axis.start_opl, axis.bin_width_opl * number, bins))
+    together = summed(transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)), dim + 1)
+    return replace(capture, transient=together, axis=TimeAxis(axis.start_opl, axis.bin_width_opl * number, bins))
 
 
 def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     """A confocal capture without the foam slab on its wall, ``thickness`` metres, by :class:`DiffusionDeconvolution`
-    with the foam of Lindell and Wetzstein (2020); what falls below zero is zero. Without legs. Raises as it does.
+    with the foam of Lindell and Wetzstein (2020); intensities below zero are zero, the other Stokes components are as
+    they come. Without legs, in double precision where the capture is, else in single. Raises as it does.
     """
+    checked_capture(capture, "without_slab")
     capture = subtract_legs(capture)
-    transient, axis = capture.transient, capture.axis
-    if transient is None or axis is None:
-        raise ShapeError("without_slab: expected a capture with a transient, got phasors alone.")
+    transient, axis = checked_capture(capture, "without_slab")
+    checked_light(capture, "without_slab")
     # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
     slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
     clear = slab.to(transient.device).reconstruct(transient.double())
-    return replace(capture, transient=clear.clamp_min(0).float(), phasor=None, frequencies=None, steady=None)
+    if capture.polarized:
+        stokes = -len(capture.scan.shape) - 3
+        intensity, others = clear.split((1, 3), stokes)
+        clear = torch.cat([intensity.clamp_min(0), others], stokes)
+    else:
+        clear = clear.clamp_min(0)
+    return replace(capture, transient=clear.to(precision_of(transient)), phasor=None, frequencies=None, steady=None)
 
 
 def moved_to(capture: Capture, device: Any) -> Capture:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,16 +11,19 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture
-from torchtransient.data.volume_file import HiddenVolume
+from torchtransient.capture import Capture, Scan
+from torchtransient.capture.arithmetic import precision_of
 from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.nlos.measured_light import checked_light
 from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
-from torchtransient.quantities import finite, shown
+from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
+from torchtransient.quantities import count, finite, positive, real_array, shown
 from torchtransient.reconstruction import (
     Backprojection,
     ConfocalCamera,
     DirectLight,
     FilteredBackprojection,
+    HiddenVolume,
     LaplacianFilter,
     PhasorField,
     PhasorFilter,
@@ -34,13 +37,13 @@ from torchtransient.reconstruction import (
     subtract_legs,
 )
 from torchtransient.reconstruction.midpoint_fk import Midpoints
+from torchtransient.reconstruction.proportions import check_proportions, check_reach, check_wavelength
+from torchtransient.volume_methods import FILTERS, Method
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
-# Planes that are found at once by backprojection, between two steps of the progress bar. Phasor fields share their
-# spectra over all planes.
-_AT_ONCE = 4
-FILTERS = ("phasor", "laplacian")
+# How far points are off one line, as a share of its length.
+_LINE = 1e-6
 
 
 def reconstruct(
@@ -49,7 +52,7 @@ def reconstruct(
     *,
     grid: VoxelGrid | None = None,
     depths: Sequence[float] | None = None,
-    progress: bool = False,
+    progress: bool = True,
     **options: Any,
 ) -> HiddenVolume:
     """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
@@ -76,21 +79,29 @@ def reconstruct(
     entry = check_method(choice.name, capture)
     options = {name: value for name, value in options.items() if value is not None}
     _check_options(choice.name, entry.options, options)
+    if grid is not None and not isinstance(grid, VoxelGrid):
+        raise ShapeError(f"reconstruct: expected grid as a tt.nlos.VoxelGrid, got {shown(grid)}.")
     if grid is not None and (depths is not None or not entry.free_grid):
         why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
         raise SceneError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
-    capture = _intensities(capture)
+    assert capture.axis is not None
+    check_proportions(capture.scan, capture.axis, "reconstruct")
+    capture = checked_light(_intensities(capture), "reconstruct")
     if not entry.takes_legs:
         capture = _from_zero(subtract_legs(capture))
     near_far = None if depths is None else checked_depths(depths)
+    assert capture.axis is not None
     with torch.no_grad():
         if entry.free_grid:
             voxels = default_grid(capture, depths=near_far) if grid is None else grid
+            check_reach(capture.scan, voxels, capture.axis, "reconstruct", seen=True)
+            check_volume_fits(choice.name, capture, voxels, options)
             values, directions, times, used = _on_grid(choice.name, capture, voxels, options, progress)
         else:
+            check_volume_fits(choice.name, capture, None, options)
             values, directions, voxels = _on_own_grid(choice.name, capture, near_far, options, progress)
             times, used = None, options
-    metadata = {"reason": choice.reason, "settings": _told(used)}
+    metadata = {"reason": choice.reason, "settings": _settings(entry, used, capture.axis)}
     return HiddenVolume(values, voxels, choice.name, metadata, times, directions)
 
 
@@ -104,8 +115,11 @@ def default_grid(
 ) -> VoxelGrid:
     """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
     ``depths`` (near, far) in metres, None for all that a record reaches, and ``planes`` between them, None for one a
-    bin and 64 at most. Raises ShapeError, UnitError.
+    bin and 64 at most. Raises ShapeError, UnitError, and SceneError for a number of planes that is none, and where
+    sensor points on one line say nothing of an ``extent``.
     """
+    if not isinstance(capture, Capture):
+        raise ShapeError(f"reconstruct: expected a tt.nlos.Capture, got {shown(capture)}.")
     axis = capture.axis
     if axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
@@ -121,12 +135,25 @@ def default_grid(
         near, far = checked_depths(depths)
     if planes is None:
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
+    planes = count("reconstruct: planes", planes)
     middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
+    if extent is None and not _spans_area(capture.scan):
+        raise SceneError(
+            f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
+            "and high a volume is. Give grid=default_grid(capture, extent=(width, height)) in metres, or another grid=."
+        )
     if size is None and extent is None and not is_planar(capture.scan):
         # As many as points: of a curved wall's grid, or of the square that a list of them would fill.
         shape = capture.scan.sensor_shape
         size = tuple(reversed(shape)) if len(shape) == 2 else math.ceil(math.sqrt(math.prod(shape)))
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
+
+
+def _spans_area(scan: Scan) -> bool:
+    """Whether sensor points are more than one, and not all on one line."""
+    points = scan.sensor_points.detach().cpu().reshape(-1, 3)
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    return len(spread) > 1 and bool(spread[1] > _LINE * spread[0])
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:
@@ -159,21 +186,33 @@ def normals_of(volume: HiddenVolume) -> Tensor:
 # ------------------------------------------------------------------------------------------------------------- parts
 
 
-def _check_options(name: str, known: tuple[str, ...], options: dict[str, Any]) -> None:
+def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> None:
     for option in options:
         if option not in known:
             raise SceneError(
                 f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
                 "Leave it out, or take another method."
             )
+    for option in ("target", "filter"):
+        if not isinstance(options.get(option, ""), str):
+            raise SceneError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
     if options.get("filter", FILTERS[0]) not in FILTERS:
         raise SceneError(f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}.")
     if options.get("filter") == "laplacian" and ("wavelength" in options or "cycles" in options):
         raise SceneError("reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out.")
 
 
-def _told(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value if isinstance(value, int | float | str) else repr(value) for name, value in options.items()}
+def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, Any]:
+    """All options that a method has, those too that nobody gave, as plain data."""
+    found = {**entry.options, **used}
+    if "v_bins" in found and found["v_bins"] is None:
+        found["v_bins"] = axis.num_bins
+    if "camera" in found and found["camera"] is None:
+        found["camera"] = DirectLight()
+    if found.get("filter") == "laplacian":
+        found = {name: value for name, value in found.items() if name not in ("wavelength", "cycles")}
+        found["sigma"] = LaplacianFilter().sigma
+    return {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.items()}
 
 
 def _intensities(capture: Capture) -> Capture:
@@ -243,11 +282,15 @@ def _on_grid(
     assert axis is not None and transient is not None
     used = dict(options)
     laplacian = used.get("filter") == "laplacian"
-    if name != "bp" and not laplacian:
-        used.setdefault("wavelength", default_wavelength(capture))
+    if laplacian:
+        LaplacianFilter().check(grid, axis.bin_width_opl, "reconstruct")
+    elif name != "bp":
+        wavelength = used.setdefault("wavelength", default_wavelength(capture))
+        check_wavelength(positive("reconstruct: wavelength", wavelength), capture.scan, axis, "reconstruct")
     make = _maker(name, capture, axis, used)
     found = []
-    at_once = len(grid.depths) if name == "phasor" else _AT_ONCE
+    # Phasor fields share their spectra over all planes; backprojection takes a step of the bar for some of them.
+    at_once = len(grid.depths) if name == "phasor" else AT_ONCE
     with _bar(len(grid.depths), progress) as bar:
         for first in range(0, len(grid.depths), at_once):
             part = grid.depths[first : first + at_once]
@@ -256,7 +299,6 @@ def _on_grid(
     values = torch.cat(found, -3)
     if laplacian:
         negative_laplacian = LaplacianFilter()
-        negative_laplacian.check(grid, axis.bin_width_opl, "reconstruct")
         values = negative_laplacian.image(negative_laplacian.volume(values))
     camera = used.get("camera", DirectLight())
     return values, None, camera.times, used
@@ -266,8 +308,7 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
     """The operator of a method on some planes."""
     transient = capture.transient
     assert transient is not None
-    dtype = torch.float64 if transient.dtype == torch.float64 else torch.float32
-    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": dtype}
+    common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": precision_of(transient)}
     if name == "bp" or options.get("filter") == "laplacian":
         return lambda grid: Backprojection(capture.scan, grid, **common)
     pulse = PhasorFilter(options["wavelength"], options.get("cycles", 4.0))
@@ -280,16 +321,22 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
 def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
     """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
 
-    Raises SceneError for unknown names and where times are missing or have no meaning.
+    Raises SceneError for unknown names, where times are missing or have no meaning, and for a count that is none,
+    UnitError for times that are not three finite numbers.
     """
-    if name == "direct":
+    if isinstance(name, str) and name == "direct":
         if times is not None:
             raise SceneError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
         return DirectLight()
     cameras = {"confocal": ConfocalCamera, "transient": TransientCamera}
-    if name not in cameras:
+    if not isinstance(name, str) or name not in cameras:
         raise SceneError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
     if times is None:
         raise SceneError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
-    start, stop, number = times
-    return cameras[name](torch.linspace(float(start), float(stop), int(number), dtype=torch.float64, device="cpu"))
+    numbers = real_array(times)
+    if numbers is None or numbers.shape != (3,):
+        raise UnitError(f"reconstruct: expected times as (start, stop, count), got {shown(times)}.")
+    start, stop, number = numbers.tolist()
+    frames = count("reconstruct: count of times", number)
+    first, last = finite("reconstruct: times", start), finite("reconstruct: times", stop)
+    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64, device="cpu"))

@@ -15,8 +15,8 @@ from torchtransient.capture.scan import KINDS
 from torchtransient.errors import SceneError
 from torchtransient.nlos.tal_materials import material, spectrum
 from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
-from torchtransient.plugins.films.phasor_grid import transform_bins
 from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.transform_bins import transform_bins
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 _KNOWN = (

@@ -11,6 +11,7 @@ from typing import Any
 
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.quantities import shown
+from torchtransient.yaml_numbers import reads_exponents
 
 _MISSING = object()
 
@@ -41,7 +42,7 @@ def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
 
     text, folder = _text(source, who)
     try:
-        data = yaml.load(text, Loader=Loader)
+        data = yaml.load(text, Loader=reads_exponents(Loader))
     except yaml.YAMLError as error:
         raise StorageError(f"{who}: expected YAML, got what cannot be read: {error}.") from error
     if not isinstance(data, dict):

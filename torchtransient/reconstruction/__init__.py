@@ -16,6 +16,7 @@ from torchtransient.reconstruction.filters import LaplacianFilter as LaplacianFi
 from torchtransient.reconstruction.filters import PhasorFilter as PhasorFilter
 from torchtransient.reconstruction.fk import FK as FK
 from torchtransient.reconstruction.fk import fk as fk
+from torchtransient.reconstruction.hidden_volume import HiddenVolume as HiddenVolume
 from torchtransient.reconstruction.lct import LCT as LCT
 from torchtransient.reconstruction.lct import lct as lct
 from torchtransient.reconstruction.legs import subtract_legs as subtract_legs

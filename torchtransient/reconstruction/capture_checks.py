@@ -13,7 +13,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import positive, shown
+from torchtransient.quantities import positive, shown, with_article
 from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
@@ -94,8 +94,9 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
         raise ShapeError(f"{who}: expected a tt.nlos.Scan or a PlanarScan, got {shown(scan)}.")
     if scan.kind != "confocal":
         raise ShapeError(
-            f"{who}: expected a confocal scan, got a {scan.kind} one. Take the diagonal of an exhaustive capture with "
-            "capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or PhasorField."
+            f"{who}: expected a confocal scan, got {with_article(scan.kind)} one. Take the diagonal of an exhaustive "
+            "capture with capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or "
+            "PhasorField."
         )
     refuse_legs(scan, who)
     return PlanarScan.of_scan(scan, who)
@@ -120,15 +121,21 @@ def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
 
 
 def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tensor:
-    """The transient of a capture with the axis of an operator. Raises ShapeError for another axis, polarized light and
-    captures without a transient.
+    """The transient of a capture with the axis of an operator, to a millionth of a bin: edges may have been computed in
+    another way. Raises ShapeError for another axis, polarized light and captures without a transient.
     """
     transient, axis = checked_capture(capture, who)
     if capture.polarized:
         raise ShapeError(f"{who}: expected a capture of intensities, got Stokes components. Give its transient[0].")
-    if axis != time_axis:
+    if not _same_bins(axis, time_axis):
         raise ShapeError(f"{who}: expected a capture with {time_axis}, as the operator has, got {axis}.")
     return transient
+
+
+def _same_bins(a: TimeAxis, b: TimeAxis) -> bool:
+    tolerance = 1e-6 * b.bin_width_opl
+    near = abs(a.start_opl - b.start_opl) <= tolerance and abs(a.end_opl - b.end_opl) <= tolerance
+    return a.num_bins == b.num_bins and near
 
 
 def same_light(a: Scan, b: Scan) -> bool:

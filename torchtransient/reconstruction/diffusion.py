@@ -23,6 +23,8 @@ from torchtransient.reconstruction.capture_checks import SNR, within
 from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.proportions import check_thickness
+from torchtransient.volume_methods import SLAB_SNR
 
 IMAGES = 20
 # Spacings to both sides that hold a Gaussian of two of them; steps of a sum in time; the least share of the light that
@@ -71,7 +73,8 @@ class DiffusionDeconvolution(ConfocalOperator):
     ``operator.reconstruct(transient)``: the capture without the slab, whose volume another operator finds. Linear and
     differentiable; results go below zero. ``passes``: how often light crosses the slab, 2 of confocal captures.
 
-    ``thickness``, ``extrapolation`` in metres, ``reduced_scattering``, ``absorption`` per metre; the defaults are those
+    ``thickness`` in metres. ``properties``: (reduced scattering per metre, absorption per metre, index of refraction,
+    extrapolation length in metres, at which behind its sides the fluence vanishes); the defaults of both are those
     of the paper's foam. ``snr``: power of the light over that of the noise where nothing is lost, at frequency zero;
     what the slab takes more than that cannot come back. Light is kept: of all that comes through, however late and far
     aside, the sum is one, and what comes into the record does not depend on its length. The convolutions are linear:
@@ -93,10 +96,11 @@ class DiffusionDeconvolution(ConfocalOperator):
         thickness: float = FOAM_THICKNESS,
         properties: tuple[float, float, float, float] = FOAM,
         passes: int = 2,
-        snr: float = 1e4,
+        snr: float = SLAB_SNR,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        check_thickness(positive("DiffusionDeconvolution: thickness", thickness), scan, "DiffusionDeconvolution")
         who = type(self).__name__
         self.thickness = positive(f"{who}: thickness", thickness)
         self.properties = _slab_properties(properties, who)

@@ -11,7 +11,8 @@ from torchtransient.errors import ShapeError
 from torchtransient.quantities import shown
 from torchtransient.reconstruction.capture_checks import checked_axis
 from torchtransient.reconstruction.ellipsoids import EllipsoidOperator, Group
-from torchtransient.reconstruction.filters import ReconstructionFilter
+from torchtransient.reconstruction.filters import PhasorFilter, ReconstructionFilter
+from torchtransient.reconstruction.proportions import check_wavelength
 from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -59,6 +60,8 @@ class FilteredBackprojection(EllipsoidOperator):
         filter.check(points if isinstance(points, VoxelGrid) else None, width, "FilteredBackprojection")
         samples = filter.samples(width)
         super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype, samples=samples)
+        if isinstance(filter, PhasorFilter):
+            check_wavelength(filter.wavelength, self.scan, time_axis, "FilteredBackprojection")
         self.filter = filter
         self.real_volume = not filter.complex_volume
 

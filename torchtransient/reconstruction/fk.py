@@ -32,8 +32,8 @@ from torchtransient.reconstruction.confocal_operator import ConfocalOperator, ch
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.reconstruction.transient_operator import reconstructed
+from torchtransient.volume_methods import TARGETS
 
-TARGETS = ("diffuse", "retroreflective")
 TAPS = (2, 4)
 
 

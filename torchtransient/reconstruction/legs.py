@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
+from torchtransient.capture.arithmetic import computed
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import checked_capture
 
@@ -21,6 +22,7 @@ def subtract_legs(capture: Capture) -> Capture:
     bins of the same width and starts where the light of the pair with the shortest legs started, or at zero; its bins
     begin where that pair's bins did. Light before its start is lost, and what would come from after the old end is
     zero. ``steady`` stays; a capture without legs is returned as it is. Differentiable by the transient, not by points.
+    Captures in double precision stay so, all others, counts too, become float32.
 
     Raises ShapeError for a capture without a transient or with phasors, whose phases would have to turn, and UnitError
     where nothing is left.
@@ -44,7 +46,7 @@ def subtract_legs(capture: Capture) -> Capture:
     first = start + skipped * width
     shorter = TimeAxis(0.0 if abs(first) < 1e-6 * width else first, width, bins)
     scan = replace(capture.scan, first_and_last_leg=False)
-    return replace(capture, transient=_moved(transient, legs, axis, shorter), axis=shorter, scan=scan)
+    return replace(capture, transient=_moved(computed(transient), legs, axis, shorter), axis=shorter, scan=scan)
 
 
 def _moved(transient: Tensor, legs: Tensor, old: TimeAxis, new: TimeAxis) -> Tensor:
@@ -56,7 +58,7 @@ def _moved(transient: Tensor, legs: Tensor, old: TimeAxis, new: TimeAxis) -> Ten
     read = new.centers_opl.to(legs.device)[:, None] + legs.reshape(-1)
     at = ((read - old.start_opl) / old.bin_width_opl + 0.5).clamp(0, old.num_bins + 1)
     low = at.floor().clamp_max(old.num_bins).to(torch.int64)
-    share = (at - low).to(transient.dtype if transient.is_floating_point() else torch.float32)
+    share = (at - low).to(transient.dtype)
     low = low.expand(*flat.shape[:-2], *low.shape)
     before, after = torch.gather(padded, -2, low), torch.gather(padded, -2, low + 1)
     found = before + share * (after - before)

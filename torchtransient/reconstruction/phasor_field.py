@@ -12,12 +12,13 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.quantities import finite, shown
+from torchtransient.quantities import finite, shown, with_article
 from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
 from torchtransient.reconstruction.capture_checks import check_falloff
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
 from torchtransient.reconstruction.plane_waves import good_length, phase_pairs, waves
+from torchtransient.reconstruction.proportions import check_wavelength
 from torchtransient.reconstruction.scan_operator import ScanOperator
 from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
@@ -82,6 +83,7 @@ class PhasorField(ScanOperator):
         if not isinstance(pulse, PhasorFilter):
             raise ShapeError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
         check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
+        check_wavelength(pulse.wavelength, scan, time_axis, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
         if not isinstance(self.camera, Camera):
             raise ShapeError(
@@ -89,8 +91,8 @@ class PhasorField(ScanOperator):
             )
         if isinstance(self.camera, TransientCamera) and scan.kind != "single":
             raise SceneError(
-                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got a {scan.kind} one. "
-                "Choose a spot of an exhaustive capture with capture.single(index)."
+                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got "
+                f"{with_article(scan.kind)} one. Choose a spot of an exhaustive capture with capture.single(index)."
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
         self.real_volume = False

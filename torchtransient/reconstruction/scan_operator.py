@@ -8,6 +8,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.reconstruction.capture_checks import checked_points, checked_scan
+from torchtransient.reconstruction.proportions import check_reach
 from torchtransient.reconstruction.transient_operator import TransientOperator
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -30,6 +31,7 @@ class ScanOperator(TransientOperator):
         super().__init__(checked_scan(scan, who), time_axis=time_axis, dtype=dtype)
         self.grid = points if isinstance(points, VoxelGrid) else None
         self._points = None if isinstance(points, VoxelGrid) else checked_points(points, who)
+        check_reach(scan, points if self._points is None else self._points, time_axis, who)
         self.volume_shape = tuple(self.points.shape[:-1])
         self.data_shape = (time_axis.num_bins, *scan.shape)
 

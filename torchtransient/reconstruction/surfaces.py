@@ -168,5 +168,6 @@ def _checked(volume: Any, depths: Any, who: str) -> tuple[Tensor, Tensor]:
         got = tuple(volume.shape) if isinstance(volume, Tensor) else shown(volume)
         raise ShapeError(f"{who}: expected a volume (..., {shape[0]}, {shape[1]}, {shape[2]}), got {got}.")
     if not volume.is_floating_point():
-        raise ShapeError(f"{who}: expected a volume of real numbers, got {volume.dtype}. Give its squared modulus.")
+        remedy = "Give its squared modulus" if volume.is_complex() else "Give volume.float()"
+        raise ShapeError(f"{who}: expected a volume of real numbers, got {volume.dtype}. {remedy}.")
     return z.to(volume.device), volume if volume.dtype == torch.float64 else volume.float()

@@ -18,12 +18,14 @@ from torchtransient.reconstruction.capture_checks import (
     checked_capture,
     checked_intensities,
     checked_precision,
+    checked_scan,
     same_light,
     telling,
 )
 from torchtransient.reconstruction.linear import LinearOperator
 from torchtransient.reconstruction.operator_state import check_same, packed, plain, unpacked
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.proportions import check_proportions
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 
@@ -36,7 +38,8 @@ class TransientOperator(LinearOperator):
     holds no tables but what the operator was made from: scan, axis, points and settings, not the precision. Loading
     the state of another operator raises ShapeError; ``strict=False`` loads what has none.
 
-    Classes say :meth:`tables` and call ``_set_tables()`` once their arguments are there. Raises ShapeError for what is
+    Classes say :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape`` and
+    ``grid`` (without one, they say :attr:`points`), and call ``_set_tables()`` last. Raises ShapeError for what is
     no axis, UnitError for a dtype other than float32 and float64.
     """
 
@@ -46,8 +49,10 @@ class TransientOperator(LinearOperator):
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         super().__init__()
         who = type(self).__name__
+        scan = scan if isinstance(scan, PlanarScan) else checked_scan(scan, who)
         self.scan, self.axis = _kept(scan), checked_axis(time_axis, who)
         self.dtype = checked_precision(dtype, who)
+        check_proportions(scan, self.axis, who)
 
     @property
     def points(self) -> Tensor:
@@ -61,6 +66,10 @@ class TransientOperator(LinearOperator):
     def depths(self) -> Tensor | None:
         """(Z,) float64: distances of the planes from the wall, metres; None for points that stand on no planes."""
         return None if self.grid is None else self.grid.depths
+
+    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
+        """The picture of a transient (..., *data_shape) or of a capture's: real, differentiable."""
+        raise NotImplementedError
 
     def tables(self) -> dict[str, Tensor]:
         """The tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""

@@ -51,6 +51,7 @@ from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.spatial_psf import LensBlur
 from torchtransient.sensing.streak import StreakCamera, SweepJitter
 from torchtransient.sensing.tdc import TDC, random_code_widths
+from torchtransient.yaml_numbers import reads_exponents
 
 
 def _seeded_code_widths(num_bins: int, dnl_std: float, seed: int = 0) -> torch.Tensor:
@@ -187,7 +188,8 @@ class Device:
         """A device from a YAML file or text, read by the safe loader. Raises StorageError."""
         yaml = _yaml()
         try:
-            return cls.from_dict(yaml.safe_load(_text(source, "\n")))
+            loader = reads_exponents(type("Loader", (yaml.SafeLoader,), {}))
+            return cls.from_dict(yaml.load(_text(source, "\n"), Loader=loader))
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import as_number, shown
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
 _OTHER_FILMS = (
@@ -84,10 +85,9 @@ def check_number(
     value: float, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
 ) -> float:
     """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, RuntimeError):
-        raise UnitError(f"{where}: expected {name} to be one number, got {value!r}.") from None
+    number = as_number(value)
+    if number is None:
+        raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
     below = number <= low if open_low else number < low
     if not math.isfinite(number) or below or number > high:
         left = "(" if open_low else "["

@@ -208,15 +208,22 @@ class SynchronousSPAD(RandomSensor):
 
 
 def first_photon_log_prob(
-    counts: Tensor, rate: Tensor, cycles: int, dead_bins: float | None = None, *, constant: bool = True
+    counts: Tensor,
+    rate: Tensor,
+    cycles: int,
+    dead_bins: float | None = None,
+    *,
+    constant: bool = True,
+    where: str = "first_photon_log_prob",
 ) -> Tensor:
     """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)). (..., C, T, H, W).
 
     Its sum over time is that of the histogram. `constant` False leaves the binomial coefficient out, which does not
     depend on the rate. Concave in the rate. Values and gradients are finite wherever counts are possible; a count at
-    rate 0 has log-probability -inf. Raises UnitError when the counts need more than `cycles` cycles.
+    rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than `cycles`
+    cycles.
     """
-    number = check_count(cycles, "cycles", "first_photon_log_prob")
+    number = check_count(cycles, "cycles", where)
     armed = armed_cycles(counts.detach(), number, dead_bins)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
     quiet = armed - n
@@ -224,7 +231,7 @@ def first_photon_log_prob(
     whole = dead_bins is None or float(split_dead_time(dead_bins)[1]) < 1e-6
     if bool((quiet < (-0.5 if whole else -0.5 - 6 * number**0.5)).any()):
         raise UnitError(
-            f"first_photon_log_prob: expected counts of at most {number} cycles, got a pixel with more detections "
+            f"{where}: expected counts of at most {number} cycles, got a pixel with more detections "
             "than armed cycles. Check cycles and the dead time."
         )
     quiet = quiet.clamp_min(0)

@@ -147,7 +147,8 @@ def check_picture(path: str | Path, who: str = "picture") -> None:
 
     endings = FigureCanvasAgg.get_supported_filetypes()
     if Path(path).suffix.lstrip(".").lower() not in endings:
-        raise StorageError(f"{who}: expected a name that ends in .png, got '{path}'.")
+        known = ", ".join(f".{ending}" for ending in sorted(endings))
+        raise StorageError(f"{who}: expected a name that ends in .png, or another of {known}, got '{path}'.")
 
 
 def _draw_steady(panel: Any, steady: Tensor, pixel: tuple[int, int]) -> None:

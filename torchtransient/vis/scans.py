@@ -15,6 +15,7 @@ from torch import Tensor
 from torchtransient import quantities
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
+from torchtransient.capture.arithmetic import computed
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.quantities import shown
 from torchtransient.vis.arrival import checked_limits, peak_time_picture
@@ -176,7 +177,7 @@ def _transient(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
         raise ShapeError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
     if capture.transient is None or capture.axis is None:
         raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
-    cube = capture.transient.detach().cpu()
+    cube = computed(capture.transient.detach().cpu())
     rank = len(capture.scan.shape) + 2
     if capture.polarized:
         cube = cube.select(cube.ndim - rank - 1, 0)

@@ -20,6 +20,9 @@ from torchtransient.vis.files import figure_type, save_figure
 _PANEL = 3.4
 # Beside the picture of depth: no colour of the map.
 _NOTHING = "0.85"
+_NO_NUMBER = "tab:red"
+# Steps of even planes differ by less, as a share.
+_UNEVEN = 1e-3
 
 
 def volume_views(
@@ -37,9 +40,10 @@ def volume_views(
     """A matplotlib figure of a volume: the highest values seen from the front, from the top and from the side.
 
     ``volume`` (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, the
-    highest one is white, `gamma` < 1 lightens what is dim. ``depths`` (Z,) and ``extent`` (width, height) in metres
-    scale the axes (those of a voxel grid: `grid.depths`, `grid.extent`), x and y from the middle; without them they
-    count voxels. With ``depth`` (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where
+    highest finite one and infinite ones white, what is not a number is red; `gamma` < 1 lightens what is dim.
+    ``depths`` (Z,), which increase, and ``extent`` (width, height) in metres scale the axes (those of a voxel grid:
+    `grid.depths`, `grid.extent`), x and y from the middle; without them they count voxels. Planes reach to the middle
+    between them. With ``depth`` (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where
     ``mask`` (Y, X) is true. Writes the figure when `path` is given. Raises ShapeError, UnitError, StorageError.
     """
     values = _volume(volume)
@@ -51,20 +55,20 @@ def volume_views(
     count = 3 + len(extras)
     figure = figure_type()(figsize=(_PANEL * count + 0.6, _PANEL + 0.6), layout="constrained")
     panels = figure.subplots(1, count, squeeze=False)[0]
-    across, up, away = (-width / 2, width / 2), (-height / 2, height / 2), (float(z[0]), float(z[-1]))
+    across, up = (torch.linspace(-side / 2, side / 2, n + 1) for side, n in ((width, size[2]), (height, size[1])))
     unit = "m" if extent is not None else "voxels"
     unit_z = "m" if depths is not None else "voxels"
-    light = (values / (float(values.max()) or 1.0)) ** gamma
+    highest = float(torch.nan_to_num(values, posinf=0.0).max()) or 1.0
+    light = (values / highest).clamp_max(1) ** gamma
     views = (
-        ("front", light.amax(0), (*across, *up), f"x ({unit})", f"y ({unit})"),
-        ("top", light.amax(1), (*across, *away), f"x ({unit})", f"depth ({unit_z})"),
-        ("side", light.amax(2).T, (*away, *up), f"depth ({unit_z})", f"y ({unit})"),
+        ("front", light.amax(0), across, up, f"x ({unit})", f"y ({unit})"),
+        ("top", light.amax(1), across, z, f"x ({unit})", f"depth ({unit_z})"),
+        ("side", light.amax(2).T, z, up, f"depth ({unit_z})", f"y ({unit})"),
     )
-    for panel, (name, picture, box, right, upwards) in zip(panels, views, strict=False):
-        aspect = "equal" if name == "front" else "auto"
-        panel.imshow(picture.numpy(), origin="lower", extent=box, cmap="gray", vmin=0, vmax=1, aspect=aspect)
+    for panel, (name, picture, columns, rows, right, upwards) in zip(panels, views, strict=False):
+        _light_panel(panel, picture, columns, rows, aspect="equal" if name == "front" else "auto")
         _label(panel, name, right, upwards)
-    box = (*across, *up)
+    box = (-width / 2, width / 2, -height / 2, height / 2)
     for panel, name in zip(panels[3:], extras, strict=True):
         if name == "depth":
             _depth_panel(figure, panel, _map("depth", depth, size[1:]), kept, box)
@@ -128,6 +132,23 @@ def _one_panel(picture: Tensor, mask: Any, extent: Any, title: str, path: str | 
     return save_figure(figure, path, who)
 
 
+def _light_panel(panel: Any, picture: Tensor, columns: Tensor, rows: Tensor, aspect: str) -> None:
+    """Brightness between edges of columns and rows; those of uneven planes as they are."""
+    from matplotlib import colormaps
+
+    shown_ = {"cmap": colormaps["gray"].with_extremes(bad=_NO_NUMBER), "vmin": 0, "vmax": 1}
+    if _even(columns) and _even(rows):
+        box = (float(columns[0]), float(columns[-1]), float(rows[0]), float(rows[-1]))
+        panel.imshow(picture.numpy(), origin="lower", extent=box, aspect=aspect, **shown_)
+    else:
+        panel.pcolormesh(columns.numpy(), rows.numpy(), picture.numpy(), **shown_)
+
+
+def _even(edges: Tensor) -> bool:
+    steps = edges.diff()
+    return bool(((steps - steps.mean()).abs() <= _UNEVEN * steps.mean()).all())
+
+
 def _depth_panel(figure: Any, panel: Any, depth: Tensor, kept: Tensor | None, box: tuple[float, ...]) -> None:
     shown_ = depth if kept is None else torch.where(kept, depth, torch.nan)
     panel.set_facecolor(_NOTHING)
@@ -164,7 +185,7 @@ def _volume(volume: Any) -> Tensor:
     values = _plain("volume", volume)
     if values.ndim != 3 or values.numel() == 0:
         raise ShapeError(f"volume: expected (Z, Y, X), got {tuple(values.shape)}; choose an item and a channel.")
-    return torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0).clamp_min(0)
+    return values.clamp_min(0)
 
 
 def _map(name: str, values: Any, size: tuple[int, ...] | None) -> Tensor:
@@ -184,19 +205,22 @@ def _normals(values: Any, size: tuple[int, ...] | None) -> Tensor:
 
 
 def _scales(size: tuple[int, ...], depths: Any, extent: Any) -> tuple[Tensor, tuple[float, float]]:
-    """Outer edges of the planes (2,) or more, and (width, height)."""
+    """Edges of the planes (Z + 1,), float64, and (width, height)."""
     if depths is None:
-        z = torch.tensor([-0.5, size[0] - 0.5])
+        z = torch.arange(size[0] + 1, dtype=torch.float64) - 0.5
     else:
         plain = real_array(depths)
         if plain is None or plain.shape != (size[0],):
             raise ShapeError(f"depths: expected ({size[0]},), one for each plane, got {shown(depths)}.")
-        first, last = float(plain[0]), float(plain[-1])
-        half = (last - first) / max(2 * (size[0] - 1), 1) or 0.5
-        z = torch.tensor([first - half, last + half])
+        planes = torch.from_numpy(plain)
+        halves = planes.diff() / 2 if len(planes) > 1 else torch.full((1,), 0.5, dtype=torch.float64)
+        if not bool(torch.isfinite(planes).all()) or not bool((halves > 0).all()):
+            raise UnitError(f"depths: expected finite metres that increase, got {shown(plain.tolist())}.")
+        between = planes[:-1] + halves[: len(planes) - 1]
+        z = torch.cat([planes[:1] - halves[:1], between, planes[-1:] + halves[-1:]])
     if extent is None:
         return z, (float(size[2]), float(size[1]))
     pair = real_array(extent)
-    if pair is None or pair.shape != (2,) or not (pair > 0).all():
+    if pair is None or pair.shape != (2,) or not ((pair > 0) & (pair < float("inf"))).all():
         raise UnitError(f"extent: expected (width, height) in metres, greater than zero, got {shown(extent)}.")
     return z, (float(pair[0]), float(pair[1]))

@@ -25,8 +25,8 @@ def recognises(contents: Contents) -> bool:
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """A confocal capture on the plane z = 0 around the origin, hidden side +z, counts in float32; ``wall_size=`` is
-    needed. Of ``out``: a capture of one point.
+    """A confocal capture on the plane z = 0 around the origin, hidden side +z, counts of the file's own kind;
+    ``wall_size=`` is needed. Of ``out``: a capture of one point.
     """
     name = "meas" if "meas" in contents.shapes else "out"
     data = contents.array(name)

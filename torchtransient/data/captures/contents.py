@@ -6,7 +6,6 @@ that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,17 +14,18 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import damage_said, hdf5_package, path_of
-from torchtransient.data.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.data.array_file import check_source, damage_said
+from torchtransient.data.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.data.hdf5_limits import read_attributes, read_dataset
+from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 
 WHAT = "capture file"
-_HEADER_BYTES = 128
-_BYTES_PER_VALUE = 8
 
 
 class Contents(Protocol):
-    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file.
+    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
+    names that lead elsewhere, which are not followed.
 
     ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
     ``structure/field``. ``text(name)`` likewise.
@@ -34,6 +34,7 @@ class Contents(Protocol):
     source: Path
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str]
+    links: frozenset[str]
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None: ...
     def text(self, name: str) -> str | None: ...
@@ -43,9 +44,7 @@ class Contents(Protocol):
 @contextmanager
 def opened(path: str | Path) -> Iterator[Contents]:
     """The contents of an HDF5 or MATLAB file. Raises StorageError for others, and for what is damaged."""
-    source = path_of(path, WHAT)
-    if not source.is_file():
-        raise StorageError(f"{WHAT}: '{source}' does not exist.")
+    source = check_source(path, WHAT)
     with damage_said(source, WHAT, "a capture of the layout that was read"):
         if _is_old_mat(source):
             yield MatContents(source)
@@ -63,13 +62,21 @@ class Hdf5Contents:
             name: self._shape(name) for name in file if name != "#refs#"
         }
         self.attributes: Mapping[str, str] = {
-            name: str(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
+            name: _sole(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
         }
+
+        self.links = frozenset(name for name in self.shapes if self._is_link(name))
+
+    def _is_link(self, name: str) -> bool:
+        """Whether there is no more than a way to elsewhere, or nothing."""
+        import h5py
+
+        return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
         import h5py
 
-        if not isinstance(self._file.get(name, getlink=True), h5py.HardLink):
+        if self._is_link(name):
             return None
         found = self._file[name]
         return found.shape if isinstance(found, h5py.Dataset) else None
@@ -90,7 +97,7 @@ class Hdf5Contents:
         """The names in a structure; empty for what is none."""
         import h5py
 
-        if not isinstance(self._file.get(name, getlink=True), h5py.HardLink):
+        if self._is_link(name):
             return frozenset()
         found = self._file[name]
         return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
@@ -99,78 +106,61 @@ class Hdf5Contents:
         return read_dataset(self._file, name, WHAT, part)
 
 
+def _sole(value: Any) -> str:
+    """A text, also one in an array of one."""
+    sole = np.asarray(value).reshape(-1)[0] if np.size(value) == 1 else value
+    return sole.decode("utf-8", "replace") if isinstance(sole, bytes) else str(sole)
+
+
 class MatContents:
-    """A MATLAB file of versions 5 to 7, read by scipy."""
+    """A MATLAB file of versions 5 to 7."""
 
     def __init__(self, source: Path) -> None:
         self.source = source
-        self._io = _scipy_io()
-        self._size = source.stat().st_size
-        with _errors_said(source):
-            found = self._io.whosmat(str(source))
-        shapes = {name: None if kind == "struct" else tuple(reversed(shape)) for name, shape, kind in found}
-        self.shapes: Mapping[str, tuple[int, ...] | None] = shapes
+        self._file = Mat5File(source)
+        self.shapes: Mapping[str, tuple[int, ...] | None] = {
+            name: variable.shape for name, variable in self._file.variables.items()
+        }
         self._kept: dict[str, Any] = {}
         self.attributes: Mapping[str, str] = {}
+        self.links: frozenset[str] = frozenset()
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         value: Any = self._variable(name.split("/")[0])
         for field in name.split("/")[1:]:
-            if not isinstance(value, np.ndarray) or value.dtype.names is None or value.size != 1:
-                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {type(value).__name__}.")
-            if field not in value.dtype.names:
-                return None
-            value = value.reshape(-1)[0][field]
-        if value is None or (isinstance(value, np.ndarray) and value.size == 0):
-            return None
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "biufc":
-            raise StorageError(f"{WHAT}: expected numbers in '{name}', got {getattr(value, 'dtype', type(value))}.")
-        found: NDArray[Any] = value.T[part]
-        return found
+            if not isinstance(value, dict):
+                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {_words(value)}.")
+            value = value.get(field)
+        if value is not None and not isinstance(value, np.ndarray):
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {_words(value)}.")
+        return None if value is None else value[part]
 
     def text(self, name: str) -> str | None:
         value = self._variable(name)
-        return None if value is None else str(np.asarray(value).reshape(-1)[0])
+        if value is not None and not isinstance(value, str):
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got {_words(value)}.")
+        return value
 
     def fields(self, name: str) -> frozenset[str]:
         value = self._variable(name)
-        return frozenset(getattr(getattr(value, "dtype", None), "names", None) or ())
+        return frozenset(value) if isinstance(value, dict) else frozenset()
 
     def _variable(self, name: str) -> Any:
         if name not in self.shapes:
             return None
         if name not in self._kept:
-            declared = math.prod(self.shapes[name] or ()) * _BYTES_PER_VALUE
-            check_size(declared, self._size, f"{WHAT}: '{name}' {self.shapes[name]}")
-            with _errors_said(self.source):
-                self._kept[name] = self._io.loadmat(str(self.source), variable_names=[name])[name]
+            self._kept[name] = self._file.read(name, WHAT)
         return self._kept[name]
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Other):
+        return value.kind
+    return "a structure" if isinstance(value, dict) else "a text" if isinstance(value, str) else "an array of numbers"
 
 
 def _is_old_mat(source: Path) -> bool:
     with source.open("rb") as file:
-        start = file.read(_HEADER_BYTES)
+        start = file.read(HEADER_BYTES)
     # Version 0x0100, whose bytes tell their order; 7.3 has 0x0200 and is HDF5.
-    return len(start) == _HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")
-
-
-@contextmanager
-def _errors_said(source: Path) -> Iterator[None]:
-    """What scipy has errors of its own for, as StorageError."""
-    from scipy.io.matlab import MatReadError
-
-    try:
-        yield
-    except MatReadError as error:
-        raise StorageError(f"{WHAT}: '{source}' is no MATLAB file, or is damaged: {error}.") from None
-
-
-def _scipy_io() -> Any:
-    try:
-        import scipy.io
-    except ImportError as error:
-        raise StorageError(
-            f"{WHAT}: MATLAB's files before version 7.3 need scipy. Install it with pip install "
-            "'torchtransient[data]', or save the file with MATLAB's option -v7.3."
-        ) from error
-    return scipy.io
+    return len(start) == HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import Gaps, cannot, only_transient, scan_of, tensor_of, time_axis
+from torchtransient.data.captures.gaps import Gaps, cannot, hidden_side, only_transient, scan_of, tensor_of, time_axis
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import new_hdf5
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}
@@ -70,10 +71,10 @@ def _real(contents: Contents, name: str, dims: int | None, gaps: Gaps) -> NDArra
 
 
 def write(target: Path, capture: Capture) -> None:
-    """Write a confocal capture of a grid along x and y on the wall z = 0, hidden side +z.
+    """Write a confocal capture of a grid along x and y on the wall z = 0, hidden side +z, of two bins or more.
 
-    Where the legs do not count, their lengths stand in the offsets. Raises StorageError for other scans; origins are
-    lost (:func:`read` asks for them where they count).
+    Where the legs do not count, their lengths stand in the offsets. Raises StorageError for others; origins are lost
+    (:func:`read` asks for them where they count).
     """
     transient, scan = only_transient(capture, NAME), capture.scan
     points = array_of(scan.sensor_points, WHAT)
@@ -86,11 +87,15 @@ def write(target: Path, capture: Capture) -> None:
         or np.any(y != y[:, :1])
     ):
         raise cannot(NAME, "confocal grids along x and y on the wall z = 0", repr(scan))
+    if hidden_side(scan)[2] <= 0:
+        raise cannot(NAME, "scans whose hidden side is that of +z", "one of -z, of which a mirror image would be read")
     assert capture.axis is not None  # a transient has one
+    if capture.axis.num_bins < 2:
+        raise cannot(NAME, "two bins or more, whose starts say how wide they are", "one")
     legs = scan.first_and_last_leg
     laser, sensor = array_of(scan.laser_legs, WHAT), array_of(scan.sensor_legs, WHAT)
     data = array_of(transient, WHAT).transpose(0, 2, 1)
-    with replacing(target, WHAT) as unfinished, hdf5_package(WHAT).File(unfinished, "w") as file:
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         write_parts(file.create_dataset("data_t", data.shape, data.dtype), data)
         for name, value in {
             "xg": x.T, "yg": y.T, "xa": x[0], "ya": y[:, 0], "da": capture.axis.edges_opl[:-1].numpy(),

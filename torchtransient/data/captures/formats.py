@@ -13,11 +13,12 @@ from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
 from torchtransient.data import capture_file
-from torchtransient.data.array_file import HDF5, check_folder, damage_said, hdf5_package, path_of
+from torchtransient.data.array_file import HDF5, check_folder, damage_said, path_of
 from torchtransient.data.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
 from torchtransient.data.captures.contents import WHAT, Contents, opened
 from torchtransient.data.captures.gaps import Gaps
 from torchtransient.data.hdf5_limits import read_attributes
+from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
@@ -87,7 +88,7 @@ def read_capture(
         Gaps(given, OWN, source).check_all_used()
         return capture_file.read_capture(source)
     with opened(source) as contents:
-        layout = _found(contents) if format is None else next(entry for entry in LAYOUTS if entry.name == format)
+        layout = _found(contents) if format is None else _asked_for(contents, format)
         gaps = Gaps(given, layout.name, source)
         capture = layout.read(contents, gaps)
         gaps.check_all_used()
@@ -141,11 +142,24 @@ def _is_own(source: Path) -> bool:
         return str(read_attributes(file, WHAT, ["format"]).get("format", "")).startswith(OWN)
 
 
+def _asked_for(contents: Contents, name: str) -> Layout:
+    """The layout of a name. Raises StorageError for a file that has another one."""
+    layout = next(entry for entry in LAYOUTS if entry.name == name)
+    others = [entry.name for entry in LAYOUTS if entry.recognises(contents)]
+    if others and not layout.recognises(contents):
+        raise StorageError(
+            f"{WHAT}: expected '{contents.source}' in the layout {name!r}, got one of {others[0]!r} (it holds "
+            f"{', '.join(sorted(contents.shapes))}). Leave format= out, or give format={others[0]!r}."
+        )
+    return layout
+
+
 def _found(contents: Contents) -> Layout:
     for layout in LAYOUTS:
         if layout.recognises(contents):
             return layout
-    names = ", ".join(sorted(contents.shapes)) or "nothing"
+    held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
+    names = ", ".join(sorted(held)) or "nothing"
     raise StorageError(
         f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
         "is one of these; read it with h5py and make a tt.nlos.Capture if it is not."

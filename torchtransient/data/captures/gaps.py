@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
+from torchtransient.data.array_file import array_of
 from torchtransient.data.captures.contents import WHAT
 from torchtransient.errors import StorageError
 from torchtransient.quantities import finite, positive, real_array, shown
@@ -21,6 +22,9 @@ from torchtransient.units import seconds_to_opl
 Numbers = NDArray[Any]
 _NEEDED = object()
 _WHO = ("sensor", "laser")
+# Of coordinates: some steps of single precision.
+_ROUNDING = 1e-6
+_MOST, _MOST_BYTES = 2**63 - 1, 8
 # Torch computes with few of NumPy's unsigned numbers.
 _SIGNED = {np.dtype(np.uint16): np.int32, np.dtype(np.uint32): np.int64, np.dtype(np.uint64): np.int64}
 
@@ -113,14 +117,48 @@ def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
     return place
 
 
-def assumed_in(capture: Capture, name: str) -> bool:
-    """Whether a capture's metadata says that nobody knew this of the file it was read from."""
+def assumed_in(capture: Capture, name: str, value: Any) -> bool:
+    """Whether a capture's metadata says that nobody knew this of the file it was read from, and it still is what was
+    assumed.
+    """
     said = capture.metadata.get("assumed")
-    return isinstance(said, Mapping) and name in said
+    if not isinstance(said, Mapping) or name not in said:
+        return False
+    then, now = real_array(said[name]), real_array(value)
+    return np.array_equal(then, now) if then is not None and now is not None else bool(said[name] == value)
+
+
+def same_points(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Whether points are the same but for the rounding of single precision."""
+    with np.errstate(all="ignore"):  # damaged files
+        return a.shape == b.shape and bool((np.abs(a - b) <= _ROUNDING * np.abs(a).max()).all())
+
+
+def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArray[np.float64]]:
+    """What the metadata of a capture that was read keep of the hidden volume: so many numbers by name, NaN where there
+    is something else. Metadata are anyone's.
+    """
+    said = capture.metadata.get("hidden_volume")
+    found = {name: real_array(said.get(name)) if isinstance(said, Mapping) else None for name in sizes}
+    return {
+        name: np.full(size, np.nan) if (array := found[name]) is None or array.size != size else array.reshape(-1)
+        for name, size in sizes.items()
+    }
+
+
+def hidden_side(scan: Scan) -> NDArray[np.float64]:
+    """The direction (3,) from the wall to its hidden side: the mean normal, or where the sensor stands."""
+    towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
+    mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
+    return mean
 
 
 def tensor_of(array: NDArray[Any]) -> Tensor:
-    """An array that was read as a tensor, on its memory where torch can compute with its numbers."""
+    """An array that was read as a tensor, on its memory where torch can compute with its numbers. Raises StorageError
+    for counts beyond those of int64.
+    """
+    if array.dtype.kind == "u" and array.dtype.itemsize == _MOST_BYTES and array.size and int(array.max()) > _MOST:
+        raise StorageError(f"{WHAT}: expected counts below 2^63, got {int(array.max())}.")
     native = array.astype(array.dtype.newbyteorder("="), copy=False)
     return torch.from_numpy(native.astype(_SIGNED.get(native.dtype, native.dtype), copy=False))
 
@@ -164,11 +202,13 @@ def scan_of(
 
 def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> Tensor:
     """The transient (T, ...) of a capture of one channel. Raises StorageError for what a layout cannot hold: batches,
-    several channels, Stokes components, phasors, lengths that are counted otherwise (``legs``).
+    several channels, Stokes components, phasors, truth values, lengths that are counted otherwise (``legs``).
     """
     if capture.transient is None or capture.phasor is not None or capture.polarized:
         raise cannot(layout, "one transient alone", "phasors or Stokes components")
     one_channel(capture, capture.transient, layout)
+    if capture.transient.dtype == torch.bool:
+        raise cannot(layout, "numbers", "truth values; write them as numbers, transient.to(torch.uint8)")
     if legs is not None and capture.scan.first_and_last_leg != legs:
         words = "with the first and the last leg", "from wall to wall"
         raise cannot(layout, f"lengths {words[0] if legs else words[1]}", f"lengths {words[1] if legs else words[0]}")
@@ -177,7 +217,9 @@ def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> T
 
 
 def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: int = 0) -> None:
-    """Raise StorageError unless a tensor has one channel and no batch."""
+    """Raise StorageError unless a tensor has one channel and no batch, and counts that can be read again."""
+    if tensor.dtype == torch.uint64:
+        tensor_of(array_of(tensor, WHAT))
     dims = before_channel + 2 + len(capture.scan.shape)
     if tensor.ndim != dims or tensor.shape[before_channel] != 1:
         raise cannot(

@@ -29,7 +29,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     """A confocal capture of a list of points ``(-xpos, 0, zpos)``: the wall's point in the frame of the thing, which
     lies on the side of +z. ``metadata``: ``xpos`` and ``zpos`` as they stand in the file.
     """
-    name = "data" if "data" in contents.shapes else next(name for name in _OTHERS if name in contents.shapes)
+    name = "data" if "data" in contents.shapes else next((name for name in _OTHERS if name in contents.shapes), "data")
     data = contents.array(name)
     if data is None or data.ndim != 2 or data.dtype.kind not in "iuf":
         raise gaps.error(f"expected {name} (positions, t), got {None if data is None else data.shape}.")

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import hdf5_package, replacing
+from torchtransient.data.array_file import replacing
 from torchtransient.data.captures.contents import WHAT
+from torchtransient.data.hdf5_writing import new_hdf5
 
 _HEADER = b"MATLAB 7.3 MAT-file, Platform: torchtransient, HDF5 schema 1.00 ."
 _USER_BLOCK = 512
@@ -22,7 +23,7 @@ def write_mat(target: Path, variables: Mapping[str, Any]) -> None:
     MATLAB's. Raises StorageError for a full disk.
     """
     with replacing(target, WHAT) as unfinished:
-        with hdf5_package(WHAT).File(unfinished, "w", userblock_size=_USER_BLOCK) as file:
+        with new_hdf5(unfinished, WHAT, userblock_size=_USER_BLOCK) as file:
             for name, value in variables.items():
                 if isinstance(value, Mapping):
                     group = file.create_group(name)

@@ -18,11 +18,19 @@ from numpy.typing import NDArray
 from torchtransient.capture import Capture
 from torchtransient.data.array_file import array_of
 from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import Gaps, cannot, only_transient, scan_of, tensor_of, time_axis
+from torchtransient.data.captures.gaps import (
+    Gaps,
+    cannot,
+    hidden_volume,
+    only_transient,
+    scan_of,
+    tensor_of,
+    time_axis,
+)
 from torchtransient.data.captures.mat_file import write_mat
 
 NAME = "phasor_field"
-_VOLUME = ("minimalpos", "maximalpos", "sampling_grid_spacing")
+_VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}
 _REQUIRED = {"data", "laserPos", "cameraPos", "deltat"}
 
 
@@ -103,6 +111,8 @@ def write(target: Path, capture: Capture) -> None:
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
     if scan.kind == "confocal":
         raise cannot(NAME, "single captures and all pairs", "a confocal one")
+    if scan.kind == "exhaustive" and scan.sensor_points.numel() == 3:
+        raise cannot(NAME, "pairs with one sensor point as single captures, laser and camera exchanged", "such pairs")
     if scan.sensor_normals is None or scan.laser_normals is None:
         raise cannot(NAME, "normals of all points", "none; give them to Scan.points")
     single = scan.kind == "single"
@@ -117,10 +127,5 @@ def write(target: Path, capture: Capture) -> None:
         dataset[f"{theirs}Pos"] = array_of(getattr(scan, f"{ours}_points"), WHAT).reshape(-1, 3).T
         dataset[f"{theirs}Norm"] = array_of(getattr(scan, f"{ours}_normals"), WHAT).reshape(-1, 3).T
         dataset[f"{theirs}Origin"] = array_of(getattr(scan, f"{ours}_origin"), WHAT).reshape(3, 1)
-    said = capture.metadata.get("hidden_volume")
-    sizes = dict(zip(_VOLUME, (3, 3, 1), strict=True))
-    volume = {
-        name: np.array(said[name] if said and name in said else np.full(size, np.nan)).reshape(-1, 1)
-        for name, size in sizes.items()
-    }
+    volume = {name: array.reshape(-1, 1) for name, array in hidden_volume(capture, _VOLUME).items()}
     write_mat(target, {"dataset": dataset, **volume})

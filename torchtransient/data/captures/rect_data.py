@@ -24,6 +24,7 @@ from torchtransient.data.captures.gaps import (
     cannot,
     flat_scan,
     grid_points,
+    hidden_side,
     only_transient,
     tensor_of,
     time_axis,
@@ -52,15 +53,22 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     name = "rect_data" if "rect_data" in contents.shapes else "meas"
     data = contents.array(name)
     if data is None or data.ndim != 3 or data.dtype.kind not in "iuf":
-        raise gaps.error(f"expected {name} of real numbers on three axes, got {None if data is None else data.shape}.")
+        got = "none" if data is None else f"{data.dtype} of {data.shape}"
+        raise gaps.error(f"expected {name} of real numbers on three axes, got {got}.")
     spad = contents.array("SPAD_index")
     tensor = tensor_of(data)
     tensor = tensor if name == "rect_data" and spad is None else tensor.transpose(1, 2)
     size = tensor.shape[1], tensor.shape[2]
     width, ts = _number(contents, "width", gaps), _number(contents, "ts", gaps)
     spacing = _number(contents, "sampling_spacing", gaps)
-    side = (size[1] * spacing, size[0] * spacing) if spacing is not None else None
-    side = side if width is None else (2 * width, 2 * width)
+    if width is not None and spacing is not None and abs(size[1] * spacing - 2 * width) > 1.01 * spacing:
+        raise gaps.error(
+            f"width says that the scan is {2 * width:g} m wide, sampling_spacing {size[1] * spacing:g} m. Correct one "
+            "of them in the file."
+        )
+    # Where both are there, by a cell apart, each goes with its own layout.
+    side = None if width is None else (2 * width, 2 * width)
+    side = (size[1] * spacing, size[0] * spacing) if spacing is not None and (spad is not None or not side) else side
     points = grid_points(size, gaps.extent(side))
     spot = None if spad is None else points[_index(spad, size, gaps)]
     scan = flat_scan("confocal" if spot is None else "single", points, gaps, spot)
@@ -93,7 +101,8 @@ def write(target: Path, capture: Capture) -> None:
 
     ``ts`` stands beside ``rect_data`` in both. Where the grid lies in space is lost, and the start of the axis must be
     0. Raises StorageError for grids that are not regular and at right angles, for those of confocal captures that are
-    not square, for lengths with the first and last leg.
+    not square, for those that run the other way round (a reflection would be lost), for lengths with the first and last
+    leg.
     """
     transient, scan = only_transient(capture, NAME, legs=False), capture.scan
     points = array_of(scan.sensor_points, WHAT)
@@ -103,6 +112,11 @@ def write(target: Path, capture: Capture) -> None:
     if capture.axis.start_opl != 0:
         raise cannot(NAME, "lengths from 0", f"an axis that starts at {capture.axis.start_opl:g} m")
     dx, dy = _pitches(points)
+    if np.cross(points[0, -1] - points[0, 0], points[-1, 0] - points[0, 0]) @ hidden_side(scan) <= 0:
+        raise cannot(
+            NAME, "grids whose columns, rows and hidden side are x, y and z of a right-handed frame",
+            "one of which a mirror image would be read; turn over its rows, in the points and in the transient",
+        )  # fmt: skip
     data = array_of(transient, WHAT)
     data = data if scan.kind == "confocal" else data.swapaxes(1, 2)
     variables: dict[str, Any] = {"rect_data": data, "ts": opl_to_seconds(capture.axis.bin_width_opl)}

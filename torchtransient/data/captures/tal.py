@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures import tal_scene_info
 from torchtransient.data.captures.contents import WHAT, Contents
 from torchtransient.data.captures.gaps import (
@@ -28,11 +28,13 @@ from torchtransient.data.captures.gaps import (
     cannot,
     frequency_axis,
     one_channel,
+    same_points,
     scan_of,
     tensor_of,
     time_axis,
 )
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.errors import StorageError
 
 NAME = "tal"
@@ -100,23 +102,35 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     tensor = _from_tal(measured, form, polarized)
     if form.frequencies:
         found = tal_scene_info.frequencies(info, own, len(measured), start)
-        settings |= {"transient": None, "axis": None, "phasor": tensor, "frequencies": frequency_axis(gaps, found)}
-        kept |= {"delta_t": width, "t_start": start}
+        axis = frequency_axis(gaps, found)
+        if start is not None and axis.start_opl != start:
+            raise gaps.error(
+                f"t_start says that phases count from {start!r} m, the frequencies from {axis.start_opl!r} m. Give "
+                f"frequencies=FrequencyAxis(..., start_opl={start!r})."
+            )
+        settings |= {"transient": None, "axis": None, "phasor": tensor, "frequencies": axis}
+        kept |= {"delta_t": width}
     else:
         settings |= {"transient": tensor, "axis": time_axis(gaps, start, width, len(measured))}
-    if own is not None:
-        return Capture(**(settings | _of_ours(own, scan)))
-    kept |= {"scene_info_text": text, "volume_format": _volume(contents, gaps)}
     left = sorted(set(contents.shapes) - _KNOWN)
+    if own is not None:
+        return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
+    kept |= {"scene_info_text": text, "volume_format": _volume(contents, gaps)}
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
-def _of_ours(own: Mapping[str, Any], scan: Scan) -> dict[str, Any]:
-    """What this library has written beside, into ``scene_info``."""
-    metadata, steady = own.get("metadata") or {}, own["steady"]
+def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], left: list[str]) -> dict[str, Any]:
+    """What this library has written beside, into ``scene_info``; ``assumed`` and ``left`` where another program has
+    taken something out since, or put something in.
+    """
+    metadata, steady = dict(own.get("metadata") or {}), own["steady"]
     if steady is not None and np.shape(steady)[-len(scan.shape) :] != scan.shape:
         # Another program has cut or thinned the points out since.
-        metadata, steady = {**metadata, "not_read": ["steady"]}, None
+        left, steady = [*left, "steady"], None
+    if assumed:
+        metadata["assumed"] = {**(metadata.get("assumed") or {}), **assumed}
+    if left:
+        metadata["not_read"] = left
     return {
         "scan": replace(scan, wall=own["wall"]), "metadata": metadata, "steady": steady,
         "channels": tuple(own.get("channels") or ()),
@@ -176,8 +190,8 @@ def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) 
     if form.lasers:
         return "exhaustive"
     if sensor.shape == laser.shape:
-        # What y-tal takes for confocal: equal but for the rounding of single precision.
-        if np.allclose(sensor, laser):
+        # Not what y-tal takes for confocal, which depends on where the origin of coordinates is.
+        if same_points(sensor, laser):
             if not np.array_equal(sensor, laser):
                 gaps.assumed["laser_grid_xyz"] = "that of the sensor"
             return "confocal"
@@ -232,7 +246,11 @@ def _number(contents: Contents, name: str, kept: dict[str, Any], gaps: Gaps) -> 
 
 def _flag(contents: Contents, name: str, kept: dict[str, Any]) -> bool | None:
     array = contents.array(name)
-    return None if array is None else bool(array.reshape(-1)[0])
+    if array is None:
+        return None
+    if array.size != 1 or array.dtype.kind not in "biuf" or array.reshape(-1)[0] not in (0, 1):
+        raise StorageError(f"{WHAT}: expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}.")
+    return bool(array.reshape(-1)[0])
 
 
 def _whole(contents: Contents, name: str, gaps: Gaps, missing: int | None = None) -> int:
@@ -266,10 +284,10 @@ def write(target: Path, capture: Capture) -> None:
     formats = {"H_format": (_NUMBERS, form.number)}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
-    if "volume_format" in kept:
+    if kept.get("volume_format") in _VOLUMES.values():
         formats["volume_format"] = (_VOLUMES, kept["volume_format"])
     h5py = hdf5_package(WHAT)
-    with replacing(target, WHAT) as unfinished, h5py.File(unfinished, "w") as file:
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         dtype = np.dtype(kept["dtypes"].get("H", h.dtype))
         write_parts(file.create_dataset("H", h.shape, dtype if _holds(h, dtype) else h.dtype), h)
         for name, (numbers, number) in formats.items():
@@ -290,6 +308,9 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
     one_channel(capture, tensor, NAME, 1 if capture.polarized else 0)
     if scan.kind == "exhaustive" and len(scan.laser_shape) != len(scan.sensor_shape):
         raise cannot(NAME, "grids or lists", f"spots {scan.laser_shape} and sensor points {scan.sensor_shape}")
+    sensor, laser = (array_of(points, WHAT).reshape(-1, 3) for points in (scan.sensor_points, scan.laser_points))
+    if scan.kind == "single" and same_points(sensor, laser):
+        raise cannot(NAME, "scans of one point that lights itself as confocal ones", "a single one; say so")
     dims = {1: "Si", 2: "Sx_Sy"}[len(scan.sensor_shape)]
     lasers = {"Si": "Li_", "Sx_Sy": "Lx_Ly_"}[dims] if scan.kind == "exhaustive" else ""
     name = f"{'F' if tensor.is_complex() else 'T'}_{lasers}{dims}"
@@ -300,18 +321,20 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
 def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[str, NDArray[Any]]:
     scan, dtypes = capture.scan, kept["dtypes"]
     legs = scan.first_and_last_leg
-    arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS) and not legs else {_LEGS: np.bool_(legs)}
+    arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS, legs) else {_LEGS: np.bool_(legs)}
     axis = capture.axis
     start, width = (None, None) if axis is None else (axis.start_opl, axis.bin_width_opl)
     if form.frequencies and capture.axis is None:
         frequencies = capture.frequencies
         assert frequencies is not None  # a phasor has them
-        start, width = kept.get("t_start", frequencies.start_opl), kept.get("delta_t")
-    if not (start == 0 and assumed_in(capture, "start_s")):
+        start, width = frequencies.start_opl, kept.get("delta_t")
+        if dtypes and "t_start" not in dtypes and start == 0:
+            start = None  # as it was read
+    if not assumed_in(capture, "start_s", start):
         arrays["t_start"] = start
     arrays["delta_t"] = width
     for who in ("sensor", "laser"):
-        if not assumed_in(capture, f"{who}_origin"):
+        if legs or not assumed_in(capture, f"{who}_origin", getattr(scan, f"{who}_origin")):
             arrays[f"{who}_xyz"] = getattr(scan, f"{who}_origin")
         for ours, theirs in (("points", "grid_xyz"), ("normals", "grid_normals")):
             points = getattr(scan, f"{who}_{ours}")

@@ -12,7 +12,7 @@ from torchtransient.capture import Capture
 from torchtransient.data.captures.plain_yaml import read_plain_yaml, write_plain_yaml
 from torchtransient.data.plain_data import plain, restored
 from torchtransient.errors import StorageError
-from torchtransient.plugins.films.phasor_grid import transform_bins
+from torchtransient.transform_bins import transform_bins
 
 # Our part of the information: a JSON text, in which numbers keep every digit.
 _OWN = "torchtransient"
@@ -64,7 +64,7 @@ def frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl:
 
 def kept_of(capture: Capture) -> dict[str, Any]:
     """What the metadata of a capture that was read keeps for writing it again: ``dtypes`` by name, and where they are
-    there ``scene_info_text``, ``volume_format``, ``delta_t``, ``t_start``. Whatever else stands there is left out:
+    there ``scene_info_text``, ``volume_format``, ``delta_t``. Whatever else stands there is left out:
     metadata are anyone's.
     """
     given = capture.metadata.get("tal")
@@ -72,7 +72,7 @@ def kept_of(capture: Capture) -> dict[str, Any]:
     dtypes = given.get("dtypes")
     names = dtypes.items() if isinstance(dtypes, Mapping) else ()
     kept: dict[str, Any] = {"dtypes": {name: kind for name, kind in names if _DTYPE.fullmatch(str(kind))}}
-    kinds = {"scene_info_text": str | None, "volume_format": int, "delta_t": float, "t_start": float}
+    kinds = {"scene_info_text": str | None, "volume_format": int, "delta_t": float}
     return kept | {name: given[name] for name, kind in kinds.items() if name in given and isinstance(given[name], kind)}
 
 
@@ -107,8 +107,8 @@ def _kept_frequencies(capture: Capture, kept: Mapping[str, Any], what: str) -> F
         return None
     text = kept.get("scene_info_text")
     info = None if text is None else parsed(text, what)
-    start = kept.get("t_start")
-    return frequencies(info, own_part(info), capture.frequencies.num_frequencies, start)
+    count, start = capture.frequencies.num_frequencies, capture.frequencies.start_opl
+    return frequencies(info, own_part(info), count, start)
 
 
 def _as_json(data: Any) -> Any:

@@ -16,10 +16,22 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, hdf5_package, replacing
+from torchtransient.data.array_file import array_of, replacing
 from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import Gaps, cannot, only_transient, scan_of, tensor_of, time_axis
+from torchtransient.data.captures.gaps import (
+    Gaps,
+    cannot,
+    hidden_volume,
+    only_transient,
+    same_points,
+    scan_of,
+    tensor_of,
+    time_axis,
+)
 from torchtransient.data.captures.mat_file import write_parts
+from torchtransient.data.hdf5_writing import new_hdf5
+from torchtransient.errors import StorageError
+from torchtransient.quantities import shown
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}
@@ -27,6 +39,9 @@ _VOLUME = ("hiddenVolumePosition", "hiddenVolumeRotation", "hiddenVolumeSize")
 # What y-tal tells the axes of pairs by. The first is empty in all files: light of the second is off hidden things.
 _BOUNCES, _OURS = 6, 1
 _CONFOCAL, _PAIRS = 4, 6
+# Files have six; each takes a look, also those that nobody stored.
+_MOST_BOUNCES = 1000
+_INT64 = 2**63
 
 
 def recognises(contents: Contents) -> bool:
@@ -39,6 +54,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
     ``hidden_volume`` of the metadata: position, rotation, size. Single captures are pairs with one spot.
     """
+    missing = sorted(_REQUIRED - set(contents.shapes))
+    if missing:
+        raise gaps.error(f"expected {', '.join(missing)}, got {', '.join(contents.shapes) or 'nothing'}.")
     transient, bounces = _summed(contents, gaps)
     sensor, laser = (_grid(contents, f"{who}GridPositions", gaps) for who in ("camera", "laser"))
     if sensor is None or laser is None:
@@ -47,14 +65,17 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     laser_normals = _grid(contents, "laserGridNormals", gaps, laser)
     sensor_origin = gaps.origin("sensor_origin", contents.array("cameraPosition"), sensor, sensor_normals, True)
     laser_origin = gaps.origin("laser_origin", contents.array("laserPosition"), laser, laser_normals, True)
-    kind = "single" if laser.size == 3 else "confocal" if transient.ndim == _CONFOCAL else "exhaustive"
+    alone = transient.ndim == _CONFOCAL and same_points(sensor, laser)
+    kind = "confocal" if alone else "single" if laser.size == 3 else "exhaustive"
     if kind == "single":
         transient = transient.reshape(*transient.shape[:2], *transient.shape[-2:])
         laser, laser_normals = laser.reshape(3), None if laser_normals is None else laser_normals.reshape(3)
     elif kind == "confocal":
-        if laser.shape != sensor.shape or not np.allclose(laser, sensor):
-            raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
+        if not np.array_equal(sensor, laser):
+            gaps.assumed["laserGridPositions"] = "those of the camera"
         laser, laser_normals = sensor, sensor_normals
+    elif transient.ndim == _CONFOCAL:
+        raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
     scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
     axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltaT", gaps), transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
@@ -62,7 +83,10 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _reversed(contents: Contents) -> bool:
-    return contents.attributes.get("data order") == "row-major"
+    order = contents.attributes.get("data order", "column-major").strip().lower()
+    if order not in ("row-major", "column-major"):
+        raise StorageError(f"{WHAT}: expected 'data order' as row-major or column-major, got {shown(order)}.")
+    return order == "row-major"
 
 
 def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
@@ -73,7 +97,10 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
     colours = len(shape) % 2  # 5 and 7 have them
     backwards = _reversed(contents)
     place = colours + 1
+    low = high = 0
     bounce_axis = len(shape) - 1 - place if backwards else place
+    if shape[bounce_axis] > _MOST_BOUNCES:
+        raise gaps.error(f"expected at most {_MOST_BOUNCES} bounces in data, got {shape[bounce_axis]} of {shape}.")
     total: NDArray[Any] | None = None
     for bounce in range(shape[bounce_axis]):
         part = contents.array("data", (slice(None),) * bounce_axis + (bounce,))
@@ -81,9 +108,16 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
             break
         if part.dtype.kind not in "iuf":
             raise gaps.error(f"expected real numbers in data, got {part.dtype}.")
+        # Counts of a few bits would overflow, and so would half precision.
+        if part.dtype.kind == "f":
+            part = part.astype(np.result_type(part, np.float32), copy=False)
+        else:
+            low, high = low + min(0, int(part.min())), high + max(0, int(part.max()))
+            if low < -_INT64 or high >= _INT64:
+                raise gaps.error("expected counts whose sum over the bounces is below 2^63, got more.")
+            part = part.astype(np.int64)
         if total is None:
-            # Counts of a few bits would overflow.
-            total = part if part.dtype.kind == "f" else part.astype(np.int64)
+            total = part
         else:
             with np.errstate(all="ignore"):
                 total += part
@@ -132,15 +166,16 @@ def write(target: Path, capture: Capture) -> None:
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
     if len(scan.sensor_shape) != 2 or len(scan.laser_shape) == 1:
         raise cannot(NAME, "grids", f"lists of points {scan.sensor_shape}")
+    if scan.kind == "exhaustive" and scan.laser_points.numel() == 3:
+        raise cannot(NAME, "pairs with one spot as single captures", "an exhaustive one; write capture.single((0, 0))")
     if scan.sensor_normals is None or scan.laser_normals is None:
         raise cannot(NAME, "normals of all points", "none; give them to Scan.points")
     if scan.kind == "single":
         transient = transient[:, None, None]
     data = array_of(transient, WHAT)
     data = data.transpose(0, 2, 1) if scan.kind == "confocal" else data.transpose(0, 4, 3, 2, 1)
-    said = capture.metadata.get("hidden_volume")
-    volume = {name: np.array(said[name]) if said and name in said else np.full(3, np.nan) for name in _VOLUME}
-    with replacing(target, WHAT) as unfinished, hdf5_package(WHAT).File(unfinished, "w") as file:
+    volume = hidden_volume(capture, dict.fromkeys(_VOLUME, 3))
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
         shape = (1, len(data), _BOUNCES, *data.shape[1:])
         # A chunk holds one bounce, so that empty ones are never stored.
         chunks = (1, min(64, len(data)), 1, *(min(32, n) for n in data.shape[1:]))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 
 import numpy as np
 
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.properties import whole_number
+from torchtransient.transform_bins import transform_bins
 
 LIST = ("frequencies",)
 GRID = ("frequency_first", "frequency_step", "frequency_count")
@@ -71,28 +71,6 @@ def checked(values) -> np.ndarray:
     if not np.isfinite(values).all():
         raise SceneError(f"phasor_hdr_film: frequencies: expected finite numbers, got {values.tolist()}.")
     return values
-
-
-def transform_bins(wl_mean: float, wl_sigma: float, bins: int, width: float) -> np.ndarray:
-    """The frequencies of a discrete Fourier transform of ``bins`` bins within three sigma of ``1 / wl_mean``.
-
-    The rules of mitransient 1.3, which include the Nyquist frequency with its negative sign for even ``bins``.
-    """
-    for name, value in (("wl_mean", wl_mean), ("wl_sigma", wl_sigma), ("bin_width_opl", width)):
-        if not (math.isfinite(value) and value > 0):
-            raise SceneError(f"phasor_hdr_film: {name} must be a positive length in metres, got {value}.")
-    if bins < 1:
-        raise SceneError(f"phasor_hdr_film: temporal_bins must be at least 1, got {bins}.")
-    window = bins * width
-    mean, sigma = window / wl_mean, window / (6 * wl_sigma)
-    first, last = max(0, math.floor(mean - 3 * sigma)), min(bins // 2, math.ceil(mean + 3 * sigma))
-    if first > last:
-        raise SceneError(
-            f"phasor_hdr_film: wl_mean = {wl_mean} m lies beyond the shortest wavelength of {bins} bins of {width} m, "
-            f"{2 * width} m; use narrower bins or give frequencies."
-        )
-    index = np.arange(first, last + 1)
-    return np.where((index == bins // 2) & (bins % 2 == 0), -index, index) / window
 
 
 def step_of(frequencies: np.ndarray) -> float | None:

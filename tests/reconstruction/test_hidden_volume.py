@@ -1,0 +1,90 @@
+"""Hidden volumes as records: moved, put into batches, taken apart, the same after a file."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.utils import _pytree
+from torch.utils.data import DataLoader
+
+import torchtransient as tt
+from torchtransient.errors import ShapeError
+
+N = tt.nlos
+SCAN = N.Scan.grid(N.Wall.plane(1.0, 1.0), (4, 3), kind="confocal")
+GRID = N.VoxelGrid.before(SCAN, [0.3, 0.4])
+
+
+def volume(seed=0, *, directions=False, times=None):
+    generator = torch.Generator().manual_seed(seed)
+    frames = [] if times is None else [len(times)]
+    vectors = torch.rand(1, 3, *GRID.shape, generator=generator) if directions else None
+    values = torch.rand(1, *frames, *GRID.shape, generator=generator)
+    return N.HiddenVolume(values, GRID, "fk", {"seed": seed}, times, vectors)
+
+
+KINDS = {
+    "values": {}, "directions": {"directions": True}, "a film": {"times": torch.tensor([0.1, 0.2, 0.3])},
+}  # fmt: skip
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@each_kind
+def test_moved_and_detached(kind):
+    one = volume(**KINDS[kind])
+    double = one.to(torch.float64)
+    assert double.values.dtype == torch.float64 and torch.equal(double.values.float(), one.values)
+    assert double != one and double.to(torch.float32) == one and double.grid == GRID
+    assert one.to("meta").values.is_meta
+    if one.times is not None:
+        assert one.to(device="meta", dtype=torch.float64).times is one.times
+    with_gradient = one.map(lambda x: x.clone().requires_grad_())
+    assert with_gradient.values.requires_grad and not with_gradient.detach().values.requires_grad
+    copy = one.clone()
+    assert copy == one and hash(copy) == hash(one) and copy.values.data_ptr() != one.values.data_ptr()
+
+
+@each_kind
+def test_batches(kind):
+    parts = [volume(seed, **KINDS[kind]) for seed in range(3)]
+    stacked, behind = N.HiddenVolume.stack(parts), N.HiddenVolume.cat(parts)
+    assert stacked.values.shape == (3, *parts[0].values.shape) and behind.values.shape[0] == 3
+    assert stacked.metadata == {"batch": [{"seed": seed} for seed in range(3)]}
+    assert torch.equal(stacked.values[1], parts[1].values) and torch.equal(stacked.picture(), parts[0].picture())
+    (loaded,) = DataLoader(parts, batch_size=3)
+    assert loaded == stacked
+    other = N.HiddenVolume(parts[0].values, GRID, "lct", {}, parts[0].times, parts[0].directions)
+    with pytest.raises(ShapeError, match="same method"):
+        N.HiddenVolume.stack([parts[0], other])
+    moved = N.HiddenVolume(parts[0].values, GRID.at_depths([0.3, 0.5]), "fk", {}, parts[0].times, parts[0].directions)
+    with pytest.raises(ShapeError, match="same grid"):
+        N.HiddenVolume.stack([parts[0], moved])
+
+
+def test_films_of_other_times_are_no_batch():
+    a, b = volume(times=torch.tensor([0.1, 0.2])), volume(times=torch.tensor([0.1, 0.3]))
+    assert a != b
+    with pytest.raises(ShapeError, match="same times"):
+        N.HiddenVolume.stack([a, b])
+
+
+@each_kind
+def test_trees_see_the_tensors(kind):
+    one = volume(**KINDS[kind])
+    leaves, spec = _pytree.tree_flatten(one)
+    assert len(leaves) == 1 + (one.directions is not None)
+    assert _pytree.tree_unflatten(leaves, spec) == one
+    doubled = _pytree.tree_map(lambda x: 2 * x, one)
+    assert torch.equal(doubled.values, 2 * one.values) and doubled.metadata == one.metadata
+    total = torch.func.grad(lambda v: v.values.square().sum())(one)
+    torch.testing.assert_close(total.values, 2 * one.values)
+
+
+@each_kind
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+def test_the_same_after_a_file(tmp_path, kind, ending):
+    one = volume(**KINDS[kind])
+    back = N.read_volume(N.write_volume(tmp_path / f"a.{ending}", one))
+    assert back == one and back.metadata == one.metadata
+    assert "HiddenVolume(values=float32" in repr(one) and "method=fk" in repr(one)
+    assert "<table>" in one._repr_html_()

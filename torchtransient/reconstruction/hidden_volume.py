@@ -1,0 +1,65 @@
+"""A hidden volume as a record of tensors: what a method found, where its voxels stand, and how it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from torch import Tensor
+
+from torchtransient.capture.arithmetic import summed
+from torchtransient.reconstruction.volume_checks import check_volume
+from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.tensor_record import TensorRecord
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HiddenVolume(TensorRecord):
+    """What a method found behind a corner.
+
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
+    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
+    data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
+
+    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
+    values and directions; grid and times stay on the CPU, and are the same in a batch. Raises ShapeError where tensors
+    and grid do not fit, UnitError for times that are not finite, StorageError for metadata that is not plain.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    values: Tensor
+    grid: VoxelGrid
+    method: str
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    times: Tensor | None = None
+    directions: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_volume(self)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Values and directions."""
+        return {name: tensor for name, tensor in super().tensors().items() if name != "times"}
+
+    def _settings(self) -> dict[str, Any]:
+        return {**super()._settings(), "times": None if self.times is None else tuple(self.times.tolist())}
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[HiddenVolume]) -> dict[str, Any]:
+        return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
+
+    def _shown(self) -> dict[str, str]:
+        frames = {} if self.times is None else {"times": f"{len(self.times)} of them"}
+        return {**{name: text for name, text in super()._shown().items() if name != "times"}, **frames}
+
+    def picture(self) -> Tensor:
+        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
+        per_item = 4 if self.times is None else 5
+        values = self.values.detach()
+        while values.ndim > per_item:
+            values = values[0]
+        together = summed(values, 0)
+        return together if self.times is None else together.amax(0)
