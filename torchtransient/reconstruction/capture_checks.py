@@ -155,8 +155,8 @@ def telling(scan: Scan) -> list[Any]:
 
 
 def check_from_zero(time_axis: TimeAxis, who: str) -> None:
-    """Raises UnitError for a time axis that begins before zero."""
-    if time_axis.start_opl < 0:
+    """Raises UnitError for a time axis that begins before zero, by more than rounding."""
+    if time_axis.start_opl < -1e-6 * time_axis.bin_width_opl:
         raise UnitError(
             f"{who}: expected a time axis from zero on, got {time_axis}: nothing is before the wall at times before "
             "zero. Leave those bins out, with capture.crop."
