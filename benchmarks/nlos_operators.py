@@ -11,6 +11,8 @@ rows are timed alone. Seconds are CPU seconds of processes with one thread: othe
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import os
 import subprocess
@@ -131,12 +133,24 @@ def positions(size: int, bins: int, peer: Tal | None) -> dict[str, Any]:
 
 
 def memory_case(size: int, bins: int) -> dict[str, float]:
-    """Peak of two captures through f-k and back, in MB beyond the tables, the captures and their gradient."""
+    """Peak of two captures through f-k and back, in MB beyond the tables, the captures and their gradient.
+
+    What the process held before is no part of it: large blocks are mapped one by one and go back when they are freed,
+    since a heap keeps what was freed, now for the operator and now beside it; pages of the captures and of their
+    gradient have been written to, and a small operator has loaded the code.
+    """
+    libc = ctypes.CDLL(None)
+    libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD of glibc; it stays what it is set to
+    scan, axis = setting(8, 64)
+    small = FK(scan, time_axis=axis, floor=0.25)
+    small.reconstruct(torch.rand(2, 64, 8, 8, requires_grad=True)).sum().backward()
     scan, axis = setting(size, bins)
     operator = FK(scan, time_axis=axis, floor=0.25)
     light = torch.rand(2, bins, size, size, requires_grad=True)
-    light.grad = torch.zeros_like(light)
+    light.grad = torch.ones_like(light)  # zeros have no pages yet
     tables = sum(buffer.numel() * buffer.element_size() for buffer in operator.buffers()) / 2**20
+    gc.collect()
+    libc.malloc_trim(0)
     before = resident("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # Linux: the peak begins anew
     operator.reconstruct(light).sum().backward()

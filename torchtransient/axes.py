@@ -78,12 +78,13 @@ class TimeAxis:
     def edges_opl(self) -> Tensor:
         """(T + 1,) float64: the borders of the bins, in metres."""
         # Not a running sum, which would carry its rounding along the axis.
-        return self.start_opl + torch.arange(self.num_bins + 1, dtype=torch.float64) * self.bin_width_opl
+        return self.start_opl + torch.arange(self.num_bins + 1, dtype=torch.float64, device="cpu") * self.bin_width_opl
 
     @property
     def centers_opl(self) -> Tensor:
         """(T,) float64: the middles of the bins, in metres."""
-        return self.start_opl + (torch.arange(self.num_bins, dtype=torch.float64) + 0.5) * self.bin_width_opl
+        middles = torch.arange(self.num_bins, dtype=torch.float64, device="cpu") + 0.5
+        return self.start_opl + middles * self.bin_width_opl
 
     @property
     def edges_s(self) -> Tensor:
@@ -148,7 +149,7 @@ class FrequencyAxis:
     @property
     def per_metre(self) -> Tensor:
         """(F,) float64: cycles per metre of optical path."""
-        return torch.tensor(self.frequencies, dtype=torch.float64)
+        return torch.tensor(self.frequencies, dtype=torch.float64, device="cpu")
 
     @property
     def hertz(self) -> Tensor:

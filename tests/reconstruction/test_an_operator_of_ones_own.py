@@ -57,9 +57,17 @@ def test_it_is_whole():
 
 
 def test_what_is_missing_is_said():
-    bare = TransientOperator(SCAN, time_axis=AXIS, dtype=torch.float32)
+    class Bare(TransientOperator):
+        def map_(self, x):
+            return x
+
+        adjoint_ = map_
+
+    with pytest.raises(TypeError, match="abstract"):
+        TransientOperator(SCAN, time_axis=AXIS, dtype=torch.float32)
+    bare = Bare(SCAN, time_axis=AXIS, dtype=torch.float32)
     assert bare.grid is None and bare.depths is None
-    with pytest.raises(NotImplementedError, match="neither a grid nor points"):
+    with pytest.raises(ShapeError, match="expected a grid, or points"):
         _ = bare.points
     with pytest.raises(NotImplementedError):
         bare.reconstruct(torch.zeros(1))

@@ -204,8 +204,9 @@ def test_what_cannot_be_taken():
         PhasorField(scan, VoxelGrid.bounds([[-1, -1, 0.1], [1, 1, 0.3]], 3), **of)
     with pytest.raises(ShapeError, match="regular, rectangular grid"):
         PhasorField(bent_scan(), grid, **of)
-    with pytest.raises(ShapeError, match="the wall itself"):
-        PhasorField(scan, grid.at_depths([0.0, 0.1]), **of)
+    for depths in ([0.0, 0.1], [-0.2, -0.1, 0.1], [-0.2, -0.1]):
+        with pytest.raises(ShapeError, match="planes before the wall"):
+            PhasorField(scan, grid.at_depths(depths), **of)
     with pytest.raises(UnitError, match="two bins"):
         PhasorField(scan, grid, time_axis=AXIS, pulse=PhasorFilter(0.03))
     for camera in (ConfocalCamera, TransientCamera):
@@ -213,3 +214,15 @@ def test_what_cannot_be_taken():
             camera([])
         with pytest.raises(UnitError, match="finite times"):
             camera([math.inf])
+
+
+def test_planes_that_touch_the_wall_fall_off_as_half_a_bin_does():
+    scan = SCANS["confocal"]
+    grid = VoxelGrid.before(scan, [1e-30, 0.1])
+    axis = TimeAxis(-0.2, 0.02, 48)
+    of = {"time_axis": axis, "falloff": 2.0, "dtype": F64}
+    light = noise(axis.num_bins, *scan.shape)
+    field = PhasorField(scan, grid, pulse=PULSE, **of).reconstruct(light)
+    other = FilteredBackprojection(scan, grid, filter=PULSE, **of).reconstruct(light)
+    assert field.isfinite().all()
+    assert (field - other).norm() < 0.02 * other.norm()

@@ -249,3 +249,11 @@ def test_depths_that_are_none():
                 function(torch.rand(3, 2, 2), depths)
         with pytest.raises(ShapeError, match="expected depths"):
             function(torch.rand(0, 2, 2), [])
+
+
+@pytest.mark.parametrize("level", [-2.0, 0.0])
+def test_normals_where_nothing_is_above_zero_are_the_walls(level):
+    grid = grid_of(UNEVEN)
+    volume = level + torch.rand(*grid.shape, dtype=F64, generator=torch.Generator().manual_seed(0)) * (level < 0)
+    found = normals_from_volume(volume, grid)
+    torch.testing.assert_close(found, -grid.normal[:, None, None].expand_as(found))

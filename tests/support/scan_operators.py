@@ -30,22 +30,24 @@ DEPTHS = (0.1, 0.16, 0.22)
 
 def points_anywhere(count=7, seed=0):
     """Points (N, 3) before the wall."""
-    generator = torch.Generator().manual_seed(seed)
-    low, size = torch.tensor([-0.1, -0.1, 0.06]), torch.tensor([0.2, 0.2, 0.15])
-    return (low + size * torch.rand(count, 3, generator=generator)).double()
+    generator = torch.Generator("cpu").manual_seed(seed)
+    low, size = (torch.tensor(x, device="cpu") for x in ([-0.1, -0.1, 0.06], [0.2, 0.2, 0.15]))
+    return (low + size * torch.rand(count, 3, generator=generator, device="cpu")).double()
 
 
 def bent_scan():
     """Confocal points on a wall that is bent around y."""
-    x, y = torch.meshgrid(torch.linspace(-0.1, 0.1, 4), torch.linspace(-0.1, 0.1, 3), indexing="xy")
+    across, along = (torch.linspace(-0.1, 0.1, n, device="cpu") for n in (4, 3))
+    x, y = torch.meshgrid(across, along, indexing="xy")
     points = torch.stack([x, y, 0.05 * (x / 0.1) ** 2], -1).double()
     return Scan.points(points, kind="confocal", sensor_origin=(0.0, 0.0, 0.5), laser_origin=(0.0, 0.0, 0.5))
 
 
 def listed_scan():
     """Three spots and four sensor points that stand anywhere on the wall."""
-    generator = torch.Generator().manual_seed(1)
-    points = torch.cat([0.2 * torch.rand(7, 2, generator=generator) - 0.1, torch.zeros(7, 1)], 1).double()
+    generator = torch.Generator("cpu").manual_seed(1)
+    points = 0.2 * torch.rand(7, 2, generator=generator, device="cpu") - 0.1
+    points = torch.nn.functional.pad(points, (0, 1)).double()
     return Scan.points(
         points[:4], kind="exhaustive", laser_points=points[4:], sensor_origin=(0.0, 0.0, 0.06),
         laser_origin=(0.05, 0.0, 0.05), first_and_last_leg=True,
@@ -66,7 +68,7 @@ def operators(dtype=torch.float64):
     single, confocal = SCANS["single"], SCANS["confocal"]
     grid = VoxelGrid.before(confocal, DEPTHS)
     larger = VoxelGrid.before(single, DEPTHS, size=(6, 4), extent=(6 * 0.06, 4 * 0.2 / 3))
-    moments = torch.tensor([0.1, 0.16, 0.3, 0.31])
+    moments = torch.tensor([0.1, 0.16, 0.3, 0.31], device="cpu")
     return found | {
         "backprojection, bent wall": Backprojection(bent_scan(), points_anywhere(), **of),
         "backprojection, lists": Backprojection(listed_scan(), points_anywhere(), falloff=2.0, **of),

@@ -45,7 +45,7 @@ def longest(scan: Scan, low: Tensor, high: Tensor) -> float:
     first, last = _legs(scan)
     found = 0.0
     for corner in itertools.product(*zip(low.tolist(), high.tolist(), strict=True)):
-        point = torch.tensor(corner, dtype=torch.float64)
+        point = torch.tensor(corner, dtype=torch.float64, device="cpu")
         to_spot, to_sensor = (torch.linalg.vector_norm(p - point, dim=-1) for p in (laser, sensor))
         found = max(found, _combined(scan, to_spot + first, to_sensor + last, longest=True))
     return found
@@ -57,7 +57,7 @@ def _points(scan: Scan) -> tuple[Tensor, Tensor]:
 
 def _legs(scan: Scan) -> tuple[Tensor, Tensor]:
     if not scan.first_and_last_leg:
-        zero = torch.zeros((), dtype=torch.float64)
+        zero = torch.zeros((), dtype=torch.float64, device="cpu")
         return zero, zero
     return scan.laser_legs.detach().cpu().reshape(-1), scan.sensor_legs.detach().cpu().reshape(-1)
 

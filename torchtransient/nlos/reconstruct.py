@@ -136,7 +136,7 @@ def default_grid(
     if planes is None:
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2))))
     planes = count("reconstruct: planes", planes)
-    middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64) + 0.5) / planes
+    middles = near + (far - near) * (torch.arange(planes, dtype=torch.float64, device="cpu") + 0.5) / planes
     if extent is None and not _spans_area(capture.scan):
         raise SceneError(
             f"reconstruct: the sensor points of this scan lie on one line ({capture.scan!r}), which says not how wide "
@@ -339,4 +339,4 @@ def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | Confoca
     start, stop, number = numbers.tolist()
     frames = count("reconstruct: count of times", number)
     first, last = finite("reconstruct: times", start), finite("reconstruct: times", stop)
-    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64))
+    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64, device="cpu"))

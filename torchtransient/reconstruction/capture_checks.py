@@ -14,9 +14,9 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.quantities import positive, shown, with_article
+from torchtransient.reconstruction.linear import PRECISIONS
 from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
 
-PRECISIONS = (torch.float32, torch.float64)
 # Signal-to-noise ratios that a Wiener filter in single precision tells from none and from infinite ones.
 SNR = (1e-20, 1e20)
 
@@ -144,5 +144,20 @@ def same_light(a: Scan, b: Scan) -> bool:
         return True
     if (a.kind, a.shape, a.first_and_last_leg) != (b.kind, b.shape, b.first_and_last_leg):
         return False
-    names = ["sensor_points", "laser_points"] + ["sensor_origin", "laser_origin"] * a.first_and_last_leg
-    return all(torch.equal(getattr(a, name).detach().cpu(), getattr(b, name).detach().cpu()) for name in names)
+    pairs = zip(telling(a)[2:], telling(b)[2:], strict=True)
+    return all(torch.equal(one.detach().cpu(), other.detach().cpu()) for one, other in pairs)
+
+
+def telling(scan: Scan) -> list[Any]:
+    """What tells a scan's light from that of others: kind, whether legs count, points and, where they do, origins."""
+    names = ["kind", "first_and_last_leg", "sensor_points", "laser_points"]
+    return [getattr(scan, name) for name in names + ["sensor_origin", "laser_origin"] * scan.first_and_last_leg]
+
+
+def check_from_zero(time_axis: TimeAxis, who: str) -> None:
+    """Raises UnitError for a time axis that begins before zero, by more than rounding."""
+    if time_axis.start_opl < -1e-6 * time_axis.bin_width_opl:
+        raise UnitError(
+            f"{who}: expected a time axis from zero on, got {time_axis}: nothing is before the wall at times before "
+            "zero. Leave those bins out, with capture.crop."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import cast
 
 import torch
@@ -90,13 +91,13 @@ class ConeOperator(ConfocalOperator):
             found.append((along_y[:, :, None], along_x[:, None, :] * scale))
         return found
 
+    @abstractmethod
     def components(self, volume: Tensor, matrix: str) -> list[Tensor]:
         """The components (V, Y, X) of a volume, resampled by the matrix "volume" or "volume_inverse"."""
-        raise NotImplementedError
 
+    @abstractmethod
     def volume_of(self, components: list[Tensor], matrix: str) -> Tensor:
         """The adjoint of :meth:`components`."""
-        raise NotImplementedError
 
     def map_(self, x: Tensor) -> Tensor:
         return each(lambda volume: self._model(volume, inverse=False), x, len(self.volume_shape))
@@ -195,7 +196,7 @@ class ConeOperator(ConfocalOperator):
         """Mean of the kernels' power over all frequencies."""
         rows, columns = self.grid.size
         offsets = [
-            torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64) * pitch
+            torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64, device="cpu") * pitch
             for n, pitch in zip(self.grid.size, self.grid.pitch, strict=True)
         ]
         means = [

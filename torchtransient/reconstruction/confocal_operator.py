@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -12,7 +10,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.errors import ShapeError
-from torchtransient.reconstruction.capture_checks import checked_axis, confocal_wall
+from torchtransient.reconstruction.capture_checks import check_from_zero, checked_axis, confocal_wall
 from torchtransient.reconstruction.linear import LinearOperator
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.reconstruction.transient_operator import TransientOperator
@@ -33,12 +31,16 @@ class ConfocalOperator(TransientOperator):
 
     ``scan``: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
     from the spot to the sensor point (``first_and_last_leg=False``). ``time_axis``: of the transients. Voxels stand
-    behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path length.
+    behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path length. Time
+    axes start at zero or later, unless a class says :attr:`early`.
 
-    Raises ShapeError for other scans and axes, UnitError for a dtype other than float32 and float64.
+    Raises ShapeError for other scans and axes, UnitError for time axes that begin before zero and for a
+    dtype other than float32 and float64.
     """
 
     grid: VoxelGrid
+    # Whether bins before time zero are taken: they are where no voxel is.
+    early = False
 
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         who = type(self).__name__
@@ -46,6 +48,8 @@ class ConfocalOperator(TransientOperator):
         bins = checked_axis(time_axis, who).num_bins
         if bins < LEAST_BINS:
             raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
+        if not self.early:
+            check_from_zero(time_axis, who)
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
         self.wall = confocal_wall(self.scan, who)
         self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
@@ -56,6 +60,9 @@ class ConfocalOperator(TransientOperator):
     def depths(self) -> Tensor:
         """(Z,) float64: distances of the planes from the wall, metres. Half bins count: half the middle of each bin."""
         return self.grid.depths
+
+    def _measured(self) -> PlanarScan:
+        return self.wall
 
     def _takes(self, scan: Scan) -> bool:
         return scan is self.scan or self.wall.matches(confocal_wall(scan, type(self).__name__))
@@ -75,6 +82,7 @@ class InverseOperator(LinearOperator):
             setattr(self.operator, name, dict(getattr(operator, name)))
         self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
         self.dtype = operator.dtype
+        self.volume_name, self.data_name = "transient", operator.volume_name
 
     @property
     def axis(self) -> TimeAxis:
@@ -96,7 +104,6 @@ class InverseOperator(LinearOperator):
         """(Z,) float64: distances of their planes from the wall, metres."""
         return self.operator.depths
 
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.dtype = self.operator.dtype
-        return self
+    def extra_repr(self) -> str:
+        taken, found = (" x ".join(map(str, shape)) for shape in (self.volume_shape, self.data_shape))
+        return f"{self.volume_name} of {taken} to {self.data_name} of {found}"

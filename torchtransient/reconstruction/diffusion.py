@@ -78,13 +78,15 @@ class DiffusionDeconvolution(ConfocalOperator):
     of the paper's foam. ``snr``: power of the light over that of the noise where nothing is lost, at frequency zero;
     what the slab takes more than that cannot come back. Light is kept: of all that comes through, however late and far
     aside, the sum is one, and what comes into the record does not depend on its length. The convolutions are linear:
-    nothing wraps around in time or along the slab, between the two crossings either.
+    nothing wraps around in time or along the slab, between the two crossings either. Bins before time zero are taken.
 
     Not supported: slabs apart from the wall, refraction at their far side, light that misses them. Raises ShapeError
     for scans it cannot take, UnitError for quantities out of range.
     """
 
     kernel: Tensor
+    volume_name = data_name = "transient"
+    early = True
 
     def __init__(
         self,
@@ -110,9 +112,9 @@ class DiffusionDeconvolution(ConfocalOperator):
     def tables(self) -> dict[str, Tensor]:
         """``kernel`` (2 T, 2 Y, X + 1, 2): the transform of what the slab makes of one flash, real and imaginary."""
         (bins, rows, columns), width = self.data_shape, self.axis.bin_width_opl
-        light, spread = self._flash(width * torch.arange(bins, dtype=torch.float64))
+        light, spread = self._flash(width * torch.arange(bins, dtype=torch.float64, device="cpu"))
         along = [
-            _gaussians(spread, torch.arange(self._reach(n, pitch, spread), dtype=torch.float64) * pitch)
+            _gaussians(spread, torch.arange(self._reach(n, pitch, spread), dtype=torch.float64, device="cpu") * pitch)
             for n, pitch in zip((rows, columns), self.grid.pitch, strict=True)
         ]
         kernel = _crossed(light, *along, passes=self.passes, size=(rows + 1, columns + 1)).clamp_min_(0)
@@ -123,7 +125,7 @@ class DiffusionDeconvolution(ConfocalOperator):
                 f"{bins * width:.3g} m of optical path. Let the time axis be longer, or the slab thinner."
             )
         # Later light than the record's would come round as early light; displacements are the same to both sides.
-        whole = torch.zeros(2 * bins, 2 * rows, 2 * columns, dtype=torch.float64)
+        whole = torch.zeros(2 * bins, 2 * rows, 2 * columns, dtype=torch.float64, device="cpu")
         whole[:bins, : rows + 1, : columns + 1] = kernel
         whole[:bins, rows + 1 :] = whole[:bins, 1:rows].flip(1)
         whole[..., columns + 1 :] = whole[..., 1:columns].flip(2)
@@ -136,7 +138,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         reduced_scattering, absorption, index, extrapolation = self.properties
         light = slab_transmittance(
             delay,
-            torch.zeros((), dtype=torch.float64),
+            torch.zeros((), dtype=torch.float64, device="cpu"),
             thickness=self.thickness,
             reduced_scattering=reduced_scattering,
             absorption=absorption,
@@ -154,7 +156,8 @@ class DiffusionDeconvolution(ConfocalOperator):
         decay = (absorption + diffusion * (math.pi / (self.thickness + 2 * extrapolation)) ** 2) / index
         # Sums of a smooth function do not depend on fine steps.
         step = max(self.axis.bin_width_opl, 40 / decay / MOST_STEPS)
-        light, spread = self._flash(step * torch.arange(math.ceil(40 / (decay * step)) + 2, dtype=torch.float64))
+        delays = step * torch.arange(math.ceil(40 / (decay * step)) + 2, dtype=torch.float64, device="cpu")
+        light, spread = self._flash(delays)
         for pitch in self.grid.pitch:
             light = light * _sum_of_gaussians(spread, pitch)
         return float(light.sum()) * step / self.axis.bin_width_opl
@@ -237,7 +240,7 @@ def _gaussians(spread: Tensor, at: Tensor) -> Tensor:
 
 def _sum_of_gaussians(spread: Tensor, pitch: float) -> Tensor:
     """The sum of exp(-(k pitch)^2 / spread) over all whole numbers k; wide ones as their integral, right to 1e-16."""
-    k = torch.arange(-NARROW, NARROW + 1, dtype=torch.float64)
+    k = torch.arange(-NARROW, NARROW + 1, dtype=torch.float64, device="cpu")
     wide = spread > (2 * pitch) ** 2
     return torch.where(wide, torch.sqrt(math.pi * spread) / pitch, _gaussians(spread, k * pitch).sum(1))
 
@@ -262,7 +265,7 @@ def _crossed(light: Tensor, along_y: Tensor, along_x: Tensor, *, passes: int, si
 
 def _cosines(count: int) -> tuple[Tensor, Tensor]:
     """Transform (N, N) of an even function of period 2 N - 2 from its values at 0 ... N - 1, and its inverse."""
-    k = torch.arange(count, dtype=torch.float64)
+    k = torch.arange(count, dtype=torch.float64, device="cpu")
     turns = k[:, None] * k / (2 * (count - 1))
     matrix = torch.cos(2 * math.pi * (turns - turns.round())) * 2
     matrix[0], matrix[-1] = matrix[0] / 2, matrix[-1] / 2

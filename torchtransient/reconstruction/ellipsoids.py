@@ -84,8 +84,8 @@ class EllipsoidOperator(ScanOperator):
         middle = sensors.mean(0)
         first, _ = sample_places(self.axis.num_bins, self.samples)
         zero = _BEFORE - first - self.samples / 2 - self.axis.start_opl / width
-        bins = torch.full((len(sensors),), zero, dtype=torch.float64)
-        spots = torch.zeros(len(lasers), dtype=torch.float64)
+        bins = torch.full((len(sensors),), zero, dtype=torch.float64, device="cpu")
+        spots = torch.zeros(len(lasers), dtype=torch.float64, device="cpu")
         if scan.first_and_last_leg:
             bins = bins + scan.sensor_legs.detach().cpu().reshape(-1) / width
             spots = scan.laser_legs.detach().cpu().reshape(-1) / width

@@ -192,7 +192,7 @@ class LaplacianFilter:
     def _kernels(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Gaussian of sum one, and minus its second derivative, of sum zero and second moment -2."""
         reach = max(1, math.ceil(4 * self.sigma))
-        t = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        t = torch.arange(-reach, reach + 1, dtype=torch.float64, device="cpu")
         smooth = torch.exp(-(t**2) / (2 * self.sigma**2))
         smooth = smooth / smooth.sum()
         curved = (1 - (t / self.sigma) ** 2) * smooth

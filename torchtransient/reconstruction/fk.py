@@ -54,7 +54,8 @@ class FK(ConfocalOperator):
     Wall, time and depth are padded to twice their length. Memory: two complex cubes of the wavefield for each call, and
     tables of 4 + 8 taps bytes (float32) for each quarter of a voxel of the padded spectrum. Not supported: scans that
     are not confocal (:class:`MidpointFK`), curved walls, cosines of wall and hidden surfaces. Raises ShapeError for
-    scans that it cannot take, SceneError for an unknown target and other taps, UnitError for a negative floor.
+    scans that it cannot take, SceneError for an unknown target and other taps, UnitError for a negative floor and
+    for time axes that begin before zero.
     """
 
     real_volume = False
@@ -85,9 +86,10 @@ class FK(ConfocalOperator):
         bins, rows, columns = self.data_shape
         width = self.axis.bin_width_opl
         depth = bins * width
-        jz = torch.arange(bins, dtype=torch.float64)
-        ky = torch.arange(rows + 1, dtype=torch.float64)[:, None] * (depth / (2 * rows * self.grid.pitch[0]))
-        kx = torch.arange(columns + 1, dtype=torch.float64)[:, None, None]
+        jz = torch.arange(bins, dtype=torch.float64, device="cpu")
+        ky = torch.arange(rows + 1, dtype=torch.float64, device="cpu")[:, None]
+        ky = ky * (depth / (2 * rows * self.grid.pitch[0]))
+        kx = torch.arange(columns + 1, dtype=torch.float64, device="cpu")[:, None, None]
         kx = kx * (depth / (2 * columns * self.grid.pitch[1]))
         jt = torch.sqrt(jz**2 + ky**2 + kx**2)
         # Waves along the wall (kz = 0) never came from the volume; at the origin the quotient is 0 / 0.
@@ -97,12 +99,12 @@ class FK(ConfocalOperator):
         # Moved into the record where it ends; the window says which bins count. Above the highest frequency there is
         # nothing, and below zero come only waves whose J is 0.
         place = (torch.floor(jt) - (self.taps // 2 - 1)).clamp_(0, bins + 1 - self.taps)
-        weights = torch.empty(columns + 1, self.taps, rows + 1, bins, 2, dtype=torch.float64)
+        weights = torch.empty(columns + 1, self.taps, rows + 1, bins, 2, dtype=torch.float64, device="cpu")
         for tap in range(self.taps):
             j = place + tap
             size, angle = _window(jt - j, self.taps) * jacobian, phase + (math.pi * middle / bins) * j
             weights[:, tap, ..., 0], weights[:, tap, ..., 1] = size * angle.cos(), size * angle.sin()
-        offset = (torch.arange(bins, dtype=torch.float64) - middle) / (2 * bins)
+        offset = (torch.arange(bins, dtype=torch.float64, device="cpu") - middle) / (2 * bins)
         return {"place": place.to(torch.int32), "weights": weights, "taper": 1 / _window_transform(offset, self.taps)}
 
     def adjoint_(self, y: Tensor) -> Tensor:
@@ -116,18 +118,19 @@ class FK(ConfocalOperator):
 
         Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
         """
-        field = self.adjoint(self.wavefield(transient))
-        return field.real.square() + field.imag.square()
+        return self.picture(stabilised_root(self.transients(transient), self.floor))
 
     def wavefield(self, transient: Tensor | Capture) -> Tensor:
         """psi (..., T, Y, X) of a transient: z sqrt(H) of a diffuse target, sqrt(H) of a retroreflective one."""
-        data = self.transients(transient)
-        psi = stabilised_root(data, self.floor)
-        return psi * self._falloff().to(psi) if self.target == "diffuse" else psi
+        return self._falling(stabilised_root(self.transients(transient), self.floor))
 
-    def _falloff(self) -> Tensor:
-        # Nothing comes from behind the wall: bins before zero are noise.
-        return self.depths.clamp_min(0)[:, None, None]
+    def picture(self, root: Tensor) -> Tensor:
+        """The squared modulus of the field that the root of a transient (..., T, Y, X) migrates to."""
+        field = self.adjoint(self._falling(root))
+        return field.real.square() + field.imag.square()
+
+    def _falling(self, root: Tensor) -> Tensor:
+        return root * self.depths.to(root)[:, None, None] if self.target == "diffuse" else root
 
     # ---------------------------------------------------------------------------------------------------- the two maps
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.planar_scan import PlanarScan
 
@@ -39,14 +39,10 @@ class ConeGrid:
 
     @staticmethod
     def of(axis: TimeAxis, grid: PlanarScan, v_bins: int, who: str) -> ConeGrid:
-        """Raises UnitError for times before zero, ShapeError where the cone is far longer than the record."""
-        if axis.start_opl < 0:
-            raise UnitError(
-                f"{who}: expected a time axis from zero on, got {axis}: there is no light cone before zero. "
-                "Crop the capture."
-            )
+        """Of an axis from zero on. Raises ShapeError where the cone is far longer than the record."""
         radii = axis.edges_opl / 2
-        edges = torch.linspace(float(radii[0]) ** 2, float(radii[-1]) ** 2, v_bins + 1, dtype=torch.float64)
+        near, far = float(radii[0]) ** 2, float(radii[-1]) ** 2
+        edges = torch.linspace(near, far, v_bins + 1, dtype=torch.float64, device="cpu")
         length = float(edges[-1] - edges[0])
         reach = sum((n * pitch) ** 2 for n, pitch in zip(grid.size, grid.pitch, strict=True))
         needed = v_bins * (1 + reach / length)
@@ -81,15 +77,16 @@ class ConeGrid:
         A cone that is band-limited alone rings as far as the record is long, and the r^-4 of early bins makes more of
         that than there is light.
         """
-        turn = math.pi / (self.padded // 2) * torch.arange(self.padded // 2 + 1, dtype=torch.float64)
+        turn = math.pi / (self.padded // 2) * torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
         return ((1 + turn.cos()) / 2) ** 2
 
     def kernel_tables(self, count: int, pitch: float, moment: int = 0, *, windowed: bool = False) -> Tensor:
         """Transform (V' / 2 + 1, 2 count, 2) along one side of the wall of q^moment exp(-i w q^2) for every frequency
         w of v, real and imaginary; ``windowed``: times :meth:`window`.
         """
-        w = 2 * math.pi / (self.padded * self.width) * torch.arange(self.padded // 2 + 1, dtype=torch.float64)
-        q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64) * pitch
+        w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
+        w = w * (2 * math.pi / (self.padded * self.width))
+        q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
         size = (q**moment) * (self.window()[:, None] if windowed else 1.0)
         size = size.expand(len(w), -1).clone()
         if moment % 2:

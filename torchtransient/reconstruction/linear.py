@@ -7,14 +7,17 @@ kept for it, so that memory does not grow with what lies between.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import DeviceError, ShapeError
+from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
+
+PRECISIONS = (torch.float32, torch.float64)
 
 
 class _Apply(torch.autograd.Function):
@@ -58,12 +61,13 @@ def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
     return result
 
 
-class LinearOperator(nn.Module):
+class LinearOperator(nn.Module, ABC):
     """A linear map ``A`` from a volume to what a scan measures of it.
 
     ``forward(volume)`` is ``A volume``, ``adjoint(y)`` is ``A^H y``, both differentiable in both modes, any number of
     times, for any leading dimensions (batch, channels), under ``torch.vmap``, and on the device of their tables
-    (``operator.to(device)``). ``volume_shape``, ``data_shape``: the trailing dimensions of the two.
+    (``operator.to(device)``). ``volume_shape``, ``data_shape``: the trailing dimensions of the two;
+    ``volume_name``, ``data_name``: what they are called.
 
     Classes define ``map_(x)`` and ``adjoint_(y)``, which run without autograd, take any leading dimensions, may be
     called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
@@ -71,6 +75,10 @@ class LinearOperator(nn.Module):
     operator's own precision (:attr:`dtype`, real; complex ones have the matching complex type); others are converted,
     half precision to float32 tables as well. ``torch.autocast`` does not reach into them. Leading dimensions may be of
     size zero; then they are not called.
+
+    Tables are buffers. Operators are differentiable by their operands alone: GradientError for tables and parameters of
+    a class that ask for a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
+    it the graph breaks at an operator, whose results are the same.
     """
 
     volume_shape: tuple[int, ...]
@@ -78,12 +86,16 @@ class LinearOperator(nn.Module):
     dtype: torch.dtype
     real_volume = True
     real_data = True
+    volume_name = "volume"
+    data_name = "data"
 
+    @abstractmethod
     def map_(self, x: Tensor) -> Tensor:
-        raise NotImplementedError
+        """``A x``."""
 
+    @abstractmethod
     def adjoint_(self, y: Tensor) -> Tensor:
-        raise NotImplementedError
+        """``A^H y``."""
 
     def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
         if x.numel():
@@ -98,12 +110,12 @@ class LinearOperator(nn.Module):
 
     def forward(self, volume: Tensor) -> Tensor:
         """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
-        volume = self._taken("volume", volume, self.volume_shape, real=self.real_volume)
+        volume = self._taken(self.volume_name, volume, self.volume_shape, real=self.real_volume)
         return _apply(volume, self, False)
 
     def adjoint(self, data: Tensor) -> Tensor:
         """``A^H data``: (..., *data_shape) to (..., *volume_shape). Raises ShapeError, DeviceError."""
-        data = self._taken("data", data, self.data_shape, real=self.real_data)
+        data = self._taken(self.data_name, data, self.data_shape, real=self.real_data)
         return _apply(data, self, True)
 
     def _taken(self, name: str, x: Tensor, shape: tuple[int, ...], *, real: bool) -> Tensor:
@@ -120,7 +132,27 @@ class LinearOperator(nn.Module):
                 f"{who}: expected {name} on {device}, where the operator is, got one on {x.device}. Move one of them "
                 "with .to(device)."
             )
+        asking = [key for key, t in (*self.named_parameters(), *self.named_buffers()) if t.requires_grad]
+        if asking:
+            raise GradientError(
+                f"{who}: expected tables without gradients, got {', '.join(asking)} with requires_grad. Operators are "
+                "differentiable by their operands alone: multiply those, or detach the tables."
+            )
         return x.to(self.dtype.to_complex() if x.is_complex() or not real else self.dtype)
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
+        """Moves and conversions of a module, which :attr:`dtype` follows, whatever tables there are."""
+        dtype = fn(torch.empty((), dtype=self.dtype, device="cpu")).dtype
+        if dtype not in PRECISIONS:
+            raise UnitError(f"{type(self).__name__}: expected dtype torch.float32 or torch.float64, got {dtype}.")
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if dtype != self.dtype:
+            self.dtype = dtype
+            self._converted()
+        return self
+
+    def _converted(self) -> None:
+        """What is to be made anew in another precision."""
 
     @property
     def device(self) -> torch.device | None:
@@ -137,10 +169,11 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     items = x.reshape(-1, *x.shape[x.ndim - dims :])
     first = function(items[0])
     out = first.new_empty(len(items), *first.shape)
-    out[0] = first
+    out[0], shape = first, first.shape
+    del first  # not held beside the next one
     for i in range(1, len(items)):
         out[i] = function(items[i])
-    return out.reshape(*lead, *first.shape)
+    return out.reshape(*lead, *shape)
 
 
 def _words(shape: tuple[int, ...]) -> str:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction.capture_checks import checked_axis, checked_scan, refuse_legs
+from torchtransient.errors import ShapeError
+from torchtransient.reconstruction.capture_checks import check_from_zero, checked_axis, checked_scan, refuse_legs
 from torchtransient.reconstruction.capture_roots import stabilised_root
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.fk import FK
@@ -48,8 +48,8 @@ class Midpoints(TransientOperator):
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
         rows, columns = sensors.size
         spots, points = (sensors.local(p).reshape(-1, 3) for p in (scan.laser_points, scan.sensor_points))
-        pitch = torch.tensor([sensors.pitch[1], sensors.pitch[0], 1.0], dtype=torch.float64)
-        extent = torch.tensor([columns - 1, rows - 1, 0], dtype=torch.float64)
+        pitch = torch.tensor([sensors.pitch[1], sensors.pitch[0], 1.0], dtype=torch.float64, device="cpu")
+        extent = torch.tensor([columns - 1, rows - 1, 0], dtype=torch.float64, device="cpu")
         off = (spots / pitch - (spots / pitch).clamp_min(0).minimum(extent)).abs()
         if float(off[:, 2].max()) > OFF_GRID * min(sensors.pitch) or float(off[:, :2].max()) > 0.5 + OFF_GRID:
             raise ShapeError(
@@ -176,11 +176,7 @@ class MidpointFK(TransientOperator):
         Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
         """
         data = self.transients(transient)
-        psi = self.midpoints.adjoint(stabilised_root(data, self.fk.floor))
-        if self.fk.target == "diffuse":
-            psi = psi * self.grid.depths.to(psi)[:, None, None]
-        field = self.fk.adjoint(psi)
-        return field.real.square() + field.imag.square()
+        return self.fk.picture(self.midpoints.adjoint(stabilised_root(data, self.fk.floor)))
 
 
 def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
@@ -196,6 +192,5 @@ def _sensors(scan: Scan, time_axis: TimeAxis, who: str) -> PlanarScan:
     if checked_scan(scan, who).kind == "confocal":
         raise ShapeError(f"{who}: expected a single or exhaustive scan, got a confocal one. Use FK.")
     refuse_legs(scan, who)
-    if checked_axis(time_axis, who).start_opl < 0:
-        raise UnitError(f"{who}: expected a time axis from zero on, got {time_axis}. Crop the capture.")
+    check_from_zero(checked_axis(time_axis, who), who)
     return PlanarScan.of_scan(scan, who)

@@ -125,17 +125,23 @@ class PhasorField(ScanOperator):
         # Along the axes of the wall, from its first point; the normal of the planes may be the opposite one.
         self.corner = wall.local(grid.first)
         self.heights = self.corner[2] + grid.depths * float(grid.normal @ wall.normal)
-        if float(self.heights.abs().min()) <= 0:
-            raise ShapeError("PhasorField: expected planes before the wall, got one that is the wall itself.")
+        nearest, farthest = float(self.heights.min()), float(self.heights.max())
+        # Where nothing says which side is the hidden one, all may be on either.
+        if not (nearest > 0 or (farthest < 0 and self.scan.sensor_normals is None)):
+            raise ShapeError(
+                f"PhasorField: expected planes before the wall, got some {nearest:.3g} to {farthest:.3g} m before it: "
+                "at the wall, behind it, or on both sides. Let depths be above zero."
+            )
 
     def _leg_lengths(self) -> tuple[Tensor, Tensor]:
         """Of the spots (L,) and the sensor points (S,), zeros where they do not count."""
         if not self.scan.first_and_last_leg:
-            return torch.zeros(len(self.lasers), dtype=torch.float64), torch.zeros(math.prod(self.wall.size)).double()
+            lengths = torch.zeros(len(self.lasers) + math.prod(self.wall.size), dtype=torch.float64, device="cpu")
+            return lengths[: len(self.lasers)], lengths[len(self.lasers) :]
         spots, points = (legs.detach().cpu().reshape(-1) for legs in (self.scan.laser_legs, self.scan.sensor_legs))
-        return (
-            (torch.zeros(1, dtype=torch.float64), points + spots) if self.scan.kind == "confocal" else (spots, points)
-        )
+        if self.scan.kind != "confocal":
+            return spots, points
+        return torch.zeros(1, dtype=torch.float64, device="cpu"), points + spots
 
     def _band(self) -> tuple[Tensor, Tensor]:
         """Frequencies (F,) in cycles per metre and their weights. They are so dense that the field of one record does
@@ -150,7 +156,7 @@ class PhasorField(ScanOperator):
         # Short pulses have frequencies of zero and below.
         first = math.ceil((middle - BAND * spread) * period)
         last = math.floor((middle + BAND * spread) * period)
-        frequencies = torch.arange(first, max(first, last) + 1, dtype=torch.float64) / period
+        frequencies = torch.arange(first, max(first, last) + 1, dtype=torch.float64, device="cpu") / period
         weights = torch.exp(-(((frequencies - middle) / spread) ** 2) / 2) * (self.axis.bin_width_opl / period)
         return frequencies, weights
 
@@ -163,14 +169,14 @@ class PhasorField(ScanOperator):
                 [float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h]
                 for i, j, h in itertools.product((0, columns - 1), (0, rows - 1), self.heights[[0, -1]].tolist())
             ],
-            dtype=torch.float64,
+            dtype=torch.float64, device="cpu",
         )
         edge = [
             [i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0]
             for i in (0, self.wall.size[1] - 1)
             for j in (0, self.wall.size[0] - 1)
         ]
-        sensors = torch.tensor(edge, dtype=torch.float64)
+        sensors = torch.tensor(edge, dtype=torch.float64, device="cpu")
         # Distances are convex: the longest ends at corners. None is shorter than the way along the normal.
         far, near = float(torch.cdist(corners, sensors).max()), float(self.heights.abs().min())
         if self.scan.kind == "confocal":
@@ -190,7 +196,7 @@ class PhasorField(ScanOperator):
         phase = -2 * math.pi * (turns - turns.round())
         weights = self.band_weights[:, None]
         spots, points = self._leg_lengths()
-        times = torch.zeros(1, dtype=torch.float64) if self.camera.times is None else self.camera.times
+        times = torch.zeros(1, dtype=torch.float64, device="cpu") if self.camera.times is None else self.camera.times
         return {
             "dft": torch.cat([weights * phase.cos(), weights * phase.sin()]),
             "legs": phase_pairs(self.frequencies[:, None] * torch.cat([spots, points])),

@@ -42,7 +42,7 @@ class PlanarScan:
         rows, columns = p.shape[:2]
         x, y = (p[0, -1] - p[0, 0]) / (columns - 1), (p[-1, 0] - p[0, 0]) / (rows - 1)
         dx, dy = float(x.norm()), float(y.norm())
-        i, k = (torch.arange(n, dtype=torch.float64)[:, None] for n in (columns, rows))
+        i, k = (torch.arange(n, dtype=torch.float64, device="cpu")[:, None] for n in (columns, rows))
         expected = p[0, 0] + (k * y)[:, None] + (i * x)[None]
         slack = OFF_GRID * min(dx, dy)
         off = float((p - expected).norm(dim=-1).max())
@@ -71,7 +71,7 @@ class PlanarScan:
     @property
     def points(self) -> Tensor:
         """(Y, X, 3) float64 on the CPU: its points in world coordinates, metres."""
-        rows, columns = (torch.arange(n, dtype=torch.float64) for n in self.size)
+        rows, columns = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
         wall = self.first + (rows[:, None, None] * self.pitch[0]) * self.along_y
         return wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
 

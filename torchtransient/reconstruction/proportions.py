@@ -144,7 +144,7 @@ def _legs(scan: Scan | PlanarScan) -> tuple[float, float]:
 
 def _lengths(scan: Scan, points: Tensor, side: str) -> Tensor:
     """(N,) float64: bounds of the way from a lit point to each hidden one and on to a seen one."""
-    total = torch.zeros(len(points), dtype=torch.float64)
+    total = torch.zeros(len(points), dtype=torch.float64, device="cpu")
     for wall in (scan.sensor_points, scan.laser_points):
         low, high = _box(_plain(wall))
         off = torch.maximum(points - high, low - points).clamp_min(0)

@@ -124,7 +124,8 @@ def normals_from_volume(volume: Tensor, grid: VoxelGrid) -> Tensor:
         _slope(volume, -2, grid.pitch[0]),
         torch.gradient(volume, spacing=((z - z[0]).to(volume.dtype),), dim=-3)[0],
     )
-    sums = [(gradient * steps * front).sum(-3) for gradient in gradients]
+    lit = volume.amax(-3) > 0
+    sums = [(gradient * steps * front).sum(-3) * lit for gradient in gradients]
     # The gradient points into the surface.
     return _world(-sums[0], -sums[1], -sums[2], grid)
 

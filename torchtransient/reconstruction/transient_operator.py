@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,8 +20,10 @@ from torchtransient.reconstruction.capture_checks import (
     checked_precision,
     checked_scan,
     same_light,
+    telling,
 )
 from torchtransient.reconstruction.linear import LinearOperator
+from torchtransient.reconstruction.operator_state import check_same, packed, plain, unpacked
 from torchtransient.reconstruction.planar_scan import PlanarScan
 from torchtransient.reconstruction.proportions import check_proportions
 from torchtransient.reconstruction.voxels import VoxelGrid
@@ -31,7 +34,9 @@ class TransientOperator(LinearOperator):
 
     ``scan``: a copy of what was given, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes
     stand on, None for points that stand on none. Tables are built in double precision and kept in ``dtype``;
-    ``operator.double()`` builds them anew.
+    ``operator.double()`` builds them anew. They are made on the CPU, whatever torch's default device is. ``state_dict``
+    holds no tables but what the operator was made from: scan, axis, points and settings, not the precision. Loading
+    the state of another operator raises ShapeError; ``strict=False`` loads what has none.
 
     Classes say :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape`` and
     ``grid`` (without one, they say :attr:`points`), and call ``_set_tables()`` last. Raises ShapeError for what is
@@ -53,7 +58,8 @@ class TransientOperator(LinearOperator):
     def points(self) -> Tensor:
         """(..., 3) float64 on the CPU: where the values of a volume stand in world coordinates, metres."""
         if self.grid is None:
-            raise NotImplementedError(f"{type(self).__name__} has neither a grid nor points of its own.")
+            who = type(self).__name__
+            raise ShapeError(f"{who}: expected a grid, or points of the class itself, got neither. Set its grid.")
         return self.grid.points
 
     @property
@@ -75,19 +81,35 @@ class TransientOperator(LinearOperator):
             # Not part of the state: the arguments make them.
             self.register_buffer(name, kept, persistent=False)
 
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
-        """Moves and conversions of a module. Another precision makes new tables, since converted ones have the digits
-        of the old.
+    def _converted(self) -> None:
+        # Converted tables have the digits of the old ones.
+        self._set_tables(self.device or "cpu")
+
+    def get_extra_state(self) -> Tensor:
+        """What the operator was made from, as bytes: its settings are those arguments of the class that it keeps under
+        their own names, records and tensors among them; of other objects it is their class alone.
         """
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        dtypes = {buffer.dtype for buffer in self.buffers() if buffer.is_floating_point() or buffer.is_complex()}
-        if len(dtypes) == 1 and (dtype := dtypes.pop()) != self.dtype:
-            device = self.device
-            try:
-                self.dtype = checked_precision(dtype, type(self).__name__)
-            finally:
-                self._set_tables(device or "cpu")
-        return self
+        return packed(self._described())
+
+    def set_extra_state(self, state: Any) -> None:
+        """Raises ShapeError for the state of another operator, StorageError for what is none."""
+        who = type(self).__name__
+        check_same(self._described(), unpacked(state, who), who)
+
+    def _described(self) -> dict[str, Any]:
+        # Children have a state of their own.
+        names = inspect.signature(type(self)).parameters.keys() - {"scan", "points", "time_axis", "dtype"}
+        return {
+            "class": type(self).__name__,
+            "time axis": [self.axis.start_opl, self.axis.bin_width_opl, self.axis.num_bins],
+            "scan": plain(self._measured()),
+            "points": plain(self.points if self.grid is None else self.grid),
+            **{name: plain(vars(self)[name]) for name in sorted(names) if name in vars(self)},
+        }
+
+    def _measured(self) -> Any:
+        """What of the scan the operator depends on."""
+        return telling(self.scan) if isinstance(self.scan, Scan) else self.scan
 
     def transients(self, data: Tensor | Capture) -> Tensor:
         """The transient (..., *data_shape) of a tensor or a capture, in the operator's precision.
@@ -110,7 +132,8 @@ class TransientOperator(LinearOperator):
 
     def extra_repr(self) -> str:
         volume = " x ".join(map(str, self.volume_shape))
-        return f"{volume} voxels, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
+        what = "voxels" if self.volume_name == "volume" else "bins and points"
+        return f"{volume} {what}, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
 
 
 def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:

@@ -48,7 +48,7 @@ class VoxelGrid:
                 raise UnitError(f"VoxelGrid: expected {name} of finite numbers, got {plain.tolist()}.")
             object.__setattr__(self, name, torch.from_numpy(plain))
         axes = torch.stack([self.along_x, self.along_y, self.normal])
-        if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64), atol=1e-6):
+        if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64, device="cpu"), atol=1e-6):
             raise ShapeError(
                 f"VoxelGrid: expected along_x, along_y and normal of length one at right angles, got {axes.tolist()}."
             )
@@ -125,9 +125,9 @@ class VoxelGrid:
         dx, dy, dz = (
             positive("VoxelGrid.bounds: a side", (b - a) / n) for a, b, n in zip(low, high, sizes, strict=True)
         )
-        eye = torch.eye(3, dtype=torch.float64)
-        first = torch.stack([low[0] + dx / 2, low[1] + dy / 2, torch.zeros((), dtype=torch.float64)])
-        depths = low[2] + dz * (torch.arange(sizes[2], dtype=torch.float64) + 0.5)
+        eye = torch.eye(3, dtype=torch.float64, device="cpu")
+        first = torch.stack([low[0] + dx / 2, low[1] + dy / 2, torch.zeros((), dtype=torch.float64, device="cpu")])
+        depths = low[2] + dz * (torch.arange(sizes[2], dtype=torch.float64, device="cpu") + 0.5)
         return cls(depths, (sizes[1], sizes[0]), (dy, dx), first, eye[0], eye[1], eye[2])
 
     @property
@@ -138,7 +138,7 @@ class VoxelGrid:
     @property
     def points(self) -> Tensor:
         """(Z, Y, X, 3) float64 on the CPU: the voxels in world coordinates, metres."""
-        j, i = (torch.arange(n, dtype=torch.float64) for n in self.size)
+        j, i = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
         plane = self.first + (j[:, None, None] * self.pitch[0]) * self.along_y
         plane = plane + (i[None, :, None] * self.pitch[1]) * self.along_x
         return plane + self.depths[:, None, None, None] * self.normal

@@ -1,0 +1,249 @@
+"""Operators as modules of torch: states, copies, parameters, precision without tables, default devices."""
+
+import copy
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from support import grid_operators, scan_operators
+from torchtransient.axes import TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
+from torchtransient.reconstruction import (
+    FK,
+    LCT,
+    Backprojection,
+    DiffusionDeconvolution,
+    DirectionalLCT,
+    FilteredBackprojection,
+    LaplacianFilter,
+    LinearOperator,
+    MidpointFK,
+    PhasorField,
+    PhasorFilter,
+    PlanarScan,
+    VoxelGrid,
+)
+from torchtransient.reconstruction.transient_operator import TransientOperator
+
+OPERATORS = grid_operators.operators() | scan_operators.operators()
+every = pytest.mark.parametrize("name", OPERATORS)
+AXIS, CONFOCAL, SINGLE = grid_operators.AXIS, grid_operators.SCAN, grid_operators.SINGLE
+MOVED = Scan.grid(grid_operators.WALL, (5, 6), kind="confocal").detach()
+MOVED = replace(MOVED, sensor_points=MOVED.sensor_points * 1.001, laser_points=MOVED.laser_points * 1.001)
+GRID = VoxelGrid.before(SINGLE, (0.1, 0.2))
+PULSE = PhasorFilter(0.2, 3.0)
+
+
+def fbp(**options):
+    return FilteredBackprojection(SINGLE, GRID, time_axis=AXIS, **{"filter": PULSE, **options})
+
+
+def field(**options):
+    return PhasorField(SINGLE, GRID, time_axis=AXIS, **{"pulse": PULSE, **options})
+
+
+OTHERS = {
+    "axis": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, start_opl=0.12))),
+    "bins": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, num_bins=17))),
+    "scan": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(MOVED, time_axis=AXIS)),
+    "hidden side": (
+        lambda: FK(CONFOCAL, time_axis=AXIS),
+        lambda: FK(PlanarScan.of(CONFOCAL.sensor_points, -CONFOCAL.sensor_normals, who="test"), time_axis=AXIS),
+    ),
+    "class": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: LCT(CONFOCAL, time_axis=AXIS)),
+    "floor": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, floor=0.25)),
+    "target": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, target="retroreflective")),
+    "floor of midpoints": (
+        lambda: MidpointFK(SINGLE, time_axis=AXIS),
+        lambda: MidpointFK(SINGLE, time_axis=AXIS, floor=1.0),
+    ),
+    "snr": (lambda: LCT(CONFOCAL, time_axis=AXIS), lambda: LCT(CONFOCAL, time_axis=AXIS, snr=20)),
+    "inverse": (lambda: LCT(CONFOCAL, time_axis=AXIS).inverse, lambda: LCT(CONFOCAL, time_axis=AXIS, snr=20).inverse),
+    "v_bins": (
+        lambda: DirectionalLCT(CONFOCAL, time_axis=AXIS),
+        lambda: DirectionalLCT(CONFOCAL, time_axis=AXIS, v_bins=20),
+    ),
+    "thickness": (
+        lambda: DiffusionDeconvolution(CONFOCAL, time_axis=AXIS),
+        lambda: DiffusionDeconvolution(CONFOCAL, time_axis=AXIS, thickness=0.02),
+    ),
+    "falloff": (
+        lambda: Backprojection(SINGLE, GRID, time_axis=AXIS),
+        lambda: Backprojection(SINGLE, GRID, time_axis=AXIS, falloff=1.0),
+    ),
+    "points": (
+        lambda: Backprojection(SINGLE, GRID.points, time_axis=AXIS),
+        lambda: Backprojection(SINGLE, GRID.points.flip(0), time_axis=AXIS),
+    ),
+    "depths": (
+        lambda: Backprojection(SINGLE, GRID, time_axis=AXIS),
+        lambda: Backprojection(SINGLE, GRID.at_depths((0.1, 0.21)), time_axis=AXIS),
+    ),
+    "filter": (fbp, lambda: fbp(filter=LaplacianFilter())),
+    "cycles": (fbp, lambda: fbp(filter=PhasorFilter(0.2, 4.0))),
+    "pulse": (field, lambda: field(pulse=PhasorFilter(0.21, 3.0))),
+}  # fmt: skip
+
+
+@every
+def test_states_hold_no_tables_and_load_into_the_same_operator(name):
+    operator = OPERATORS[name]
+    model = nn.Sequential(nn.Linear(2, 2), copy.deepcopy(operator).float())
+    file = io.BytesIO()
+    torch.save(model.state_dict(), file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    assert all(key.endswith("_extra_state") or key.startswith("0.") for key in state)
+    assert sum(tensor.numel() for tensor in state.values()) < 1 << 14
+    # Another precision is the same operator.
+    assert not any(nn.Sequential(nn.Linear(2, 2), copy.deepcopy(operator)).load_state_dict(state))
+    without = {key: value for key, value in state.items() if key.startswith("0.")}
+    missing, unexpected = model.load_state_dict(without, strict=False)
+    assert missing and not unexpected
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_states_of_other_operators_are_refused(name):
+    one, other = (make() for make in OTHERS[name])
+    copy.deepcopy(one).load_state_dict(one.state_dict())
+    for strict in (True, False):
+        # An operator in place of one of another kind may lack children, of which torch says so itself.
+        with pytest.raises(ShapeError, match="expected the state of an operator like this one"):
+            nn.ModuleList([other]).load_state_dict(nn.ModuleList([one]).state_dict(), strict=strict)
+
+
+def test_scans_that_a_file_rounds_are_the_same():
+    scan = CONFOCAL.detach()
+    rounded = {name: getattr(scan, name).float().double() for name in ("sensor_points", "laser_points")}
+    for kind in (FK, LCT, DiffusionDeconvolution):
+        kind(replace(scan, **rounded), time_axis=AXIS).load_state_dict(kind(scan, time_axis=AXIS).state_dict())
+
+
+@pytest.mark.parametrize("state", [None, 3, torch.zeros(3), torch.tensor([255, 3], dtype=torch.uint8), {"a": 1}])
+def test_states_that_are_none(state):
+    with pytest.raises(StorageError, match="expected the state of an operator"):
+        FK(CONFOCAL, time_axis=AXIS).load_state_dict({"_extra_state": state})
+
+
+@every
+def test_replicas_of_data_parallel(name):
+    operator = OPERATORS[name]
+    replica = operator._replicate_for_data_parallel()
+    replica._buffers = {key: None if table is None else table.clone() for key, table in operator._buffers.items()}
+    y = torch.ones(operator.data_shape, dtype=torch.float64)
+    if name.startswith("inverse"):
+        y = y.to(torch.complex128) if not operator.real_data else y
+    torch.testing.assert_close(replica.adjoint(y), operator.adjoint(y), rtol=0, atol=0)
+
+
+# ----------------------------------------------------------------------------------- parameters, operators of one's own
+
+
+class Doubled(TransientOperator):
+    """Twice a transient, without tables; ``weight``: in place of 2."""
+
+    def __init__(self, scan, *, time_axis, weight=2.0, dtype=torch.float32):
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        self.weight = weight
+        self.volume_shape = self.data_shape = (time_axis.num_bins, *scan.shape)
+
+    def map_(self, x):
+        return self.weight * x
+
+    adjoint_ = map_
+
+
+def test_operators_without_tables_have_a_precision():
+    single = Doubled(CONFOCAL, time_axis=AXIS)
+    x = torch.rand(single.volume_shape, dtype=torch.float64)
+    assert single(x).dtype == torch.float32
+    double = single.double()
+    assert double.dtype == torch.float64 and torch.equal(double(x), 2 * x)
+    assert double.to("meta").float().dtype == torch.float32
+    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
+        double.half()
+    assert double.dtype == torch.float32
+    with pytest.raises(ShapeError, match="Set its grid"):
+        double.points  # noqa: B018
+
+
+def test_tables_of_two_precisions_follow():
+    operator = FK(CONFOCAL, time_axis=AXIS)
+    operator.register_buffer("kept", torch.ones(3, dtype=torch.float64))
+    assert operator.double().dtype == torch.float64 and operator.weights.dtype == torch.float64
+
+
+@pytest.mark.parametrize("kind", [nn.Parameter, lambda t: t.requires_grad_()])
+def test_parameters_of_a_class_would_get_no_gradient(kind):
+    operator = Doubled(CONFOCAL, time_axis=AXIS)
+    x = torch.rand(operator.volume_shape)
+    table = kind(torch.ones(()))
+    del operator.weight
+    if isinstance(table, nn.Parameter):
+        operator.weight = table
+    else:
+        operator.register_buffer("weight", table)
+    for function in (operator, operator.adjoint):
+        with pytest.raises(GradientError, match="weight"):
+            function(x)
+    operator.weight.requires_grad_(False)
+    assert torch.equal(operator(x), x)
+
+
+def test_operators_say_both_maps():
+    class Half(LinearOperator):
+        def map_(self, x):
+            return x
+
+    for kind in (LinearOperator, TransientOperator, Half):
+        with pytest.raises(TypeError, match="abstract"):
+            kind()
+
+
+# --------------------------------------------------------------------------------------------------- time zero, devices
+
+
+@pytest.mark.parametrize("target", ["diffuse", "retroreflective"])
+def test_light_before_time_zero_is_refused_alike(target):
+    early = replace(AXIS, start_opl=-0.1)
+    for kind, scan in ((FK, CONFOCAL), (LCT, CONFOCAL), (DirectionalLCT, CONFOCAL), (MidpointFK, SINGLE)):
+        with pytest.raises(UnitError, match=f"{kind.__name__}: expected a time axis from zero on"):
+            kind(scan, time_axis=early, target=target)
+        made = [kind(scan, time_axis=replace(AXIS, start_opl=t), target=target) for t in (0.0, -1e-17)]
+        light = torch.rand(made[0].data_shape)
+        assert made[0].depths[0] > 0
+        torch.testing.assert_close(made[1].reconstruct(light), made[0].reconstruct(light), rtol=1e-4, atol=0)
+    slab = DiffusionDeconvolution(CONFOCAL, time_axis=early)
+    assert slab.reconstruct(torch.rand(slab.data_shape)).isfinite().all()
+
+
+@pytest.mark.parametrize("how", ["default", "with"])
+def test_default_devices_of_torch_do_not_matter(how):
+    def made():
+        found = grid_operators.operators() | scan_operators.operators()
+        wall = torch.zeros(2, 3, device="cpu")
+        box = VoxelGrid.bounds(torch.stack([wall[0], wall[0] + 1]), 3)
+        return found, box.points, [op.adjoint(data[name]) for name, op in found.items()], found["fk"].float().double()
+
+    data = {name: torch.ones(operator.data_shape, dtype=torch.float64) for name, operator in OPERATORS.items()}
+    data = {name: y if OPERATORS[name].real_data else y.to(torch.complex128) for name, y in data.items()}
+    expected = made()
+    if how == "with":
+        with torch.device("meta"):
+            found = made()
+    else:
+        torch.set_default_device("meta")
+        try:
+            found = made()
+        finally:
+            torch.set_default_device(None)
+    torch.testing.assert_close(found[1:3], expected[1:3], rtol=0, atol=0)
+    torch.testing.assert_close(found[3].weights, expected[3].weights, rtol=0, atol=0)
+    capture = Capture(data["fk"][None], AXIS, CONFOCAL)
+    with torch.device("meta"):
+        assert OPERATORS["fk"].reconstruct(capture).device.type == "cpu"
+        assert TimeAxis(0.0, 0.1, 3).centers_opl.device.type == "cpu"
