@@ -37,6 +37,7 @@ def report():
     )
 
 
+@pytest.mark.slow
 def test_every_curve_is_there(report):
     curves = {(quantity, str(choice)) for quantity, choice, _ in report.curves()}
     names = [f"{sampler}, {name}" for sampler in ("independent", "multijitter") for name in ("box", "tent")]

@@ -96,6 +96,7 @@ QUICK_PATHS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "kind"),
     long_pairs([name for name in CASES if name in {case for case, _ in QUICK_PATHS}], KINDS, QUICK_PATHS),

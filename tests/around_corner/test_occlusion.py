@@ -91,6 +91,7 @@ FILMS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["confocal", "single"])
 @pytest.mark.parametrize("name", long(FILMS, ["phasors", "gates"]))
 def test_films(name, kind):

@@ -54,6 +54,7 @@ def test_hidden_geometry_sampling_is_unbiased(hidden, kind):
     agree(guided, brute, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "points"), [("confocal", 4), ("single", 4), ("exhaustive", 3)])
 def test_shared_samples_are_paths(kind, points):
     """Light of three bounces from shared samples, with that of more bounces from paths, is all from paths."""

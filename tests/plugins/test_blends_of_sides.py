@@ -69,6 +69,7 @@ def total(bsdf, spp):
     return np.mean(sums), np.std(sums, ddof=1) / 2
 
 
+@pytest.mark.slow
 def test_values():
     """A weight by which nothing is blended is the same as none: black paint takes away its share."""
     blended, error = total({"type": "blendbsdf", "weight": 0.5, "a": GLASS, "b": matte(0.0)}, 16384)

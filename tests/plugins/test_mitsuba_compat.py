@@ -619,6 +619,7 @@ assert dr.all(dr.isfinite(dr.grad(ray.d)), axis=None)
 """
 
 
+@pytest.mark.slow
 def test_forward_mode_through_a_batch_of_sensors_ends_the_process():
     for batch, ends in ((False, False), (True, True)):
         run = subprocess.run([sys.executable, "-c", BATCH % batch], capture_output=True, text=True, timeout=300)

@@ -84,6 +84,7 @@ def exact_weights(pulses, name, x):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_weights_are_those_of_the_convolution(kernel, name):

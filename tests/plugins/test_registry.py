@@ -106,6 +106,7 @@ def test_no_variant_at_import_and_after():
     assert out == ["None", "TransientPath"]
 
 
+@pytest.mark.slow
 def test_variant_chosen_before_import():
     out = run("""
         import mitsuba as mi

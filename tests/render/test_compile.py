@@ -72,6 +72,7 @@ def test_a_renderer(room_scene, backend):
     assert compiled(seed=5).stats.seeds == (5,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_module_around_a_renderer(room_scene, backend):
     pipeline = Pipeline(tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4))
@@ -103,6 +104,7 @@ def test_what_a_whole_graph_would_need(room_scene):
             torch.compile(module, backend="eager", fullgraph=True)(START if module is not renderer else None)
 
 
+@pytest.mark.slow
 def test_a_render_does_not_import_the_compiler():
     code = (
         "import torchtransient as tt, sys, torch\n"

@@ -75,6 +75,7 @@ def test_batched_cotangents_of_autograd(groups, jacobian):
     close(rows, jacobian)
 
 
+@pytest.mark.slow
 def test_nested_transforms(groups):
     loop = torch.stack([groups(x) for x in XS])
     each = torch.stack([torch.func.jacrev(groups)(x) for x in XS])

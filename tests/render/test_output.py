@@ -76,6 +76,7 @@ class Renders(Dataset):
         return {"out": tt.render(tt.load(make_room(), variant=VARIANT), spp=2, seed=n), "number": n}
 
 
+@pytest.mark.slow
 def test_workers_of_a_data_loader_hand_over_renders():
     loader = DataLoader(Renders(), batch_size=2, num_workers=1, multiprocessing_context="spawn")
     batches = list(loader)

@@ -27,6 +27,7 @@ def run(script: str, *arguments: str) -> str:
     return result.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_fresh_process_gives_the_same_tensor_and_takes_a_pickle(tmp_path, room_scene):
     plain = tt.render(room_scene, spp=16, seed=1).transient
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)

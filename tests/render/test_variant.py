@@ -86,6 +86,7 @@ def test_variant_is_restored_after_an_error(room):
         assert mi.variant() == "llvm_ad_mono"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
 def test_scenes_of_several_variants_side_by_side(variant, room_scene):
     other = tt.TransientRenderer(tt.load(make_room(), variant=variant), parameters=["light.position"], spp=64)
@@ -105,6 +106,7 @@ def test_unusable_variants():
     assert is_differentiable(resolve_variant(None))
 
 
+@pytest.mark.slow
 def test_fork_before_rendering_is_fine_and_after_it_is_refused():
     printed = run("""
         import os, torchtransient as tt

@@ -135,6 +135,7 @@ class Measured(Dataset):
         return self.sensor(x, generator=torch.Generator().manual_seed(i))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_in_a_data_loader(workers):
     data = Measured(chain("straight_through"))

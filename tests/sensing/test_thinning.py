@@ -42,6 +42,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=SLOW)], ids=str)
 @pytest.mark.parametrize("draw", ["thin", "halve"])
 def test_frequencies(draw, dtype):

@@ -30,6 +30,7 @@ def gradients(name, gap, seeds=16, spp=1024):
 damped_gradients = functools.cache(gradients)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SCENES))
 def test_variance_is_bounded(name):
     """Guards against the derivative of a direction by the place of its vertex, which grows as one over the distance."""

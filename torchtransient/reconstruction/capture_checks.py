@@ -159,5 +159,5 @@ def check_from_zero(time_axis: TimeAxis, who: str) -> None:
     if time_axis.start_opl < -1e-6 * time_axis.bin_width_opl:
         raise UnitError(
             f"{who}: expected a time axis from zero on, got {time_axis}: nothing is before the wall at times before "
-            "zero. Leave those bins out, with capture.crop."
+            "zero. Leave those bins out with capture.crop, or say when the first bin begins, in metres of path."
         )
