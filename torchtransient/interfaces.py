@@ -13,6 +13,10 @@ import enum
 from typing import Any, TypeGuard
 
 
+# The jobs of an integrator: a render, its derivative in reverse mode, and along one tangent.
+RENDER, BACKWARD, FORWARD = JOBS = ("render", "backward", "forward")
+
+
 class FilmInterface(abc.ABC):
     """A film that keeps an array behind every pixel beside the steady image.
 
@@ -200,6 +204,14 @@ class FilmInterface(abc.ABC):
         """The storage as (first row, rows, flat array) for each band."""
 
     @abc.abstractmethod
+    def taken(self) -> list[Any]:
+        """The arrays of a finished render, as a list that :meth:`hold` takes; the film has none of them any more."""
+
+    @abc.abstractmethod
+    def hold(self, arrays: list[Any]) -> None:
+        """Take over what :meth:`taken` returned, as if it had been rendered now."""
+
+    @abc.abstractmethod
     def check_one_band(self) -> None:
         """Raise ``StorageError`` when the array does not fit into one tensor."""
 
@@ -269,6 +281,18 @@ class IntegratorInterface(abc.ABC):
     @abc.abstractmethod
     def frozen_state(self, scene: Any, sensor: Any = 0) -> list[Any]:
         """The arrays that kernels of this scene read beside its parameters."""
+
+    @abc.abstractmethod
+    def prepared(
+        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, kind: str = RENDER, grad_in: Any = None
+    ) -> Any:
+        """A job of :data:`JOBS` with all that is looked up and computed beforehand: ``arrays()`` and ``structure()`` that
+        its kernels depend on, ``tables()`` that carry gradients, ``refusal``, ``launches``, ``film``.
+        """
+
+    @abc.abstractmethod
+    def run(self, prepared: Any, evaluate: bool = True, progress: Any = None) -> None:
+        """Carry out a job that is prepared; this alone is recorded."""
 
     @abc.abstractmethod
     def passes(self, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> tuple[list[Any], int]:

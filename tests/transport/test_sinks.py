@@ -31,14 +31,14 @@ def scene_of(kind, depth=5):
 
 
 def traced(scene, sink_of):
-    """The paths of one pass into the sink that ``sink_of(film, rays, job)`` makes: (sink, what it kept)."""
+    """The paths of one pass into the sink that ``sink_of(integrator, contents, film, rays, job)`` makes: (sink, what it kept)."""
     integrator = scene.integrator()
     with dr.suspend_grad():
         sensor, film = integrator.resolve(scene, 0)
         world = integrator.world(scene, integrator.contents(scene, sensor))
         job = integrator.passes(world, sensor, film, SEED, SPP)[0][0]
         rays = integrator.start(scene, world.contents, sensor, film, job)
-        sink = sink_of(integrator, film, rays, job)
+        sink = sink_of(integrator, world.contents, film, rays, job)
         _, kept = walk(world, rays.sampler, dr.detach(rays.ray), integrator.first_opl(film, rays), sink)
         dr.eval(kept)
         return sink, kept
@@ -50,9 +50,9 @@ def test_adjoint_sum_is_the_product_with_the_render(kind):
     _, cube = scene.integrator().render(scene, seed=SEED, spp=SPP)
     weights = np.cos(0.3 * np.arange(int(np.prod(cube.shape)))).astype(np.float32)
 
-    def sink_of(integrator, film, rays, job):
+    def sink_of(integrator, contents, film, rays, job):
         base, _ = integrator.pixel_indices(film, job, rays)
-        match = integrator.channel_match(film, rays)
+        match = integrator.channel_match(contents, film, rays)
         return AdjointSumSink(film.create_adjoint_block((mi.Float(weights), 1, 1), base, [mi.Float(0)], match))
 
     _, kept = traced(scene, sink_of)
@@ -62,8 +62,8 @@ def test_adjoint_sum_is_the_product_with_the_render(kind):
 
 @pytest.mark.parametrize("kind", ["plain", "fog", "glass"])
 def test_depth_of_an_event_is_that_of_the_render_that_has_it(kind):
-    def sink_of(integrator, film, rays, job):
-        match = integrator.channel_match(film, rays)
+    def sink_of(integrator, contents, film, rays, job):
+        match = integrator.channel_match(contents, film, rays)
         return EventListSink(dr.width(rays.row), 32, lambda value: dr.mean(value * match.weight))
 
     sink, _ = traced(scene_of(kind), sink_of)

@@ -25,6 +25,8 @@ class Kept:
     :mod:`.frozen_state`.
     """
 
+    only_remembers = True
+
     __slots__ = ("_anew", "_arrays", "_fixed", "_seen", "_value")
 
     def __init__(self, plugins: list[Any]) -> None:

@@ -68,19 +68,18 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
     """The objects of a kind below a plugin, each once and in order. ``through``: also those inside others found."""
     found: dict[int, Any] = {}
     visited: set[int] = set()
-
-    def enter(above: Any) -> None:
-        for _, value in objects_of(above):
-            if value.ptr in visited:
+    # Not a function that calls itself: it would be a circle of references, and what it has seen would live on.
+    waiting = objects_of(node)[::-1]
+    while waiting:
+        _, value = waiting.pop()
+        if value.ptr in visited:
+            continue
+        visited.add(value.ptr)
+        if isinstance(value, kind):
+            found[value.ptr] = value
+            if not through:
                 continue
-            visited.add(value.ptr)
-            if isinstance(value, kind):
-                found[value.ptr] = value
-                if not through:
-                    continue
-            enter(value)
-
-    enter(node)
+        waiting += objects_of(value)[::-1]
     return list(found.values())
 
 

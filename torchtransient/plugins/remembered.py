@@ -16,6 +16,9 @@ _MOST = 4
 class Remembered:
     """The last few results of each kind: a key has to hold all that its result depends on."""
 
+    # What is kept follows from its keys: recorded calls do not depend on it beside them.
+    only_remembers = True
+
     def __init__(self) -> None:
         self._found: dict[str, dict[bytes, object]] = {}
 

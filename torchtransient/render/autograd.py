@@ -17,8 +17,8 @@ import torch
 
 from torchtransient.errors import GradientError
 from torchtransient.render import engine
-from torchtransient.render.engine import RenderJob
 from torchtransient.render.older_vmap import each_of_older_vmap
+from torchtransient.render.session import RenderJob
 
 
 class OnceDifferentiable(torch.autograd.Function):

@@ -23,7 +23,9 @@ class RenderStats:
     ``seconds`` is wall time, without loading and without the wait for other threads; ``samples_per_second``
     counts camera paths. ``energy_before`` and ``energy_after`` hold, per rendered item, the light outside the time
     axis: sum over pixels of the mean over channels; zero for films without a window (phasors, gates).
-    ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds.
+    ``temporal_filter`` is empty for films without one. ``seeds`` are the items' seeds. ``recorded``: what became of
+    each item's recording, "launched", "recorded", or "traced: " and why; ``derivatives_recorded``: the same of the
+    derivatives that have been asked for since.
     """
 
     spp: int
@@ -35,6 +37,8 @@ class RenderStats:
     seeds: tuple[int, ...]
     energy_before: tuple[float, ...]
     energy_after: tuple[float, ...]
+    recorded: tuple[str, ...] = ()
+    derivatives_recorded: list[str] = field(default_factory=list, compare=False)
 
     @classmethod
     def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
@@ -58,6 +62,8 @@ class RenderStats:
             seeds=tuple(seed for stats in several for seed in stats.seeds),
             energy_before=tuple(energy for stats in several for energy in stats.energy_before),
             energy_after=tuple(energy for stats in several for energy in stats.energy_after),
+            recorded=tuple(said for stats in several for said in stats.recorded),
+            derivatives_recorded=[said for stats in several for said in stats.derivatives_recorded],
         )
 
 

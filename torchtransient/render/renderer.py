@@ -31,7 +31,6 @@ from torchtransient.render.arguments import (
 from torchtransient.render.autograd import Render
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.effects import Effects
-from torchtransient.render.engine import RenderJob
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.layout import steady_channels_first
 from torchtransient.render.opaque import opaque
@@ -42,6 +41,7 @@ from torchtransient.render.progress import Bar
 from torchtransient.render.pulse_properties import checked_pulse
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.seeds import Item, Seeding, drawn
+from torchtransient.render.session import RenderJob
 from torchtransient.render.slope import check_filter, filter_for, has_slope, response_of
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
@@ -91,6 +91,10 @@ class TransientRenderer(nn.Module):
     light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
     ``PhysicsError``; "ignore" does not look.
 
+    ``freeze``: True records what a call launches, so that the calls after it need no tracing; values, gradients and
+    noise are the same with and without. ``out.stats.recorded`` and ``out.stats.derivatives_recorded`` say what became
+    of it, ``docs/design.md`` what makes a new recording.
+
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
     """
@@ -116,6 +120,7 @@ class TransientRenderer(nn.Module):
         steady: bool = True,
         film: FilmChoice | None = None,
         physics: str = "warn",
+        freeze: bool = True,
     ):
         super().__init__()
         film = film_asked_for(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
@@ -135,6 +140,7 @@ class TransientRenderer(nn.Module):
         self.spp, self.spp_grad = samples("spp", spp), samples("spp_grad", spp_grad)
         self.temporal_filter = checked_filter(temporal_filter)
         self.grad_seed = checked_grad_seed(grad_seed)
+        self.freeze = bool(freeze)
         self._watch = PhysicsWatch(physics, self.scene.told)
         self._keys = tuple(parameters)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
@@ -328,6 +334,7 @@ class TransientRenderer(nn.Module):
             temporal_filter=temporal_filter or None,
             watch=self._watch,
             progress=bar,
+            freeze=self.freeze,
         )
         try:
             steady, response = Render.apply(job, per_entry, *tensors)
@@ -386,6 +393,8 @@ class TransientRenderer(nn.Module):
             seeds=tuple(item.seed for item in items),
             energy_before=tuple(energy for run in runs for energy in run.energy_before),
             energy_after=tuple(energy for run in runs for energy in run.energy_after),
+            recorded=tuple(said for run in runs for said in run.recorded),
+            derivatives_recorded=job.derivative_log,
         )
 
     def extra_repr(self) -> str:

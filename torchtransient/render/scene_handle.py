@@ -13,6 +13,7 @@ from torchtransient.render.build import BuildOptions, BuiltScene, build
 from torchtransient.render.description import Description, describe_dict, describe_xml, same_description
 from torchtransient.render.opaque import opaque
 from torchtransient.render.parameters import ParameterTable, SlotTable, parameter_table, unknown_key
+from torchtransient.render.recordings import Recordings
 from torchtransient.render.variant import active_variant, engine_lock, resolve_variant
 
 # Built scenes kept per description: one for every combination of time axis, depth and substituted plugins in use.
@@ -34,6 +35,7 @@ class Scene:
         self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
         # Not in the built scenes: what refers to itself is freed late.
         self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
+        self._recordings: dict[BuildOptions, dict[tuple[str, ...], Recordings]] = {}
         self._table: ParameterTable | None = None
         # Which unphysical things were said already (`render.physics`).
         self.told: set[str] = set()
@@ -82,6 +84,7 @@ class Scene:
         """Forget one built scene; the next use builds it anew."""
         self._builds.pop(options, None)
         self._slots.pop(options, None)
+        self._recordings.pop(options, None)
 
     def options_for(self, keys: Iterable[str], options: BuildOptions) -> BuildOptions:
         """The options under which every one of ``keys`` is an independent, differentiable parameter.
@@ -112,6 +115,10 @@ class Scene:
         if wanted not in tables:
             tables[wanted] = SlotTable(built, wanted)
         return tables[wanted]
+
+    def recordings(self, keys: Iterable[str], options: BuildOptions) -> Recordings:
+        """The recorded calls of the built scene with values for ``keys``."""
+        return self._recordings.setdefault(options, {}).setdefault(tuple(keys), Recordings())
 
     def same_description(self, other: Scene) -> bool:
         """Whether both describe one scene, in whichever variants."""

@@ -73,7 +73,7 @@ class MutualOcclusion:
         """Accumulate into the attached parameters; ``incoming``: the film's adjoint."""
         for job in self.jobs:
             rays = self._start(job)
-            match = self.integrator.channel_match(self.film, rays)
+            match = self.integrator.channel_match(self.world.contents, self.film, rays)
             _, pixel = self.integrator.pixel_indices(self.film, job, rays)
             block = incoming.block(rays, pixel, match)
             with dr.resume_grad():
@@ -90,7 +90,7 @@ class MutualOcclusion:
         film = self.film
         for job in self.jobs:
             rays = self._start(job)
-            match = self.integrator.channel_match(film, rays)
+            match = self.integrator.channel_match(self.world.contents, film, rays)
             base, pixel = self.integrator.pixel_indices(film, job, rays)
             block = film.create_block(job, base, match, 2, tangents=True)
             with dr.resume_grad():

@@ -42,6 +42,8 @@ class TimeResolvedFilm(mi.Film):
     has_window = True
     # Whether ``put`` takes the word that every lane has an array of its own.
     knows_exclusive_lanes = False
+    # Films outside of this library say it of themselves, see :class:`..integrators.base.TransientIntegrator`.
+    can_be_recorded = False
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
     has_slope = True
     pulses = ()
@@ -204,6 +206,15 @@ class TimeResolvedFilm(mi.Film):
     def clear(self):
         self.bands, self.steady, self.outside = [], None, None
 
+    def taken(self):
+        arrays = [self.steady, self.outside, *(band[2] for band in self.bands)]
+        self.clear()
+        return arrays
+
+    def hold(self, arrays):
+        self.steady, self.outside, *stored = arrays
+        self.bands = [(first, rows, flat) for (first, rows), flat in zip(self.band_layout(), stored, strict=True)]
+
     def transient_bands(self):
         return self.bands
 
@@ -243,22 +254,28 @@ class TimeResolvedFilm(mi.Film):
 
     # ----------------------------------------------------------------------------------- pixel sampling
 
+    def tabulate_filter(self):
+        """Make the density that offsets are drawn from, where there is none yet: outside of recorded code."""
+        rfilter = self.rfilter()
+        if rfilter.is_box_filter() or self._offset_distribution is not None:
+            return
+        radius = rfilter.radius()
+        x = dr.linspace(mi.Float, -radius, radius, 513)
+        h = rfilter.eval(x)
+        dr.eval(h)
+        # A floor keeps the density positive wherever the filter is not zero between two nodes.
+        density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
+        fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)
+        self._offset_distribution = (
+            mi.ContinuousDistribution(mi.ScalarVector2f(-radius, radius), density),
+            float((fine.sum() - 0.5 * (fine[0] + fine[-1])) * 2 * radius / (fine.size - 1)),
+        )
+
     def sample_offset(self, sample):
         rfilter = self.rfilter()
         if rfilter.is_box_filter():
             return sample - 0.5, None
-        if self._offset_distribution is None:
-            radius = rfilter.radius()
-            x = dr.linspace(mi.Float, -radius, radius, 513)
-            h = rfilter.eval(x)
-            dr.eval(h)
-            # A floor keeps the density positive wherever the filter is not zero between two nodes.
-            density = dr.maximum(dr.abs(h), 1e-4 * dr.max(dr.abs(h)))
-            fine = np.array(rfilter.eval(dr.linspace(mi.Float, -radius, radius, (1 << 14) + 1)), dtype=np.float64)
-            self._offset_distribution = (
-                mi.ContinuousDistribution(mi.ScalarVector2f(-radius, radius), density),
-                float((fine.sum() - 0.5 * (fine[0] + fine[-1])) * 2 * radius / (fine.size - 1)),
-            )
+        self.tabulate_filter()
         distribution, integral = self._offset_distribution
         x, pdf_x = distribution.sample_pdf(sample.x)
         y, pdf_y = distribution.sample_pdf(sample.y)

@@ -8,12 +8,46 @@ import mitsuba as mi
 from torchtransient.plugins.polarized import FrameRotation, rotate_stokes
 
 
+# Mitsuba's tables of the CIE 1931 observer: nodes, and their range in nanometres.
+_NODES, _FIRST, _LAST = 95, 360.0, 830.0
+
+
+class StandardObserver:
+    """From wavelengths to linear sRGB, as ``mi.spectrum_to_srgb`` does it, off a table of one's own: Mitsuba's is no
+    part of any scene, so that a recorded call could not read it.
+    """
+
+    def __init__(self) -> None:
+        nodes = mi.UnpolarizedSpectrum(dr.linspace(mi.Float, _FIRST, _LAST, _NODES))
+        unit = mi.UnpolarizedSpectrum(0)
+        unit[0] = 1
+        self._tables = [mi.Float(curve) for curve in mi.spectrum_to_srgb(unit, nodes)]
+        dr.make_opaque(self._tables)
+
+    @staticmethod
+    def of_variant() -> StandardObserver | None:
+        """The observer in variants with wavelengths, None in others."""
+        return StandardObserver() if mi.is_spectral else None
+
+    def matrix(self, wavelengths) -> list:
+        """Per wavelength of a ray the share of each channel."""
+        return [self._shares(wavelengths[k]) for k in range(len(wavelengths))]
+
+    def _shares(self, wavelength):
+        inside = (wavelength >= _FIRST) & (wavelength <= _LAST)
+        x = (wavelength - _FIRST) * ((_NODES - 1) / (_LAST - _FIRST))
+        i = dr.clip(mi.UInt32(x), 0, _NODES - 2)
+        b = x - mi.Float(i)
+        ends = [[dr.gather(mi.Float, table, i + k, inside) for k in (0, 1)] for table in self._tables]
+        return [dr.select(inside, dr.fma(1 - b, low, b * high), 0) for low, high in ends]
+
+
 class ChannelMatch:
     """Linear map from a sample's spectrum to the film's channels, weight of the primary ray included.
 
-    Monochromatic and RGB variants copy the channels; spectral variants integrate against the CIE curves at the ray's
-    own wavelengths, or against the film's response curves (see :mod:`.response`), whose weights are evaluated once per
-    ray instead of once per event.
+    Monochromatic and RGB variants copy the channels; spectral variants integrate against ``response`` at the ray's own
+    wavelengths, once per ray instead of once per event: the film's response curves (:mod:`.response`), or the
+    :class:`StandardObserver`.
 
     In polarized variants a sample is a Stokes vector in the frame of its ray, and the channels are those of S0, S1, S2,
     S3 one after the other, in the frame of the sensor that ``rotation`` leads to.
@@ -25,13 +59,6 @@ class ChannelMatch:
         self.matrix = None
         if response is not None:
             self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
-        elif mi.is_spectral:
-            self.matrix = []
-            for k in range(len(wavelengths)):
-                unit = mi.UnpolarizedSpectrum(0)
-                unit[k] = 1
-                rgb = mi.spectrum_to_srgb(unit, wavelengths)
-                self.matrix.append([rgb[c] * self.weight[k] for c in range(3)])
 
     def to_channels(self, value) -> list:
         """Channel values (list of Float) of what an event contributes."""

@@ -91,6 +91,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "transient_hdr_film"
+    can_be_recorded = True
     knows_exclusive_lanes = True
     measures = "transient"
 

@@ -7,25 +7,24 @@ import mitsuba as mi
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
-from torchtransient.interfaces import IntegratorInterface, is_time_resolved
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
 from torchtransient.plugins.frozen_state import arrays_below
+from torchtransient.plugins.integrators.derivative_passes import backward, forward
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
-from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of
-from torchtransient.plugins.integrators.primary_carry import objective_of, tangent_of
+from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of, seed_array
+from torchtransient.plugins.integrators.prepared import Prepared
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.sensors.origin import PrimaryRays, index_at_sensor, sample_rays, views
 from torchtransient.plugins.sensors.stokes_frame import sensor_rotation
 from torchtransient.plugins.transport.contents import SceneContents
-from torchtransient.plugins.transport.derivative.forward import forward, propagate_tangents
-from torchtransient.plugins.transport.derivative.reverse import reverse
+from torchtransient.plugins.transport.derivative.forward import propagate_tangents
 from torchtransient.plugins.transport.derivative.wanted import Wanted
 from torchtransient.plugins.transport.sinks.film import FilmSink
-from torchtransient.plugins.transport.sinks.record import RecordSink
 from torchtransient.plugins.transport.walk import walk
 from torchtransient.plugins.transport.world import PathSettings, World
 
@@ -66,6 +65,9 @@ class TransientIntegrator(mi.CppADIntegrator):
     # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
+    # Plugins outside of this library say it of themselves: what they compute of numbers that are no arrays, or read of
+    # arrays, would be that of the first call for ever.
+    can_be_recorded = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -194,11 +196,12 @@ class TransientIntegrator(mi.CppADIntegrator):
         """(offset of a sample from its pixel's centre, weight or None for one)."""
         return film.sample_offset(sampler.next_2d())
 
-    def channel_match(self, film, rays):
+    def channel_match(self, contents, film, rays):
         """The map from samples of the primary rays to the film's channels, detached."""
         ray = dr.detach(rays.ray)
         rotation = sensor_rotation(rays.seen, ray) if mi.is_polarized else None
-        return ChannelMatch(ray.wavelengths, dr.detach(rays.weight) * rays.scale, film.curves, rotation)
+        weight = dr.detach(rays.weight) * rays.scale
+        return ChannelMatch(ray.wavelengths, weight, film.curves or contents.observer, rotation)
 
     def pixel_indices(self, film, job, rays):
         """Index of a pixel's first entry in its band, and of the pixel in the film."""
@@ -222,12 +225,61 @@ class TransientIntegrator(mi.CppADIntegrator):
         """
         return []
 
-    def _walk(self, world, film, rays, sink):
+    def walk(self, world, film, rays, sink):
+        """Trace the paths of primary rays into a sink: (number of vertices, what it kept)."""
         ray, η = dr.detach(rays.ray), dr.detach(rays.η)
         world.start(rays)
         return walk(world, rays.sampler, ray, self.first_opl(film, rays), sink, η, rays.leg)
 
     # ----------------------------------------------------------------------------------- entry points
+
+    @no_collection()
+    def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
+        """A :class:`.prepared.Prepared` job of :data:`~torchtransient.interfaces.JOBS` with all that is looked up,
+        checked and computed once; arguments and errors as in :meth:`render`, :meth:`render_backward` and
+        :meth:`render_forward`.
+        """
+        with dr.suspend_grad():
+            sensor, film = self.resolve(scene, sensor)
+            contents, wanted = self.contents(scene, sensor), None
+            if kind == RENDER:
+                self._seen_scene(scene).follow_derivatives(scene, False)
+                contents = self.contents(scene, sensor)
+            else:
+                contents, wanted = self._wanted(scene, sensor, film)
+            world = self.world(scene, contents, wanted, film.arrivals())
+            launches, samples = self.passes(world, sensor, film, seed, int(spp))
+            film.tabulate_filter()
+            job = Prepared(kind, self, scene, sensor, film, world, launches, seed_array(seed), samples)
+            job.plugins = self._seen_scene(scene).python_plugins(scene)
+            if wanted is not None:
+                job.beside = self.beside(world, sensor, film, seed, samples)
+            if kind == BACKWARD:
+                job.incoming = IncomingAdjoint(film, *grad_in)
+            if kind == FORWARD:
+                with dr.resume_grad():
+                    propagate_tangents(self.parameters(scene), job.tables())
+            job.refusal = self.refusal_of(job)
+            return job
+
+    def refusal_of(self, job) -> str | None:
+        """Why ``dr.freeze`` cannot record a job, None where it can."""
+        for plugin in (self, job.film):
+            # Of the class itself: one made out of it may do otherwise.
+            if not vars(type(plugin)).get("can_be_recorded", False):
+                return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
+        return "derivatives beside paths read numbers of the scene" if job.beside else None
+
+    @no_collection()
+    def run(self, prepared, evaluate=True, progress=None):
+        """Carry out a job that is :meth:`prepared`: a render or a tangent stays in the film, gradients arrive at the
+        parameters of the scene and at the tables of the job. What ``dr.freeze`` records is this alone.
+        """
+        with dr.suspend_grad():
+            if prepared.kind == RENDER:
+                self._render(prepared, evaluate, progress)
+            else:
+                (backward if prepared.kind == BACKWARD else forward)(prepared)
 
     @no_collection()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, progress_callback=None):
@@ -237,16 +289,17 @@ class TransientIntegrator(mi.CppADIntegrator):
         result stays in the film.
         """
         with dr.suspend_grad():
-            sensor, film = self.resolve(scene, sensor)
-            self._seen_scene(scene).follow_derivatives(scene, False)
             if develop:
-                film.check_one_band()
-            world = self.world(scene, self.contents(scene, sensor), window=film.arrivals())
-            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
-            film.prepare(self.aov_names(), samples)
-            self.add_light(world, sensor, film, Job(jobs, seed, samples, evaluate, progress_callback))
-            film.finish_render()
-            return film.develop() if develop else None
+                self.resolve(scene, sensor)[1].check_one_band()
+            job = self.prepared(scene, sensor, seed, spp)
+            self.run(job, evaluate, progress_callback)
+            return job.film.develop() if develop else None
+
+    def _render(self, job, evaluate, progress):
+        job.film.prepare(self.aov_names(), job.samples)
+        launches = Job(job.launches, job.seed, job.samples, evaluate, progress)
+        self.add_light(job.world, job.sensor, job.film, launches)
+        job.film.finish_render()
 
     def add_light(self, world, sensor, film, job):
         """Bring all light to a film that is prepared; ``job``: a :class:`.launch.Job`."""
@@ -260,10 +313,10 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def _render_pass(self, world, sensor, film, job):
         rays = self.start(world.scene, world.contents, sensor, film, job)
-        match = self.channel_match(film, rays)
+        match = self.channel_match(world.contents, film, rays)
         base, pixel = self.pixel_indices(film, job, rays)
         block = film.create_block(job, base, match, world.most_events())
-        _, kept = self._walk(world, film, rays, FilmSink(block))
+        _, kept = self.walk(world, film, rays, FilmSink(block))
         film.add_steady(pixel, match.to_channels(kept["L"]))
         film.add_outside(pixel, kept["before"], kept["after"])
         block.finish()
@@ -279,24 +332,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         Raises GradientError when a path length can change and the temporal filter has no slope, or without a bound on
         the depth.
         """
-        with dr.suspend_grad():
-            sensor, film = self.resolve(scene, sensor)
-            contents, wanted = self._wanted(scene, sensor, film)
-            g_steady, g_transient = grad_in
-            if g_steady is None and g_transient is None:
-                return
-            world = self.world(scene, contents, wanted, film.arrivals())
-            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
-            incoming = IncomingAdjoint(film, g_steady, g_transient)
-            beside = self.beside(world, sensor, film, seed, samples)
-            # Derivatives wait at the parameters until all passes are done: following the graph further uses up its
-            # edges, and the first pass would be the only one to arrive.
-            with dr.isolate_grad(), contents.hidden_from_mitsuba():
-                for job in jobs if world.walks else ():
-                    self._backward_pass(world, sensor, film, job, incoming)
-                    dr.eval()
-                for part in beside:
-                    part.backward(incoming)
+        job = self.prepared(scene, sensor, seed, spp, BACKWARD, grad_in)
+        if grad_in[0] is not None or grad_in[1] is not None:
+            self.run(job)
 
     def _wanted(self, scene, sensor, film):
         """(contents, which derivatives are asked for). Raises GradientError where the film or the depth has none."""
@@ -321,24 +359,6 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         return contents, Wanted(effects, sensor, contents)
 
-    def _record(self, world, film, rays):
-        """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
-        sink = RecordSink()
-        count, store = self._walk(world, film, rays, sink)
-        return sink.layout, store, count
-
-    def _backward_pass(self, world, sensor, film, job, incoming):
-        rays = self.start(world.scene, world.contents, sensor, film, job)
-        match = self.channel_match(film, rays)
-        _, pixel = self.pixel_indices(film, job, rays)
-        block = incoming.block(rays, pixel, match)
-        adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
-        with dr.resume_grad():
-            if world.wanted.sensor or dr.grad_enabled(rays.η):
-                # What carries a sensor may move without its rays: they go to points that are given.
-                flags = dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-                dr.backward_from(objective_of(world, rays, adjoint), flags)
-
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Derivatives (steady ``(H, W, C)``, transient) along the tangents set on the scene's attached parameters.
@@ -350,33 +370,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         :meth:`render_backward`.
         """
         with dr.suspend_grad():
-            sensor, film = self.resolve(scene, sensor)
-            contents, wanted = self._wanted(scene, sensor, film)
-            world = self.world(scene, contents, wanted, film.arrivals())
-            jobs, samples = self.passes(world, sensor, film, seed, int(spp))
-            beside = self.beside(world, sensor, film, seed, samples)
-            with dr.resume_grad():
-                tables = [table for part in beside for table in part.tables()]
-                propagate_tangents(self.parameters(scene), world.tables() + tables)
-            film.prepare(self.aov_names(), samples)
-            with contents.hidden_from_mitsuba():
-                for job in jobs if world.walks else ():
-                    self._forward_pass(world, sensor, film, job)
-                    dr.eval(film.bands[job.band][2], film.steady)
-                for part in beside:
-                    part.forward()
-            film.finish_render()
-            return film.develop() if develop else None
-
-    def _forward_pass(self, world, sensor, film, job):
-        rays = self.start(world.scene, world.contents, sensor, film, job)
-        match = self.channel_match(film, rays)
-        base, pixel = self.pixel_indices(film, job, rays)
-        block = film.create_block(job, base, match, world.most_events(), tangents=True)
-        tangent = tangent_of(world, rays)
-        dL = forward(world, *self._record(world, film, rays), block, dr.detach(rays.ray), tangent)
-        film.add_steady(pixel, match.to_channels(dL))
-        block.finish()
+            job = self.prepared(scene, sensor, seed, spp, FORWARD)
+            self.run(job)
+            return job.film.develop() if develop else None
 
     def to_string(self):
         return (

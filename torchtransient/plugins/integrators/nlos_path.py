@@ -102,6 +102,7 @@ class TransientNLOSPath(base.TransientIntegrator):
     (as that of point lights elsewhere).
     """
 
+    can_be_recorded = True
     walks_through_media = True
     scans_exhaustively = True
 
@@ -268,6 +269,11 @@ class TransientNLOSPath(base.TransientIntegrator):
             parts.append(lambda run: follow_paths(world, sensor, film, run))
         for i, part in enumerate(parts):
             part(replace(job, progress=_share_of(job.progress, i, len(parts))))
+
+    def refusal_of(self, job: Any) -> str | None:
+        if job.world.wanted is None and (job.world.division.third_bounce or job.world.division.chained):
+            return "samples that a scan shares are drawn by reading numbers of the scene"
+        return super().refusal_of(job)
 
     def strategies(self, contents: Any, table: ScanTable) -> Any:
         guides = self._guides(contents, table)

@@ -26,6 +26,8 @@ class TransientPath(TransientIntegrator):
     Not supported: participating media (``SceneError``).
     """
 
+    can_be_recorded = True
+
     def strategies(self, contents):
         return Vacuum(), Surface(), [EmitterFound(), EmitterSampled()]
 

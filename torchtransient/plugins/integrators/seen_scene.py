@@ -23,6 +23,9 @@ class SeenScene:
     freed.
     """
 
+    # What recorded calls depend on of it is in their worlds.
+    only_remembers = True
+
     def __init__(self, scene: Any, integrator: Any) -> None:
         self._described = described(scene, integrator)
         check_scene(scene, known=self._described)
@@ -37,6 +40,7 @@ class SeenScene:
         self._followers: list[Any] = []
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
+        self._python: list[Any] | None = None
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
@@ -66,6 +70,15 @@ class SeenScene:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
+    def python_plugins(self, scene: Any) -> list[Any]:
+        """The plugins of the scene that are written in Python, sensors and integrator included."""
+        self._forget_replaced(scene)
+        if self._python is None:
+            held = [*objects_below(scene, mi.Object), scene.integrator()]
+            written = {one.ptr: one for one in held if one is not None and type(one).__module__ != "mitsuba"}
+            self._python = list(written.values())
+        return self._python
+
     def _forget_replaced(self, scene: Any) -> None:
         """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""
         bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in [*scene.shapes(), *self._in_groups]) if bsdf is not None]
@@ -79,5 +92,5 @@ class SeenScene:
         # Changed parameters may add a lobe, which those around a BSDF do not tell of.
         lobes = [bsdf.flags() for bsdf in self._bsdfs]
         if pointers != self._pointers or lobes != self._lobes:
-            self._pointers, self._lobes, self._tracker = pointers, lobes, None
+            self._pointers, self._lobes, self._tracker, self._python = pointers, lobes, None, None
             self._contents.clear()

@@ -11,6 +11,7 @@ import mitsuba as mi
 from torchtransient.plugins.bsdfs.delay_table import delays_of
 from torchtransient.plugins.bsdfs.inherited import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
+from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.mitsuba_compat import has_smooth_shape, has_vertices, is_flat, lacks_directions
 from torchtransient.plugins.mixtures import mixtures_of
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, shapes_of_scene
@@ -47,7 +48,8 @@ class SceneContents:
 
     ``damping_radius`` (Float): see :func:`.scattering.geometry_terms.damped_motion`. ``patterned_lights``: what leaves
     some surface differs from place to place. ``patterned``: that, or how a surface scatters does, or its normal.
-    ``untraceable``: names of the emitters that derivatives cannot be traced beside.
+    ``untraceable``: names of the emitters that derivatives cannot be traced beside. ``observer``: the
+    :class:`~..films.colour.StandardObserver` in spectral variants.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -76,6 +78,7 @@ class SceneContents:
         self.patterned = self.patterned_lights or not all(is_flat(shape) for shape in scene.shapes())
         self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
+        self.observer = StandardObserver.of_variant()
         # What was computed of the scene as it was: renders of one that stays as it is begin sooner.
         self.memory = Remembered()
         self._built = True

@@ -17,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.render.build import BuildOptions
-from torchtransient.render.engine import RenderJob, jvp, primal, vjp
+from torchtransient.render.engine import jvp, primal, vjp
+from torchtransient.render.session import RenderJob
 from torchtransient.render.physics import PhysicsWatch
 from torchtransient.render.seeds import Item, Seeding
 from torchtransient.render.variant import active_variant

@@ -1,0 +1,57 @@
+"""A job of an integrator whose look-ups, checks and tables are made: what is left is a function of arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+
+from torchtransient.plugins.frozen_state import arrays_below, structure_below
+
+
+@dataclass
+class Prepared:
+    """One render or one derivative of it. Made outside of recorded code by
+    :meth:`~.base.TransientIntegrator.prepared`, carried out by :meth:`~.base.TransientIntegrator.run`.
+
+    ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`.launch.Pass` of its paths;
+    ``seed``, ``samples``: as it was asked for, and the largest number of samples of a pixel. ``incoming``: the film's
+    adjoint in reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
+    written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it
+    can.
+    """
+
+    kind: str
+    integrator: Any
+    scene: Any
+    sensor: Any
+    film: Any
+    world: Any
+    launches: list[Any]
+    seed: Any
+    samples: int
+    incoming: Any = None
+    beside: list[Any] = field(default_factory=list)
+    plugins: list[Any] = field(default_factory=list)
+    refusal: str | None = None
+
+    def _held(self) -> list[Any]:
+        return [
+            self.kind, self.integrator, self.film, self.world, self.launches, self.seed, self.samples, self.incoming,
+            self.beside, [vars(plugin) for plugin in self.plugins],
+        ]  # fmt: skip
+
+    def arrays(self) -> list[Any]:
+        """What kernels read beside the scene's parameters: arrays, and structures of them."""
+        return arrays_below(self._held())
+
+    def structure(self) -> tuple[Any, ...]:
+        """What the traced kernels depend on beside arrays."""
+        return structure_below(self._held())
+
+    def tables(self) -> list[Any]:
+        """What has been computed of the scene's parameters: attached where they are."""
+        tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
+        with dr.resume_grad():
+            return [table for table in tables if dr.grad_enabled(table)]

@@ -1,0 +1,170 @@
+"""A built scene in use: values are installed for one run and the described ones put back, under one lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchtransient._collection import no_collection
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.plugins.black_textures import lifted
+from torchtransient.render.build import BuildOptions
+from torchtransient.render.filter_override import temporal_filter
+from torchtransient.render.kernel_errors import named_errors
+from torchtransient.render.physics import PhysicsWatch
+from torchtransient.render.seeds import Item, Seeding
+from torchtransient.render.variant import active_variant
+
+if TYPE_CHECKING:
+    from torchtransient.render.parameters import SlotTable
+    from torchtransient.render.scene_handle import Scene
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """What one primal run reports. ``energy_before``, ``energy_after``: outside of the window; ``recorded``: what became
+    of the call's recording, item by item.
+    """
+
+    items: tuple[Item, ...]
+    seconds: float
+    integrator: str
+    spp: int
+    energy_before: tuple[float, ...]
+    energy_after: tuple[float, ...]
+    recorded: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Everything about a call that is not a tensor.
+
+    ``items``: the films to fill, where the seed is known; ``seeding`` makes them of a seed that is known later.
+    ``batched[i]``: value i has a leading batch dimension. ``needs[i]``: value i wants a derivative. ``watch``: says
+    what is unphysical. ``freeze``: calls are recorded. ``log`` collects what each primal run reports (seconds, seeds,
+    energy outside the window) and belongs to one call: under ``vmap`` a call is several runs. ``derivative_log``: what
+    became of the recordings of the call's derivatives.
+    """
+
+    scene: Scene
+    options: BuildOptions
+    keys: tuple[str, ...]
+    items: tuple[Item, ...]
+    seeding: Seeding
+    batched: tuple[bool, ...]
+    spp: int
+    spp_grad: int
+    temporal_filter: str | None
+    watch: PhysicsWatch
+    needs: tuple[bool, ...] = ()
+    progress: Callable[[float], None] | None = None
+    freeze: bool = True
+    log: list[RunLog] = field(default_factory=list)
+    derivative_log: list[str] = field(default_factory=list)
+
+    def seeded(self, seed: torch.Tensor | None) -> RenderJob:
+        """The job with the items of a seed; with its own ones for None."""
+        return self if seed is None else replace(self, items=self.seeding.items(int(seed)))
+
+
+class Session:
+    """A built scene in use."""
+
+    def __init__(self, job: RenderJob, slots: SlotTable):
+        self.job = job
+        self.slots = slots
+        self.scene = slots.built.scene
+        self.params = slots.built.params
+        self.integrator = self.scene.integrator()
+        self.recordings = job.scene.recordings(job.keys, job.options)
+        self.sensors = self.scene.sensors()
+
+    def film(self, item: Item) -> Any:
+        return self.sensors[item.sensor].film()
+
+    def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
+        """Write the values of one batch entry into the scene; leaves that need it carry gradients."""
+        import drjit as dr
+
+        leaves = []
+        for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
+            entry = value[item.entry] if batched else value
+            leaf = own_array(entry)
+            if need and slot.loses_black():
+                leaf = lifted(leaf)
+            if need:
+                dr.enable_grad(leaf)
+            leaves.append(leaf)
+        try:
+            with _quiet():
+                self.slots.install(leaves)
+        except (RuntimeError, ValueError, TypeError) as error:
+            if isinstance(error, TorchTransientError):
+                raise
+            raise SceneError(f"values of {', '.join(self.job.keys)}: Mitsuba refuses them: {error}") from error
+        return leaves
+
+
+# Of so few entries a list is taken over sooner than a kernel is launched.
+_FEW = 64
+
+
+def own_array(tensor: torch.Tensor) -> Any:
+    """A flat Dr.Jit copy in Dr.Jit's own memory: the scene must not alias memory that belongs to the caller, and a
+    recorded kernel would go on reading memory that is not Dr.Jit's where the first call had it.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    flat = tensor.detach().reshape(-1)
+    if flat.numel() <= _FEW:
+        return mi.Float(flat.tolist())
+    flat = flat.contiguous()
+    wait_for_torch(flat)
+    copy = mi.Float(flat) * dr.opaque(mi.Float, 1)
+    dr.eval(copy)
+    dr.sync_thread()
+    return copy
+
+
+def wait_for_torch(tensor: torch.Tensor) -> None:
+    """Dr.Jit works on a stream of its own: what torch has queued must be done before Dr.Jit reads or reuses memory."""
+    if tensor.is_cuda:
+        torch.cuda.current_stream(tensor.device).synchronize()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Mitsuba warns of gradients through parameters it does not list as differentiable; which ones are right is
+    in our own table.
+    """
+    import mitsuba as mi
+
+    logger = mi.logger()
+    before = logger.log_level()
+    logger.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        logger.set_log_level(before)
+
+
+@contextmanager
+def session_of(job: RenderJob) -> Iterator[Session]:
+    with active_variant(job.scene.variant), no_collection():
+        slots = job.scene.slots(job.keys, job.options)
+        session = Session(job, slots)
+        films = [sensor.film() for sensor in session.sensors]
+        try:
+            with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
+                yield session
+        finally:
+            try:
+                slots.restore()
+            except BaseException:
+                job.scene.drop(job.options)
+                raise
