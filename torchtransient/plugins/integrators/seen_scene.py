@@ -71,13 +71,16 @@ class SeenScene:
         return self._tracker
 
     def python_plugins(self, scene: Any) -> list[Any]:
-        """The plugins of the scene that are written in Python, sensors and integrator included."""
+        """The plugins of the scene that are written in Python, integrator and films included."""
         self._forget_replaced(scene)
         if self._python is None:
-            held = [*objects_below(scene, mi.Object), scene.integrator()]
-            written = {one.ptr: one for one in held if one is not None and type(one).__module__ != "mitsuba"}
-            self._python = list(written.values())
-        return self._python
+            # Of these alone: who holds a light or a sensor may hold its shape, and so on up to the scene.
+            below = (mi.BSDF, mi.Texture, mi.Volume, mi.PhaseFunction, mi.Medium)
+            found = [one for one in objects_below(scene, mi.Object) if isinstance(one, below)]
+            self._python = list({one.ptr: one for one in found if _is_python(one)}.values())
+        sensors = scene.sensors()
+        others = [*sensors, *(sensor.film() for sensor in sensors), *scene.emitters(), *scene.shapes()]
+        return [*self._python, *filter(_is_python, others), scene.integrator()]
 
     def _forget_replaced(self, scene: Any) -> None:
         """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""
@@ -94,3 +97,7 @@ class SeenScene:
         if pointers != self._pointers or lobes != self._lobes:
             self._pointers, self._lobes, self._tracker, self._python = pointers, lobes, None, None
             self._contents.clear()
+
+
+def _is_python(plugin: Any) -> bool:
+    return type(plugin).__module__ != "mitsuba"
