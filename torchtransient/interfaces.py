@@ -12,7 +12,6 @@ import abc
 import enum
 from typing import Any, TypeGuard
 
-
 # The jobs of an integrator: a render, its derivative in reverse mode, and along one tangent.
 RENDER, BACKWARD, FORWARD = JOBS = ("render", "backward", "forward")
 
@@ -204,6 +203,20 @@ class FilmInterface(abc.ABC):
         """The storage as (first row, rows, flat array) for each band."""
 
     @abc.abstractmethod
+    def can_borrow(self, samples: int) -> bool:
+        """Whether renders of ``samples`` per pixel can add to an array of somebody else's, see :meth:`lend`."""
+
+    @abc.abstractmethod
+    def lend(self, storage: tuple[Any, int] | None) -> None:
+        """Let renders add to an array of zeros from one entry on, ``(flat array, first entry)``, instead of to one of
+        their own, until None is given.
+        """
+
+    @abc.abstractmethod
+    def first_entry(self) -> Any:
+        """Index of the film's first value in its band (``UInt32``), None for zero."""
+
+    @abc.abstractmethod
     def taken(self) -> list[Any]:
         """The arrays of a finished render, as a list that :meth:`hold` takes; the film has none of them any more."""
 
@@ -222,6 +235,10 @@ class FilmInterface(abc.ABC):
     @abc.abstractmethod
     def clear(self) -> None:
         """Drop the storage; tensors developed before keep their memory."""
+
+    @abc.abstractmethod
+    def energies_outside(self) -> tuple[float, float]:
+        """(``energy_before``, ``energy_after``), read together."""
 
     @property
     @abc.abstractmethod
@@ -286,8 +303,15 @@ class IntegratorInterface(abc.ABC):
     def prepared(
         self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, kind: str = RENDER, grad_in: Any = None
     ) -> Any:
-        """A job of :data:`JOBS` with all that is looked up and computed beforehand: ``arrays()`` and ``structure()`` that
-        its kernels depend on, ``tables()`` that carry gradients, ``refusal``, ``launches``, ``film``.
+        """A job of :data:`JOBS` with all that is looked up and computed beforehand
+        (:class:`~torchtransient.plugins.integrators.prepared.Prepared`).
+        """
+
+    @staticmethod
+    @abc.abstractmethod
+    def state_of(jobs: list[Any]) -> tuple[tuple[Any, ...], list[Any]]:
+        """(structure, arrays) of prepared jobs of one scene: those with equal structures, and arrays of the same types
+        and sizes, have the same kernels.
         """
 
     @abc.abstractmethod

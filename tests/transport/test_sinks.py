@@ -31,7 +31,7 @@ def scene_of(kind, depth=5):
 
 
 def traced(scene, sink_of):
-    """The paths of one pass into the sink that ``sink_of(integrator, contents, film, rays, job)`` makes: (sink, what it kept)."""
+    """The paths of one pass: (the sink of ``sink_of(integrator, contents, film, rays, job)``, what it kept)."""
     integrator = scene.integrator()
     with dr.suspend_grad():
         sensor, film = integrator.resolve(scene, 0)

@@ -1,8 +1,9 @@
-"""What a recorded call depends on beside its arguments: arrays to be handed in, and all else, by which it is told apart.
+"""What a recorded call depends on beside its arguments: arrays to be handed in, and all else, that tells it apart.
 
 ``dr.freeze`` finds what it is handed and what plugins show to it; tables sit in plain objects, so that loops leave them
 alone, and have to be named: ``dr.freeze(f, state_fn=lambda *args: integrator.frozen_state(scene))``. Numbers that are
-no arrays become part of the kernels: a recording is good for one :func:`structure_below` alone.
+no arrays become part of the kernels: a recording is good for one structure alone, see
+:func:`state_below`.
 """
 
 from __future__ import annotations
@@ -35,14 +36,16 @@ def arrays_below(value: Any) -> list[Any]:
     """The Dr.Jit arrays in plain objects and in the containers they hold, each once and in order, and Mitsuba's
     structures of arrays.
     """
-    return _Walk(value).arrays
+    return state_below(value)[1]
 
 
-def structure_below(value: Any) -> tuple[Any, ...]:
-    """All that is no array in plain objects and in the containers they hold, with the places and types of arrays: of
-    two jobs with the same structure the same kernels are traced. Hashable; Mitsuba's objects count by their address.
+def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
+    """(structure, arrays). The structure is all that is no array in plain objects and in the containers they hold, with
+    the places and types of arrays: of two jobs with the same structure the same kernels are traced. Hashable; Mitsuba's
+    objects count by their address. Arrays: as :func:`arrays_below`.
     """
-    return tuple(_Walk(value).structure)
+    walk = _Walk(value)
+    return tuple(walk.structure), walk.arrays
 
 
 class _Walk:

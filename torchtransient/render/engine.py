@@ -16,15 +16,16 @@ from typing import Any
 
 import torch
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError, UnitError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
 from torchtransient.plugins.parameters import check_slope
+from torchtransient.render.batch import Batch, take
+from torchtransient.render.carry_out import Numbered, carry_out, groups_of
 from torchtransient.render.films.choice import FilmChoice
 from torchtransient.render.films.choices import of_film
 from torchtransient.render.memory import check_fits
 from torchtransient.render.parameters import needing_slope
 from torchtransient.render.physics import are_finite, smallest_and_largest
-from torchtransient.render.recordings import SWITCHED_OFF, NotRecordedError
 from torchtransient.render.seeds import Item
 from torchtransient.render.session import RenderJob, RunLog, Session, own_array, session_of, wait_for_torch
 
@@ -50,63 +51,27 @@ def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor
 def _render_items(
     session: Session, values: Sequence[torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor, tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    job, count = session.job, len(session.job.items)
-    steady_all = response_all = None
-    before, after, said = [], [], []
-    for n, item in enumerate(job.items):
-
-        def install(item: Item = item) -> None:
-            session.install(item, values, [False] * len(values))
-            job.watch.placed(session.scene, item.sensor)
-
-        if n == 0 or item.entry != job.items[n - 1].entry:
-            install()
-        said.append(_carry_out(session, item, RENDER, install, progress=_fraction(job, n)))
-        film = session.film(item)
-        before.append(film.energy_before)
-        after.append(film.energy_after)
-        steady, response = _take(film, response_all[n] if response_all is not None else None)
-        if count == 1:
-            steady_all, response_all = steady, response
-        elif steady_all is None or response_all is None:
-            steady_all, response_all = (
-                steady.new_empty((count, *steady.shape)),
-                response.new_empty((count, *response.shape)),
-            )
-        if count > 1:
-            steady_all[n].copy_(steady)
-            response_all[n].copy_(response)
-        del steady, response
-    if steady_all is None or response_all is None:
-        raise ShapeError("a batch must have at least one entry, got 0.")
-    return steady_all, response_all, tuple(before), tuple(after), tuple(said)
-
-
-def _carry_out(
-    session: Session,
-    item: Item,
-    kind: str,
-    install: Callable[[], Any],
-    grad_in: tuple[Any, Any] = (None, None),
-    progress: Callable[[float], None] | None = None,
-) -> str:
-    """One job on values that are installed, recorded where that is possible; says how. ``install`` installs them
-    again: a recording that fails may have come half the way.
-    """
     job = session.job
-    seed, spp = (item.seed, job.spp) if kind == RENDER else (item.grad_seed, job.spp_grad)
-    prepared = session.integrator.prepared(session.scene, item.sensor, seed, spp, kind, grad_in)
-    if job.freeze:
-        try:
-            return session.recordings.run(prepared, progress)
-        except NotRecordedError as error:
-            reason = str(error)
-        install()
-        prepared = session.integrator.prepared(session.scene, item.sensor, seed, spp, kind, grad_in)
-    else:
-        reason = SWITCHED_OFF
-    session.integrator.run(prepared, progress=progress)
-    return reason
+    batch = Batch(len(job.items), [session.film(item) for item in job.items])
+    energies: list[tuple[float, float]] = []
+    said: list[str] = []
+    for group in groups_of(session):
+
+        def install(item: Item, group: Sequence[Numbered] = group) -> None:
+            session.install(item, values, [False] * len(values))
+            for _, each in group:
+                job.watch.placed(session.scene, each.sensor)
+
+        def collect(n: int, item: Item) -> None:
+            film = session.film(item)
+            energies.append(film.energies_outside())
+            batch.take(film, n)
+
+        with batch.lent_to(session.film(group[0][1]), group[0][0], job.spp) as lent:
+            said += carry_out(session, RENDER, group, install, collect, report=lambda n: _fraction(job, n), lent=lent)
+    steady, response = batch.tensors()
+    before, after = zip(*energies, strict=True)
+    return steady, response, before, after, tuple(said)
 
 
 def _drawn_samples(session: Session) -> int:
@@ -119,28 +84,6 @@ def _drawn_samples(session: Session) -> int:
 def _fraction(job: RenderJob, n: int) -> Callable[[float], None] | None:
     report, count = job.progress, len(job.items)
     return None if report is None else lambda fraction: report((n + fraction) / count)
-
-
-def _take(film: Any, into: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-    """The film's result as torch tensors that own the film's memory. A cube stored in several bands is put together."""
-    import drjit as dr
-    import mitsuba as mi
-
-    bands = film.transient_bands()
-    shape = film.cube_shape()
-    dr.eval(film.steady, *(band[2] for band in bands))
-    dr.sync_thread()
-    steady = mi.TensorXf(film.steady, (shape[0], shape[1], film.channel_count())).torch()
-    if len(bands) == 1:
-        response = mi.TensorXf(bands[0][2], shape).torch()
-    else:
-        response = torch.empty(shape, dtype=steady.dtype, device=steady.device) if into is None else into
-        while bands:
-            first, rows, flat = bands.pop(0)
-            response[first : first + rows].copy_(flat.torch().view(rows, *shape[1:]))
-            del flat
-    film.clear()
-    return steady, response
 
 
 def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
@@ -190,23 +133,27 @@ def vjp(
     if g_steady is not None or g_response is not None:
         with session_of(job) as session:
             _check_slope(session)
-            for n, item in enumerate(job.items):
+            for group in groups_of(session):
                 leaves: list[Any] = []
 
-                def install(item: Item = item, leaves: list[Any] = leaves) -> None:
+                def install(item: Item, leaves: list[Any] = leaves) -> None:
                     leaves[:] = session.install(item, values, job.needs)
 
-                install()
-                several = len(job.items) > 1
-                gs = None if g_steady is None else _steady_adjoint(g_steady[n] if several else g_steady)
-                gr = None if g_response is None else _cube_adjoint(g_response[n] if several else g_response)
-                job.derivative_log.append(_carry_out(session, item, BACKWARD, install, (gs, gr)))
-                _finish_backward(session, leaves)
-                for grad, leaf, batched in zip(grads, leaves, job.batched, strict=True):
-                    if grad is not None:
-                        target = grad[item.entry] if batched else grad
-                        target += dr.grad(leaf).torch().view(target.shape)
-                del leaves, gs, gr
+                def adjoint(n: int) -> tuple[Any, Any]:
+                    several = len(job.items) > 1
+                    gs = None if g_steady is None else _steady_adjoint(g_steady[n] if several else g_steady)
+                    gr = None if g_response is None else _cube_adjoint(g_response[n] if several else g_response)
+                    return gs, gr
+
+                def collect(n: int, item: Item, leaves: list[Any] = leaves) -> None:
+                    _finish_backward(session, leaves)
+                    for grad, leaf, batched in zip(grads, leaves, job.batched, strict=True):
+                        if grad is not None:
+                            target = grad[item.entry] if batched else grad
+                            target += dr.grad(leaf).torch().view(target.shape)
+                    leaves.clear()
+
+                job.derivative_log.extend(carry_out(session, BACKWARD, group, install, collect, adjoint))
     return [grad for grad in grads if grad is not None]
 
 
@@ -230,19 +177,20 @@ def jvp(
     steady_all, response_all = [], []
     with session_of(job) as session:
         _check_slope(session)
-        for item in job.items:
+        for group in groups_of(session):
             leaves: list[Any] = []
 
-            def install(item: Item = item, leaves: list[Any] = leaves) -> None:
+            def install(item: Item, leaves: list[Any] = leaves) -> None:
                 leaves[:] = session.install(item, values, job.needs)
                 _set_tangents(job, item, leaves, tangents)
 
-            install()
-            job.derivative_log.append(_carry_out(session, item, FORWARD, install))
-            d_steady, d_response = _take(session.film(item), None)
-            steady_all.append(d_steady)
-            response_all.append(d_response)
-            del leaves, d_steady, d_response
+            def collect(n: int, item: Item) -> None:
+                d_steady, d_response = take(session.film(item), None)
+                steady_all.append(d_steady)
+                response_all.append(d_response)
+
+            job.derivative_log.extend(carry_out(session, FORWARD, group, install, collect))
+            leaves.clear()
     if len(job.items) == 1:
         return steady_all[0], response_all[0]
     return torch.stack(steady_all), torch.stack(response_all)

@@ -9,6 +9,8 @@ from torchtransient.errors import StorageError
 from torchtransient.render.variant import device_type
 
 _BYTES_PER_VALUE = 4
+# So little is not asked for: the question takes as long as a small render.
+_SMALL = 2**22
 
 
 def available_bytes(variant: str) -> int | None:
@@ -53,6 +55,8 @@ def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
     """
     cube = math.prod(cube_shape) * _BYTES_PER_VALUE
     films = items + 1 if items > 1 else 1
+    if cube * films <= _SMALL:
+        return
     available = available_bytes(variant)
     if available is None or cube * films <= available:
         return

@@ -1,41 +1,43 @@
 """Jobs that are traced once and launched ever after: the recorded calls of one built scene.
 
-The first job of a kind is traced as it comes, and fills what the scene remembers; the second is recorded
+The first call of a kind is traced as it comes, and fills what the scene remembers; the second is recorded
 (``dr.freeze``), and from the third on its kernels are launched. A recording is good for one structure: keys and film,
 samples, plan, which values need derivatives, layout of the adjoint, numbers of the plugins, see
-:func:`torchtransient.plugins.frozen_state.structure_below`; Dr.Jit tells types, sizes and flags of the arrays apart
-within it. Recordings hold kernels alone, no results; they are bounded in number and go with the scene.
+:func:`torchtransient.plugins.frozen_state.state_below`; Dr.Jit tells types, sizes and flags of the arrays apart within
+it. Recordings hold kernels alone, no results; they are bounded in number and go with the scene.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 from torchtransient.interfaces import BACKWARD
 from torchtransient.plugins.frozen_state import not_recordable
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
-MAX_STRUCTURES, MAX_RECORDINGS = 16, 8
+MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
 # Calls in a row none of which could be launched, after which it is said.
 IN_VAIN = 24
 
 FIRST, RECORDED, LAUNCHED = "traced: the first call", "recorded", "launched"
 SWITCHED_OFF = "traced: freeze=False"
 SEVERAL = "traced: it takes several kernel launches, beside which tracing costs little"
+LARGE = "traced: a large film of a batch, beside which tracing costs little"
 PROGRESS = "traced: progress is reported"
 
 
 class NotRecordedError(Exception):
-    """A job could not be recorded, and is to be done again from its installation on; the text says why."""
+    """A call could not be recorded, and is to be traced from its installation on; the text says why."""
 
 
 class Recordings:
     """Those of one built scene, with the values of one set of keys."""
 
     def __init__(self) -> None:
-        self._found: OrderedDict[Any, _Recording] = OrderedDict()
+        self._found: OrderedDict[Any, Recording] = OrderedDict()
         self._in_vain = 0
         self._before: tuple[Any, ...] = ()
         self._warned = False
@@ -43,40 +45,46 @@ class Recordings:
     def __len__(self) -> int:
         return len(self._found)
 
-    def run(self, job: Any, progress: Any = None) -> str:
-        """Carry out a prepared job and say how. Raises NotRecordedError."""
-        refusal = f"traced: {job.refusal}" if job.refusal else None
-        if len(job.launches) > 1:
-            refusal = SEVERAL
-        if progress is not None:
-            refusal = PROGRESS
-        if refusal is not None:
-            job.integrator.run(job, progress=progress)
-            return refusal
-        job.film.clear()
-        structure = job.structure()
+    def run(self, jobs: Sequence[Any]) -> tuple[str, list[list[Any]]]:
+        """Carry out prepared jobs (:class:`~torchtransient.plugins.integrators.prepared.Prepared`) of one scene with
+        one set of values: how, and what each film has taken (:meth:`~.FilmInterface.taken`), nothing in reverse mode.
+        Raises NotRecordedError where they are to be traced; nothing has been rendered then.
+        """
+        for job in jobs:
+            if job.refusal is not None or len(job.launches) > 1:
+                raise NotRecordedError(SEVERAL if job.refusal is None else f"traced: {job.refusal}")
+            job.film.clear()
+        structure, arrays = jobs[0].integrator.state_of(jobs)
         found = self._found.get(structure)
         if found is None:
-            found = self._found[structure] = _Recording()
+            found = self._found[structure] = Recording()
             while len(self._found) > MAX_STRUCTURES:
                 self._found.popitem(last=False)
         self._found.move_to_end(structure)
-        said = found.run(job)
-        self._watch(said, structure)
-        return said
+        launched = False
+        try:
+            results, launched = found.run(jobs, arrays)
+        finally:
+            self._watch(launched, structure)
+        return LAUNCHED if launched else RECORDED, results
 
-    def _watch(self, said: str, structure: tuple[Any, ...]) -> None:
-        self._in_vain = 0 if said == LAUNCHED else self._in_vain + 1
+    def _watch(self, launched: bool, structure: tuple[Any, ...]) -> None:
+        self._in_vain = 0 if launched else self._in_vain + 1
         if self._in_vain >= IN_VAIN and not self._warned:
             self._warned = True
             warnings.warn(
                 f"the last {IN_VAIN} renders and derivatives of a scene were all traced anew, none could use a "
-                f"recording: {_difference(self._before, structure)}. Tracing costs some milliseconds a call; keep "
+                f"recording: {self._reason(structure)}. Tracing costs some milliseconds a call; keep "
                 "spp, keys, shapes and which values need gradients the same from call to call, or switch recordings "
                 "off with freeze=False.",
                 stacklevel=2,
             )
         self._before = structure
+
+    def _reason(self, structure: tuple[Any, ...]) -> str:
+        if len(self._found) == MAX_STRUCTURES:
+            return f"more than {MAX_STRUCTURES} kinds of calls take turns"
+        return _difference(self._before, structure)
 
 
 def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
@@ -94,25 +102,27 @@ def _short(value: Any) -> str:
     return said if len(said) <= 80 else said[:77] + "..."
 
 
-class _Recording:
-    """The jobs of one structure."""
+class Recording:
+    """The calls of one structure."""
 
     def __init__(self) -> None:
-        self._job: Any = None
+        self._jobs: Sequence[Any] = ()
         self._frozen: Any = None
-        self._calls = 0
-        self._refusal: str | None = None
+        self._refusal: str | None = FIRST
 
-    def run(self, job: Any) -> str:
-        self._calls += 1
-        if self._calls == 1 or self._refusal is not None:
-            job.integrator.run(job)
-            return self._refusal or FIRST
+    def run(self, jobs: Sequence[Any], arrays: list[Any]) -> tuple[list[list[Any]], bool]:
+        """(what the films have taken, whether kernels were launched without tracing). Raises NotRecordedError."""
+        if self._refusal is not None:
+            refusal = self._refusal
+            if refusal == FIRST:
+                self._refusal = None
+            raise NotRecordedError(refusal)
         if self._frozen is None:
             self._frozen = self._made()
-        before, self._job = self._frozen.n_recordings, job
+        before, self._jobs = self._frozen.n_recordings, jobs
         try:
-            arrays = self._frozen(job.scene, job.arrays())
+            results = self._frozen(jobs[0].scene, arrays)
+            return results, self._frozen.n_recordings == before
         except BaseException as error:
             self._frozen = None
             reason = not_recordable(error)
@@ -121,18 +131,17 @@ class _Recording:
             self._refusal = f"traced: Dr.Jit cannot record it: {reason}"
             raise NotRecordedError(self._refusal) from error
         finally:
-            self._job = None
-        if job.kind != BACKWARD:
-            job.film.hold(arrays)
-        return RECORDED if self._frozen.n_recordings > before else LAUNCHED
+            self._jobs = ()
 
     def _made(self) -> Any:
         import drjit as dr
 
-        def call(scene: Any, arrays: list[Any]) -> list[Any]:
-            # The scene and the arrays are those of the job, which the recording finds by being handed them.
-            job = self._job
-            job.integrator.run(job)
-            return [] if job.kind == BACKWARD else job.film.taken()
+        def call(scene: Any, arrays: list[Any]) -> list[list[Any]]:
+            # Scene and arrays are those of the jobs; a recording finds them by being handed them.
+            results = []
+            for job in self._jobs:
+                job.integrator.run(job)
+                results.append([] if job.kind == BACKWARD else job.film.taken())
+            return results
 
         return dr.freeze(call, limit=MAX_RECORDINGS, warn_after=2**31 - 1)

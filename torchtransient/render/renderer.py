@@ -91,9 +91,8 @@ class TransientRenderer(nn.Module):
     light. "warn" says each once for a scene, as a ``PhysicsWarning`` with the key and the number; "error" raises
     ``PhysicsError``; "ignore" does not look.
 
-    ``freeze``: True records what a call launches, so that the calls after it need no tracing; values, gradients and
-    noise are the same with and without. ``out.stats.recorded`` and ``out.stats.derivatives_recorded`` say what became
-    of it, ``docs/design.md`` what makes a new recording.
+    ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
+    and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
 
     Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
     derivatives raise ``GradientError``.
@@ -341,7 +340,7 @@ class TransientRenderer(nn.Module):
         finally:
             if bar is not None:
                 bar.close()
-        leading = (() if batch is None else (batch,)) + ((len(self._sensors),) if self._stack_sensors else ())
+        leading = (*(() if batch is None else (batch,)), *((len(self._sensors),) if self._stack_sensors else ()))
         stats, components = self._stats(job), stokes_components(self.scene.variant)
         steady = steady_channels_first(steady, leading, components)
         return RenderOutput.of(
@@ -355,11 +354,9 @@ class TransientRenderer(nn.Module):
             if key not in self._shapes:
                 hint = unknown_key(key, list(self._shapes), "this renderer")
                 raise SceneError(f"values: {hint} It was made with parameters={list(self._keys)}.")
-        expected = device_type(self.scene.variant)
         tensors, batched, batch = [], [], None
         for key in self._keys:
-            value = given.get(key, self.values[key])
-            value = as_float(key, value, expected)
+            value = as_float(key, given.get(key, self.values[key]), device_type(self.scene.variant))
             value, has_batch = fit_shape(key, value, self._shapes[key])
             if has_batch:
                 if batch is not None and value.shape[0] != batch:
@@ -399,5 +396,4 @@ class TransientRenderer(nn.Module):
 
     def extra_repr(self) -> str:
         """Shown by ``print(renderer)``."""
-        keys, used = list(self._keys), self.effective_filter
-        return f"{self.scene!r}, parameters={keys}, {self.film.describe(used)}"
+        return f"{self.scene!r}, parameters={list(self._keys)}, {self.film.describe(self.effective_filter)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunLog:
-    """What one primal run reports. ``energy_before``, ``energy_after``: outside of the window; ``recorded``: what became
-    of the call's recording, item by item.
+    """What one primal run reports, item by item. ``energy_before``, ``energy_after``: outside of the window;
+    ``recorded``: what became of its recording.
     """
 
     items: tuple[Item, ...]
@@ -85,6 +86,10 @@ class Session:
 
     def film(self, item: Item) -> Any:
         return self.sensors[item.sensor].film()
+
+    def entries(self, item: Item) -> int:
+        """Number of values behind the pixels of an item's film."""
+        return math.prod(self.film(item).cube_shape())
 
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:
         """Write the values of one batch entry into the scene; leaves that need it carry gradients."""

@@ -62,7 +62,9 @@ class Launch:
 
     def base(self, film: Any, pixel: Any) -> Any:
         """Index of the first value of each lane's pixel in its band."""
-        return (pixel - dr.opaque(mi.UInt32, self.band_first_row * self.width)) * film.entries_per_pixel()
+        base = (pixel - dr.opaque(mi.UInt32, self.band_first_row * self.width)) * film.entries_per_pixel()
+        entry = film.first_entry()
+        return base if entry is None else base + entry
 
 
 def launches_of(film: Any, points: int, samples: int) -> list[Launch]:

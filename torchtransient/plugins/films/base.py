@@ -59,6 +59,7 @@ class TimeResolvedFilm(mi.Film):
         self._check_laser_grid()
         self.curves = SensorResponse.of(props)
         self.bands = []
+        self._lent = None
         self.steady = None
         self.outside = None
         self._offset_distribution = None
@@ -167,7 +168,15 @@ class TimeResolvedFilm(mi.Film):
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
-        self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
+        if self._lent is None:
+            self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
+        else:
+            if real is not mi.Float:
+                raise StorageError(
+                    f"{self.plugin}: the array that was lent is summed up in single precision, up to "
+                    f"{MAX_SINGLE_PRECISION_SAMPLES} samples per pixel; got {samples}. Render to one of its own."
+                )
+            self.bands = [(0, height, self._lent[0])]
         self.steady = dr.zeros(real, height * width * self.channel_count())
         # By pixel: one sum over all samples would drown small terms, and be one address that every thread waits for.
         self.outside = dr.zeros(real, height * width * 2) if self.has_window else None
@@ -206,6 +215,17 @@ class TimeResolvedFilm(mi.Film):
     def clear(self):
         self.bands, self.steady, self.outside = [], None, None
 
+    def can_borrow(self, samples):
+        # Samplers may round up; a sum over the array needs one that starts with the film.
+        in_single = 4 * samples <= MAX_SINGLE_PRECISION_SAMPLES
+        return in_single and len(self.band_layout()) == 1 and self.keeps_steady
+
+    def lend(self, storage):
+        self._lent = storage
+
+    def first_entry(self):
+        return None if self._lent is None else dr.opaque(mi.UInt32, self._lent[1])
+
     def taken(self):
         arrays = [self.steady, self.outside, *(band[2] for band in self.bands)]
         self.clear()
@@ -241,16 +261,19 @@ class TimeResolvedFilm(mi.Film):
         steady = mi.TensorXf(self.steady, (shape[0], shape[1], self.channel_count()))
         return steady, mi.TensorXf(self.bands[0][2], shape)
 
+    def energies_outside(self):
+        if self.outside is None:
+            return 0.0, 0.0
+        before, after = np.array(self.outside).reshape(-1, 2).sum(0, dtype=np.float64)
+        return float(before), float(after)
+
     @property
     def energy_before(self) -> float:
-        return self._energy_outside(0)
+        return self.energies_outside()[0]
 
     @property
     def energy_after(self) -> float:
-        return self._energy_outside(1)
-
-    def _energy_outside(self, side: int) -> float:
-        return 0.0 if self.outside is None else float(np.array(self.outside, dtype=np.float64)[side::2].sum())
+        return self.energies_outside()[1]
 
     # ----------------------------------------------------------------------------------- pixel sampling
 

@@ -7,7 +7,6 @@ import mitsuba as mi
 
 from torchtransient.plugins.polarized import FrameRotation, rotate_stokes
 
-
 # Mitsuba's tables of the CIE 1931 observer: nodes, and their range in nanometres.
 _NODES, _FIRST, _LAST = 95, 360.0, 830.0
 

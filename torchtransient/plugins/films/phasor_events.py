@@ -109,6 +109,8 @@ class EventBlock(FilmBlock):
         first = pixel * spp + group * GROUP
         last = dr.minimum(first + GROUP, (pixel + 1) * spp)
         base = (pixel + dr.opaque(mi.UInt32, (job.first_row - self.first_row) * self.width)) * film.entries_per_array()
+        if (entry := film.first_entry()) is not None:
+            base += entry
         start = block * per_block
         frequencies = FrequencyBlock(film, start, per_block)
         re, im = sum_events(self, frequencies, first, last)

@@ -15,7 +15,7 @@ from torchtransient.plugins.frozen_state import arrays_below
 from torchtransient.plugins.integrators.derivative_passes import backward, forward
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of, seed_array
-from torchtransient.plugins.integrators.prepared import Prepared
+from torchtransient.plugins.integrators.prepared import Prepared, state_of
 from torchtransient.plugins.integrators.seen_scene import SeenScene
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterTracker, check_slope, check_stand_ins, moving_names
 from torchtransient.plugins.properties import truth, whole_number
@@ -210,6 +210,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         pixel = dr.fma(rays.row, width, rays.column)
         in_band = pixel - dr.opaque(mi.UInt32, first * width)
         base = in_band * film.entries_per_pixel()
+        if (entry := film.first_entry()) is not None:
+            base += entry
         return base if rays.laser is None else film.pixel_base(base, rays.laser), pixel
 
     def first_opl(self, film, rays):
@@ -269,6 +271,11 @@ class TransientIntegrator(mi.CppADIntegrator):
             if not vars(type(plugin)).get("can_be_recorded", False):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
         return "derivatives beside paths read numbers of the scene" if job.beside else None
+
+    @staticmethod
+    def state_of(jobs):
+        """(structure, arrays) of prepared jobs, see :func:`.prepared.state_of`."""
+        return state_of(jobs)
 
     @no_collection()
     def run(self, prepared, evaluate=True, progress=None):

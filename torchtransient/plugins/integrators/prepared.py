@@ -7,7 +7,7 @@ from typing import Any
 
 import drjit as dr
 
-from torchtransient.plugins.frozen_state import arrays_below, structure_below
+from torchtransient.plugins.frozen_state import state_below
 
 
 @dataclass
@@ -36,22 +36,19 @@ class Prepared:
     plugins: list[Any] = field(default_factory=list)
     refusal: str | None = None
 
-    def _held(self) -> list[Any]:
-        return [
-            self.kind, self.integrator, self.film, self.world, self.launches, self.seed, self.samples, self.incoming,
-            self.beside, [vars(plugin) for plugin in self.plugins],
-        ]  # fmt: skip
-
-    def arrays(self) -> list[Any]:
-        """What kernels read beside the scene's parameters: arrays, and structures of them."""
-        return arrays_below(self._held())
-
-    def structure(self) -> tuple[Any, ...]:
-        """What the traced kernels depend on beside arrays."""
-        return structure_below(self._held())
-
     def tables(self) -> list[Any]:
         """What has been computed of the scene's parameters: attached where they are."""
         tables = self.world.tables() + [table for part in self.beside for table in part.tables()]
         with dr.resume_grad():
             return [table for table in tables if dr.grad_enabled(table)]
+
+
+def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
+    """(structure, arrays): what the traced kernels of jobs depend on beside arrays, and the arrays and structures of
+    arrays that they read beside the scene's parameters.
+    """
+    held = [
+        [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
+        for job in jobs
+    ]
+    return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.engine import jvp, primal, vjp
-from torchtransient.render.session import RenderJob
 from torchtransient.render.physics import PhysicsWatch
 from torchtransient.render.seeds import Item, Seeding
+from torchtransient.render.session import RenderJob
 from torchtransient.render.variant import active_variant
 
 if TYPE_CHECKING:
