@@ -18,8 +18,9 @@ from torchtransient.render.session import RenderJob
 from torchtransient.testing.gradient_sweep.measure import Subject
 
 SPP = 2
-# Calls of a kind: traced, recorded, launched with other values and seeds.
-STEPS = (0.0, 0.5, 1.0, -0.5)
+# Calls of a kind: traced, recorded, launched with other values and seeds. What is found to change may be recorded once
+# more; the last one has to be launched.
+STEPS = (0.0, 0.5, 1.0, -0.5, 0.25)
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,13 @@ class Outcome:
 
     @property
     def launched(self) -> bool:
+        """Whether the last call of each kind was launched without tracing."""
         return all(words[-1] == LAUNCHED for words in self.said.values())
+
+    @property
+    def refused(self) -> bool:
+        """Whether some kind is never recorded."""
+        return any(words[-1].startswith("traced") for words in self.said.values())
 
 
 class Runs:

@@ -122,10 +122,11 @@ class _Walk:
 
 def not_recordable(error: BaseException) -> str | None:
     """What Dr.Jit says of a function that it cannot record; None for other errors."""
-    seen: BaseException | None = error
+    found, seen = None, error
     while seen is not None:
         text = str(seen)
         if isinstance(seen, RuntimeError) and any(words in text for words in _NOT_RECORDABLE):
-            return text
-        seen = seen.__cause__ or seen.__context__
-    return None
+            # What it came of says more.
+            found = text if found is None or "(see above)" in found else found
+        seen = seen.__cause__ or seen.__context__  # type: ignore[assignment]
+    return found
