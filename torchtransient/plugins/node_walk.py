@@ -24,7 +24,14 @@ class ShownValue(NamedTuple):
 
     def read(self, node: Any) -> Any:
         """The value now, attached where it is; ``node`` is the plugin that showed it."""
-        return self.handle if self.cpptype is None else mi.get_property(self.handle, self.cpptype, node)
+        return self.handle if self.cpptype is None else unshared(mi.get_property(self.handle, self.cpptype, node))
+
+
+def unshared(value: Any) -> Any:
+    """A Dr.Jit array as one of its own: whoever looks at numbers of a plugin's literal would make memory of it, which
+    recorded calls cannot find in every plugin (``hg`` shows it to Mitsuba alone).
+    """
+    return type(value)(value) if dr.is_jit_v(value) else value
 
 
 @functools.cache

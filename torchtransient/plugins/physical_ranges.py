@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.mitsuba_compat import keeps_coefficients
+from torchtransient.plugins.node_walk import unshared
 
 # What single precision makes of the ends of a range.
 _SLACK = 1e-5
@@ -106,6 +107,6 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
     for key in params.properties:
         found = physical_range(params, key)
         if found is not None:
-            numbers = np.array(params[key])
+            numbers = np.array(unshared(params[key]))
             if numbers.size:
                 yield key, found, float(numbers.min()), float(numbers.max())

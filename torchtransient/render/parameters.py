@@ -16,7 +16,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
-from torchtransient.plugins.node_walk import ShownValue
+from torchtransient.plugins.node_walk import ShownValue, unshared
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
 from torchtransient.render.build import BuiltScene
@@ -238,6 +238,7 @@ def read_value(current: Any, shape: tuple[int, ...] | None) -> Any:
         return None
     elif not dr.is_array_v(current):
         return current if shape == () else type(current).__name__
+    current = unshared(current)
     if dr.is_jit_v(current) and not dr.is_tensor_v(current) and len(shape or ()) == 2 and dr.depth_v(current) == 2:
         return np.array(current).T.reshape(shape)
     # Arrays of width one come with a trailing dimension of one.

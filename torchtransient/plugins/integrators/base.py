@@ -254,7 +254,6 @@ class TransientIntegrator(mi.CppADIntegrator):
             film.tabulate_filter()
             job = Prepared(kind, self, scene, sensor, film, world, launches, seed_array(seed), samples)
             job.plugins = self._seen_scene(scene).python_plugins(scene)
-            job.media = self._seen_scene(scene).media_plugins(scene)
             if wanted is not None:
                 job.beside = self.beside(world, sensor, film, seed, samples)
             if kind == BACKWARD:

@@ -8,7 +8,6 @@ from typing import Any
 import drjit as dr
 
 from torchtransient.plugins.frozen_state import state_below
-from torchtransient.plugins.node_walk import shown_by
 
 
 @dataclass
@@ -19,8 +18,8 @@ class Prepared:
     ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`.launch.Pass` of its paths;
     ``seed``, ``samples``: as it was asked for, and the largest number of samples of a pixel. ``incoming``: the film's
     adjoint in reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
-    written in Python, whose numbers become part of the kernels; ``media``: its media and what they hold, which shapes
-    do not show to Dr.Jit. ``refusal``: why it cannot be recorded, None where it can.
+    written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it
+    can.
     """
 
     kind: str
@@ -35,7 +34,6 @@ class Prepared:
     incoming: Any = None
     beside: list[Any] = field(default_factory=list)
     plugins: list[Any] = field(default_factory=list)
-    media: list[Any] = field(default_factory=list)
     refusal: str | None = None
 
     def tables(self) -> list[Any]:
@@ -53,6 +51,4 @@ def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
         [job.kind, job.integrator, job.film, job.world, job.launches, job.seed, job.samples, job.incoming, job.beside]
         for job in jobs
     ]
-    structure, arrays = state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
-    shown = [value.read(node) for node in jobs[0].media for value in shown_by(node)[0]]
-    return structure, arrays + jobs[0].media + shown
+    return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])

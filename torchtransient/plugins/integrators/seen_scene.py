@@ -41,7 +41,6 @@ class SeenScene:
         self._contents: dict[int, tuple[Any, SceneContents]] = {}
         self._tracker: ParameterTracker | None = None
         self._python: list[Any] | None = None
-        self._media: list[Any] | None = None
 
     def is_of(self, scene: Any) -> bool:
         """Whether it is this scene."""
@@ -71,14 +70,6 @@ class SeenScene:
             self._tracker = ParameterTracker(scene)
         return self._tracker
 
-    def media_plugins(self, scene: Any) -> list[Any]:
-        """The media of the scene with their phase functions and volumes."""
-        self._forget_replaced(scene)
-        if self._media is None:
-            kinds = (mi.Medium, mi.PhaseFunction, mi.Volume)
-            self._media = [one for one in objects_below(scene, mi.Object) if isinstance(one, kinds)]
-        return self._media
-
     def python_plugins(self, scene: Any) -> list[Any]:
         """The plugins of the scene that are written in Python, integrator and films included."""
         self._forget_replaced(scene)
@@ -105,7 +96,7 @@ class SeenScene:
         lobes = [bsdf.flags() for bsdf in self._bsdfs]
         if pointers != self._pointers or lobes != self._lobes:
             self._pointers, self._lobes = pointers, lobes
-            self._tracker = self._python = self._media = None
+            self._tracker = self._python = None
             self._contents.clear()
 
 
