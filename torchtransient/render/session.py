@@ -127,7 +127,11 @@ def own_array(tensor: torch.Tensor) -> Any:
 
     flat = tensor.detach().reshape(-1)
     if flat.numel() <= _FEW:
-        return mi.Float(flat.tolist())
+        few = mi.Float(flat.tolist())
+        # A single number would be a literal of the kernels, and that of the first call for ever where a plugin does not
+        # show it to Dr.Jit.
+        dr.make_opaque(few)
+        return few
     flat = flat.contiguous()
     wait_for_torch(flat)
     copy = mi.Float(flat) * dr.opaque(mi.Float, 1)
