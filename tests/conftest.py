@@ -1,5 +1,10 @@
 """What every test needs: the package first, so that it chooses the LLVM before Dr.Jit is imported."""
 
+import os
+
+# NumPy's solver, as torch below: its second thread waits by spinning. It reads this when it is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import torchtransient as torchtransient  # isort: skip
 
 import gc

@@ -62,13 +62,19 @@ def room_of(module):
     return parts[1] if len(parts) > 1 and parts[1] != "__init__" else None
 
 
+@functools.cache
+def parsed(source):
+    """The syntax tree of a source, which several tests read."""
+    return ast.parse(source)
+
+
 def imports(path, package=PACKAGE, *, for_types=True):
     """Every import of a file as (line, absolute dotted name); `from a import b` gives `a.b`.
 
     `for_types`: those under `if TYPE_CHECKING:` too.
     """
     here = ("torchtransient", *path.relative_to(package).parent.parts)
-    for node in nodes(ast.parse(path.read_text(encoding="utf-8")), for_types):
+    for node in nodes(parsed(path.read_text(encoding="utf-8")), for_types):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -158,7 +164,7 @@ def test_imports(path):
 
 @pytest.mark.parametrize("path", [f for f in FILES if f.relative_to(PACKAGE).parts[0] != "cli"], ids=dotted)
 def test_heavy_packages_are_imported_where_they_are_used(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path.read_text(encoding="utf-8"))
     at_top = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
     for node in at_top:
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""]
@@ -175,7 +181,7 @@ def test_sizes():
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= MOST_LINES["file"], dotted(path)
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(parsed(text)):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
 

@@ -173,7 +173,6 @@ def test_describe_says_what_comes_and_stops(folder):
 
 
 def test_pictures(folder):
-    pytest.importorskip("matplotlib")
     names = {"--transients": "t.png", "--peak-time": "p.png", "--layout": "l.png", "--video": "v.gif"}
     result = run("own.yaml", "--whole", "--quiet", "--every", 10, *(word for pair in names.items() for word in pair))
     assert result.exit_code == 0, result.output

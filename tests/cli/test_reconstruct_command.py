@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import h5py
 import pytest
 import torch
 from click.testing import CliRunner
@@ -151,7 +152,6 @@ def test_films_and_normals(folder):
 
 
 def test_what_a_file_leaves_open_is_asked_for(folder):
-    h5py = pytest.importorskip("h5py")
     counts = torch.poisson(torch.full((6, 6, 40), 5.0), generator=torch.Generator().manual_seed(0))
     with h5py.File("foam.mat", "w") as file:
         file["meas"] = counts.numpy()

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long_pairs
 from support.runs import T, runs
 from support.surface_samples import start
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
@@ -135,8 +136,10 @@ def test_angular_light(ratio):
     close_to(steady(over_a_plane(lamp(ratio, emitter=emitter)), 8, 1 << 18), RHO * RADIANCE * ratio**2 / 4, 2 * ratio)
 
 
-@pytest.mark.parametrize("ratio", [1e-4, 0.1, 0.7, 0.95])
-@pytest.mark.parametrize("alpha", [0.02, 0.5])
+@pytest.mark.parametrize(
+    ("ratio", "alpha"),
+    long_pairs([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5], [(1e-4, 0.02), (0.1, 0.5), (0.7, 0.02), (0.95, 0.5)]),
+)
 def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
     if ratio < 1e-3 and alpha < 0.1:
@@ -210,8 +213,14 @@ def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
     assert float(dr.max(dr.abs(off))[0]) < 3e-6 * max(1, ratio) * DISTANCE
 
 
-@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 0.1, 0.9])
-@pytest.mark.parametrize("key", ["radius", "height", "radiance"])
+@pytest.mark.parametrize(
+    ("ratio", "key"),
+    long_pairs(
+        [1e-5, 1e-3, 0.1, 0.9],
+        ["radius", "height", "radiance"],
+        [(1e-5, "radius"), (1e-3, "height"), (0.1, "radiance"), (0.9, "radius"), (0.9, "height")],
+    ),
+)
 def test_derivatives(ratio, key):
     """Of rho L (r / d)^2, in both modes."""
     scene = over_a_plane(lamp(ratio))

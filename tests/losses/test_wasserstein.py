@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+from scipy import stats
 
 from torchtransient import losses
 from torchtransient.errors import ShapeError, UnitError
@@ -41,7 +42,6 @@ def test_equals_the_distance_of_sorted_photons():
 
 
 def test_agrees_with_scipy():
-    stats = pytest.importorskip("scipy.stats")
     a, b = draw(25, 0), draw(25, 1) ** 4
     found = losses.wasserstein_loss(a, b, WIDTH, reduction="none")
     assert found.shape == (1, 2, 3)

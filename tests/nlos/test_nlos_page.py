@@ -68,7 +68,6 @@ def folder(tmp_path, monkeypatch):
 
 def test_every_block_runs(folder):
     """In one session from top to bottom."""
-    pytest.importorskip("matplotlib")
     names: dict[str, object] = {}
     for code in blocks("python"):
         exec(compile(smaller(code), str(PAGE), "exec"), names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,33 @@ def test_channels_and_batches():
         power = 2 if method == "phasor" else 1
         torch.testing.assert_close(volume.values[1, 0], 3**power * one[0], rtol=1e-6, atol=1e-9 * float(one.max()))
         assert volume.picture().shape == one.shape[1:]
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "kind"),
+    [("FK", "fk", "confocal"), ("MidpointFK", "midpoint-fk", "single"),
+     ("LCT", "lct", "confocal"), ("DirectionalLCT", "directional-lct", "confocal")],
+)  # fmt: skip
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_channels_share_one_operator(monkeypatch, name, method, kind, dtype):
+    """Whose tables cost as much as a channel; with the values and places of the operator alone."""
+    one = point_capture(scanned(kind), [PLATE], time_axis=AXIS).to(dtype)
+    operator = getattr(tt.nlos, name)(one.scan, time_axis=AXIS, dtype=dtype)
+    expected, kept = operator.reconstruct(one), (operator.depths >= 0.4) & (operator.depths <= 0.8)
+    made = []
+
+    class Counted(getattr(tt.nlos, name)):
+        def __init__(self, *arguments, **options):
+            made.append(options)
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr(sys.modules["torchtransient.nlos.reconstruct"], name, Counted)
+    three = tt.nlos.Capture(one.transient.expand(3, *one.transient.shape[1:]), AXIS, one.scan)
+    volume = tt.nlos.reconstruct(three, method, depths=(0.4, 0.8))
+    assert len(made) == 1 and volume.values.dtype == dtype and len(volume.values) == 3
+    found = volume.values if volume.directions is None else volume.directions
+    assert torch.equal(found, expected.index_select(-3, kept.nonzero()[:, 0]).expand_as(found))
+    assert volume.grid == operator.grid.at_depths(operator.depths[kept])
 
 
 def test_mistakes_have_types(tmp_path):

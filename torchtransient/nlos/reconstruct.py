@@ -19,24 +19,22 @@ from torchtransient.nlos.methods import Choice, check_method, choose_method, def
 from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
 from torchtransient.quantities import count, finite, positive, real_array, shown
 from torchtransient.reconstruction import (
+    FK,
+    LCT,
     Backprojection,
     ConfocalCamera,
+    DirectionalLCT,
     DirectLight,
     FilteredBackprojection,
     HiddenVolume,
     LaplacianFilter,
+    MidpointFK,
     PhasorField,
     PhasorFilter,
-    PlanarScan,
     TransientCamera,
     VoxelGrid,
-    directional_lct,
-    fk,
-    lct,
-    midpoint_fk,
     subtract_legs,
 )
-from torchtransient.reconstruction.midpoint_fk import Midpoints
 from torchtransient.reconstruction.proportions import check_proportions, check_reach, check_wavelength
 from torchtransient.volume_methods import FILTERS, Method
 
@@ -246,16 +244,11 @@ def _bar(total: int, progress: bool) -> Any:
 def _on_own_grid(
     name: str, capture: Capture, depths: tuple[float, float] | None, options: dict[str, Any], progress: bool
 ) -> tuple[Tensor, Tensor | None, VoxelGrid]:
-    """By a method with a plane for each bin, a channel at a time."""
-    function = {"fk": fk, "midpoint-fk": midpoint_fk, "lct": lct, "directional-lct": directional_lct}[name]
+    """By a method with a plane for each bin, a channel at a time, all by one operator."""
+    kind = {"fk": FK, "midpoint-fk": MidpointFK, "lct": LCT, "directional-lct": DirectionalLCT}[name]
     axis, transient = capture.axis, capture.transient
     assert axis is not None and transient is not None
     dim = transient.ndim - len(capture.scan.shape) - 2
-    wall = (
-        Midpoints(capture.scan, time_axis=axis).wall
-        if name == "midpoint-fk"
-        else PlanarScan.of_scan(capture.scan, "reconstruct")
-    )
     found, z = [], axis.centers_opl / 2
     seen = torch.ones_like(z, dtype=torch.bool) if depths is None else (z >= depths[0]) & (z <= depths[1])
     if not bool(seen.any()):
@@ -264,12 +257,13 @@ def _on_own_grid(
             f"{shown(depths)}."
         )
     kept = seen.nonzero()[:, 0]
+    operator = kind(capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
     with _bar(transient.shape[dim], progress) as bar:
         for channel in range(transient.shape[dim]):
             one = replace(capture, transient=transient.narrow(dim, channel, 1), steady=None, channels=())
-            found.append(function(one, **options).index_select(-3, kept.to(transient.device)))
+            found.append(operator.reconstruct(one).index_select(-3, kept.to(transient.device)))
             bar.update()
-    grid = VoxelGrid.of_wall(wall, z[kept])
+    grid = operator.grid.at_depths(z[kept])
     together = torch.cat(found, dim)
     return (together.norm(dim=-4), together, grid) if name == "directional-lct" else (together, None, grid)
 

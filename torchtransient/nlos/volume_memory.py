@@ -16,8 +16,9 @@ from torchtransient.reconstruction import VoxelGrid
 from torchtransient.render.memory import available_bytes
 from torchtransient.volume_methods import METHODS
 
-# Planes whose points backprojection holds at once, and bytes of a point: float64 and the tables of an operator.
-AT_ONCE, POINT = 4, 40
+# Planes whose points backprojection holds at once: filters run over all rows once for each such pass. Bytes of a
+# point: float64 and the tables of an operator.
+AT_ONCE, POINT = 16, 40
 
 
 def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, options: Mapping[str, Any]) -> None:
@@ -54,7 +55,8 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
         if name == "phasor":
             return 3 * number * volume
         planes = min(AT_ONCE, len(grid.depths))
-        return 2 * number * volume + POINT * planes * math.prod(grid.size)
+        # The planes of the last pass beside those before them; then all planes, and the volume that they are put into.
+        return max(2 * number * volume, number * volume + POINT * planes * math.prod(grid.size))
     rows, columns = capture.scan.sensor_shape
     rows, columns = (2 * rows, 2 * columns) if name == "midpoint-fk" else (rows, columns)
     plane, bins = rows * columns, axis.num_bins

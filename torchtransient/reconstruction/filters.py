@@ -13,8 +13,8 @@ from torch.nn import functional
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.quantities import positive
 from torchtransient.reconstruction.capture_checks import within
-from torchtransient.reconstruction.plane_waves import good_length
 from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.transform_bins import fast_length
 
 # Samples of a wavelength. Lines between them lose (pi / SAMPLES)^2 / 3 of a wave in the mean, 1.3 %.
 SAMPLES = 16
@@ -85,7 +85,7 @@ class PhasorFilter:
 
     def rows(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
         bins, (first, last) = rows.shape[-1], sample_places(rows.shape[-1], samples)
-        padded = good_length(2 * bins)
+        padded = fast_length(2 * bins)
         # Zeros between bins repeat the spectrum.
         spectrum = torch.fft.fft(rows, n=padded).repeat(*[1] * (rows.ndim - 1), samples)
         spectrum.mul_(self._response(spectrum, bin_width_opl, samples, bins))
@@ -95,7 +95,7 @@ class PhasorFilter:
     def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
         bins = (rows.shape[-1] - 1 - 2 * (samples // 2)) // samples + 1
         first, last = sample_places(bins, samples)
-        padded = good_length(2 * bins)
+        padded = fast_length(2 * bins)
         spread = rows.new_zeros(*rows.shape[:-1], padded * samples)
         spread[..., :last] = rows[..., -first:] if first else rows
         if first:

@@ -22,6 +22,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.confocal_operator import chunk_rows
 from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.transform_bins import fast_length
 
 # Longest padded axis of v over the axis itself: what a cone reaches far behind the record costs memory and time.
 LONGEST = 8
@@ -52,7 +53,7 @@ class ConeGrid:
                 f"distance with a scan whose diagonal squared is {reach:.3g} m^2. Let the time axis end later, or crop "
                 "the scan."
             )
-        return ConeGrid(edges, radii, _fast_length(max(2 * v_bins, math.ceil(needed))))
+        return ConeGrid(edges, radii, fast_length(max(2 * v_bins, math.ceil(needed)), multiple=2))
 
     @property
     def width(self) -> float:
@@ -113,16 +114,3 @@ class Resampling:
             products = part.index_select(0, columns).mul_(self.values[:, None])
             out[:, first : first + step].index_add_(0, rows, products)
         return out
-
-
-def _fast_length(least: int) -> int:
-    """The smallest even length of factors 2, 3 and 5 that is not shorter than ``least``."""
-    length = least + least % 2
-    while True:
-        rest = length
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return length
-        length += 2

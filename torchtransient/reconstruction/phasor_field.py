@@ -17,11 +17,12 @@ from torchtransient.reconstruction.cameras import Camera, DirectLight, Transient
 from torchtransient.reconstruction.capture_checks import check_falloff
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
 from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
-from torchtransient.reconstruction.plane_waves import good_length, phase_pairs, waves
+from torchtransient.reconstruction.plane_waves import phase_pairs, waves
 from torchtransient.reconstruction.proportions import check_wavelength
 from torchtransient.reconstruction.scan_operator import ScanOperator
 from torchtransient.reconstruction.transient_operator import reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.transform_bins import fast_length
 
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25
@@ -104,7 +105,7 @@ class PhasorField(ScanOperator):
         near = max(self._nearest, float(self.heights.abs().min()))
         check_falloff(self.falloff, near**2, self._lengths()[1] ** 2, dtype, "PhasorField")
         self.frequencies, self.band_weights = self._band()
-        self.shape_fft = tuple(good_length(s + v - 1) for s, v in zip(self.wall.size, points.size, strict=True))
+        self.shape_fft = tuple(fast_length(s + v - 1) for s, v in zip(self.wall.size, points.size, strict=True))
         self._set_tables()
 
     grid: VoxelGrid

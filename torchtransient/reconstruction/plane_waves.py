@@ -1,4 +1,4 @@
-"""Waves of evenly spaced frequencies over fields of distances, and the lengths of transforms."""
+"""Waves of evenly spaced frequencies over fields of distances."""
 
 from __future__ import annotations
 
@@ -36,16 +36,3 @@ def _turned(turns: Tensor) -> Tensor:
 def phase_pairs(turns: Tensor) -> Tensor:
     """(..., 2): real and imaginary part of ``exp(2 pi i turns)``, float64."""
     return torch.view_as_real(_turned(turns))
-
-
-def good_length(least: int) -> int:
-    """The next length with no prime factor above 5, which transforms are fast at."""
-    length = least
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 1

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError
 from torchtransient.sensing.layout import TIME, check_transient, without_autocast
+from torchtransient.transform_bins import fast_length
 
 Boundary = Literal["zero", "periodic"]
 Method = Literal["auto", "direct", "fft"]
@@ -94,7 +95,7 @@ def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
     bins, taps = rows.shape[-1], kernel.numel()
     # Twice the bins hold every lag in (-bins, bins) without wrapping into the window: at least bins + taps - 1 if the
     # lags lie on one side, and one side does not reach the other.
-    length = bins if boundary == "periodic" else _good_length(2 * bins + taps)
+    length = bins if boundary == "periodic" else fast_length(2 * bins + taps)
     transfer = torch.fft.rfft(kernel.to(torch.float64), n=length)
     return filter_rows(rows.to(torch.float64), transfer, length, first, bins).to(rows.dtype)
 
@@ -113,15 +114,3 @@ def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: i
     slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
     value = y.detach()
     return y - torch.where((value < 0) & (value >= -slack), value, 0.0)
-
-
-def _good_length(length: int) -> int:
-    """The next length whose only prime factors are 2, 3 and 5."""
-    while True:
-        rest = length
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return length
-        length += 1
