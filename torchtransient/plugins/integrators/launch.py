@@ -115,3 +115,8 @@ def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
     while (left := spp - sum(counts)) > 0:
         counts.append(drawn(min(most, left)))
     return counts
+
+
+def share_of(progress: Any, part: int, count: int) -> Any:
+    """The progress of one of several parts of a job."""
+    return progress and (lambda done: progress((part + done) / count))

@@ -24,6 +24,7 @@ from torchtransient.plugins.around_corner.shared_light import (
 )
 from torchtransient.plugins.integrators import base
 from torchtransient.plugins.integrators.base import UNLIMITED
+from torchtransient.plugins.integrators.launch import share_of
 from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
@@ -268,7 +269,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         if division.walks:
             parts.append(lambda run: follow_paths(world, sensor, film, run))
         for i, part in enumerate(parts):
-            part(replace(job, progress=_share_of(job.progress, i, len(parts))))
+            part(replace(job, progress=share_of(job.progress, i, len(parts))))
 
     def refusal_of(self, job: Any) -> str | None:
         if job.world.wanted is None and (job.world.division.third_bounce or job.world.division.chained):
@@ -374,11 +375,6 @@ def _choice(props: Any, name: str, shared: str) -> str:
     if value not in ("auto", shared, "paths"):
         raise SceneError(f"transient_nlos_path: {name}: expected auto, {shared} or paths, got {value!r}.")
     return value
-
-
-def _share_of(progress: Any, part: int, count: int) -> Any:
-    """The progress of one of several parts of a job."""
-    return progress and (lambda done: progress((part + done) / count))
 
 
 def _scanned(scene: Any, sensor: Any) -> Any:
