@@ -35,6 +35,8 @@ class Scene:
         self._builds: OrderedDict[BuildOptions, BuiltScene] = OrderedDict()
         # Not in the built scenes: what refers to itself is freed late.
         self._slots: dict[BuildOptions, dict[tuple[str, ...], SlotTable]] = {}
+        # Built scenes that still hold the values of the last run: the next one most likely brings its own.
+        self._unsettled: dict[BuildOptions, SlotTable] = {}
         self._recordings: dict[BuildOptions, dict[tuple[str, ...], Recordings]] = {}
         self._table: ParameterTable | None = None
         # Which unphysical things were said already (`render.physics`).
@@ -62,7 +64,13 @@ class Scene:
             return self._table
 
     def built(self, options: BuildOptions) -> BuiltScene:
-        """The Mitsuba scene for some options. Must be called inside ``active_variant(scene.variant)``."""
+        """The Mitsuba scene for some options, with the described values. Must be called inside
+        ``active_variant(scene.variant)``.
+        """
+        self._settle(options)
+        return self._build(options)
+
+    def _build(self, options: BuildOptions) -> BuiltScene:
         found = self._builds.get(options)
         if found is None:
             found = build(self._description, self.variant, options)
@@ -83,6 +91,7 @@ class Scene:
     def drop(self, options: BuildOptions) -> None:
         """Forget one built scene; the next use builds it anew."""
         self._builds.pop(options, None)
+        self._unsettled.pop(options, None)
         self._slots.pop(options, None)
         self._recordings.pop(options, None)
 
@@ -107,14 +116,37 @@ class Scene:
         return replace(options, substitute=frozenset(substitute), real_bitmaps=True, merge=False)
 
     def slots(self, keys: Iterable[str], options: BuildOptions) -> SlotTable:
-        """How torch values for ``keys`` enter the built scene. Must be called inside
-        ``active_variant(scene.variant)``.
+        """How torch values for ``keys`` enter the built scene, which holds the described values or those of the last
+        run with these keys. Must be called inside ``active_variant(scene.variant)``.
         """
-        built, wanted = self.built(options), tuple(keys)
+        wanted = tuple(keys)
+        found = self._slots.setdefault(options, {}).get(wanted)
+        if found is not None and self._unsettled.get(options) is found:
+            del self._unsettled[options]
+            self._builds.move_to_end(options)
+            return found
+        built = self.built(options)
+        # Whoever built it may have dropped others, or this one's tables.
         tables = self._slots.setdefault(options, {})
         if wanted not in tables:
             tables[wanted] = SlotTable(built, wanted)
         return tables[wanted]
+
+    def leave(self, options: BuildOptions, slots: SlotTable) -> None:
+        """End of a run: the described values are put back when the built scene is asked for by anyone but a run with
+        the same keys.
+        """
+        if slots.originals and self._builds.get(options) is slots.built:
+            self._unsettled[options] = slots
+
+    def _settle(self, options: BuildOptions) -> None:
+        slots = self._unsettled.pop(options, None)
+        if slots is not None:
+            try:
+                slots.restore()
+            except BaseException:
+                self.drop(options)
+                raise
 
     def recordings(self, keys: Iterable[str], options: BuildOptions) -> Recordings:
         """The recorded calls of the built scene with values for ``keys``."""

@@ -1,4 +1,6 @@
-"""A built scene in use: values are installed for one run and the described ones put back, under one lock."""
+"""A built scene in use: values are installed for one run under one lock, and the described ones put back before
+anybody else looks.
+"""
 
 from __future__ import annotations
 
@@ -171,9 +173,8 @@ def session_of(job: RenderJob) -> Iterator[Session]:
         try:
             with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
                 yield session
-        finally:
-            try:
-                slots.restore()
-            except BaseException:
-                job.scene.drop(job.options)
-                raise
+        except BaseException:
+            job.scene.leave(job.options, slots)
+            job.scene.built(job.options)  # puts the described values back, or drops the scene
+            raise
+        job.scene.leave(job.options, slots)
