@@ -1,6 +1,6 @@
 """Forward: `transient_path` against Mitsuba's steady `path` and `prb`, and mitransient against its own `path`.
 
-Cornell box, 256 x 256, 64 spp, depth 8, 300 and 2048 bins. Bars: 1.22 x the steady `path` at 300 bins and 1.38 x at
+Cornell box, 256 x 256, 64 spp, depth 8, 300 and 2048 bins. Bars: 1.16 x the steady `path` at 300 bins and 1.26 x at
 2048. With `--peer-python` the peer runs between our runs, in its own process and environment, and is compared with its
 own `path`.
 """
@@ -12,7 +12,7 @@ from _runner import steady
 
 from torchtransient.scenes import cornell_box
 
-BARS = {300: 1.22, 2048: 1.38}
+BARS = {300: 1.16, 2048: 1.26}
 
 
 def rows(scenes: dict[int, dict]) -> list[Row]:

@@ -41,11 +41,12 @@ class Batch:
             film.lend(None)
 
     def _lend(self, film: Any, n: int, entries: int) -> None:
-        import drjit as dr
         import mitsuba as mi
 
+        from torchtransient.plugins.films.base import zeros
+
         if self._memory is None:
-            self._memory, self._shape = dr.zeros(mi.Float, self.count * entries), tuple(film.cube_shape())
+            self._memory, self._shape = zeros(mi.Float, self.count * entries), tuple(film.cube_shape())
         film.lend((self._memory, n * entries))
 
     def take(self, film: Any, n: int) -> None:

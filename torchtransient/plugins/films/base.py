@@ -20,6 +20,19 @@ MAX_ARRAY_ENTRIES = 2**32 - 1
 # processors, which add up a packet first), 2^20 to 3e-4, 2^26 only to 1.5e-2. Larger jobs are summed in double
 # precision.
 MAX_SINGLE_PRECISION_SAMPLES = 2**16
+# From this many values on zeros are written by all threads, in a kernel of their own.
+MANY_VALUES = 2**23
+
+
+def zeros(real, size):
+    """An array of zeros for a film. Dr.Jit lets one thread of a processor write those of ``dr.zeros``, and where the
+    memory is new, that thread waits for every page.
+    """
+    if dr.backend_v(real) is not dr.JitBackend.LLVM or size < MANY_VALUES:
+        return dr.zeros(real, size)
+    values = dr.gather(real, dr.opaque(real, 0), dr.zeros(mi.UInt32, size))
+    dr.eval(values)
+    return values
 
 
 @FilmInterface.register
@@ -44,6 +57,8 @@ class TimeResolvedFilm(mi.Film):
     knows_exclusive_lanes = False
     # Films outside of this library say it of themselves, see :class:`..integrators.base.TransientIntegrator`.
     can_be_recorded = False
+    # Whether ``put`` takes the word that most lanes add something at once.
+    knows_crowds = False
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
     has_slope = True
     pulses = ()
@@ -168,8 +183,9 @@ class TimeResolvedFilm(mi.Film):
         height, width = self.cube_shape()[:2]
         real = mi.Float64 if samples > MAX_SINGLE_PRECISION_SAMPLES else mi.Float
         per_row = width * self.entries_per_pixel()
+        self.clear()  # the memory of the last render is that of this one
         if self._lent is None:
-            self.bands = [(first, rows, dr.zeros(real, rows * per_row)) for first, rows in self.band_layout()]
+            self.bands = [(first, rows, zeros(real, rows * per_row)) for first, rows in self.band_layout()]
         else:
             if real is not mi.Float:
                 raise StorageError(

@@ -29,18 +29,22 @@ class FilmBlock:
         """What the film carries along a path: loop state, handed back at every event."""
         return {}
 
-    def put(self, events, opl, value, active):
-        """Write a contribution; returns what fell before and after the window (mean over channels)."""
+    def put(self, events, opl, value, active, crowded=False):
+        """Write a contribution; returns what fell before and after the window (mean over channels). ``crowded``: most
+        lanes have one, see :class:`~..transport.strategy.Event`.
+        """
         channels = self.match.to_channels(value)
-        before, after = self.store(opl, channels, active)
+        before, after = self.store(opl, channels, active, crowded)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
 
-    def store(self, opl, channels, active):
+    def store(self, opl, channels, active, crowded):
         """Write to the film; returns the fractions before and after the window."""
-        # Films that know nothing of it add atomically.
-        alone = {"exclusive": True} if self.exclusive else {}
-        return self.film.put(self.band, self.base, self.counted(opl), channels, active, **alone)
+        # Films that know nothing of it add as always.
+        how = {"exclusive": True} if self.exclusive else {}
+        if crowded and self.film.knows_crowds:
+            how["crowded"] = True
+        return self.film.put(self.band, self.base, self.counted(opl), channels, active, **how)
 
     def counted(self, opl):
         """A path length from the film's start on, ``Float64``."""

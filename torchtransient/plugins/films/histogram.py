@@ -19,6 +19,8 @@ from torchtransient.plugins.properties import truth, whole_number
 
 # Kernels of more bins are looped over instead of written out.
 MAX_UNROLLED = 9
+# From so many bins on, hardly any two lanes beside each other add to the same one.
+MANY_BINS = 64
 # Temporal filters of other settings that a film keeps.
 MAX_FILTERS = 8
 
@@ -40,9 +42,10 @@ class HistogramBlock(FilmBlock):
         self.scale = mi.Float(1 / film.bin_width_opl)
         dr.eval(self.fraction, self.window, self.first)
 
-    def store(self, opl, channels, active):
+    def store(self, opl, channels, active, crowded):
         x = dr.fma(mi.Float(opl), self.scale, self.fraction)
-        cube, mode = self.film.band_array(self.band), reduce_mode(self.exclusive)
+        cube = self.film.band_array(self.band)
+        mode = self.film.reduce_mode(cube, self.exclusive, crowded)
         return self.film.put_bins(cube, self.first, x, self.window, channels, active, mode)
 
 
@@ -92,7 +95,7 @@ class TransientHDRFilm(TimeResolvedFilm):
 
     plugin = "transient_hdr_film"
     can_be_recorded = True
-    knows_exclusive_lanes = True
+    knows_exclusive_lanes = knows_crowds = True
     measures = "transient"
 
     def __init__(self, props):
@@ -201,7 +204,14 @@ class TransientHDRFilm(TimeResolvedFilm):
             return super().create_block(job, base, match, most_events, tangents, exclusive, origin)
         return HistogramBlock(self, job.band, base, match, exclusive, origin)
 
-    def put(self, band, base, opl_from_start, value, active, exclusive=False, laser=None):
+    def reduce_mode(self, cube, exclusive, crowded):
+        """How lanes add to ``cube``. A processor takes them one by one: where many add, it costs more to look for those
+        that share a bin than to add each. Of a small array Dr.Jit gives every thread its own.
+        """
+        looks = dr.backend_v(cube) is dr.JitBackend.LLVM and dr.width(cube) > dr.expand_threshold()
+        return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
+
+    def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None):
         """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
         otherwise.
         """
@@ -212,7 +222,8 @@ class TransientHDRFilm(TimeResolvedFilm):
         if self._long:
             layout = BinLayout(cube, base, channels, 1, bins, channels, exclusive)
             return put_long(layout, self.filter, x, value, None, active)
-        return self.put_bins(cube, base, x, (0, bins), value, active, reduce_mode(exclusive))
+        mode = self.reduce_mode(cube, exclusive, crowded)
+        return self.put_bins(cube, base, x, (0, bins), value, active, mode)
 
     def put_bins(self, cube, base, x, window, value, active, mode):
         """Add to the bins that the filter reaches from ``x``, in bins (``Float`` or ``Float64``). ``base``: index of

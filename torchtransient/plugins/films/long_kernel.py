@@ -20,9 +20,13 @@ class BinLayout:
         self.mode = reduce_mode(exclusive)
 
 
-def reduce_mode(exclusive):
-    """How lanes add that share their target with others (``Auto``: atomically), or that have one of their own."""
-    return dr.ReduceMode.NoConflicts if exclusive else dr.ReduceMode.Auto
+def reduce_mode(exclusive, direct=False):
+    """How lanes add that share their target with others (``Auto``: atomically, lanes with the same address together),
+    or that have one of their own. ``direct``: each lane by itself.
+    """
+    if exclusive:
+        return dr.ReduceMode.NoConflicts
+    return dr.ReduceMode.Direct if direct else dr.ReduceMode.Auto
 
 
 @dr.syntax

@@ -61,7 +61,7 @@ class EventBlock(FilmBlock):
     def begin(self):
         return {"count": mi.UInt32(0), "path": dr.arange(mi.UInt32, self.paths)}
 
-    def put(self, events, opl, value, active):
+    def put(self, events, opl, value, active, crowded=False):
         channels, opl = self.match.to_channels(value), self.counted(opl)
         more = self._store(events, opl, channels, active)
         if self.overflows:

@@ -6,6 +6,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.transport.connection.emitter_found import EmitterFound
 from torchtransient.plugins.transport.connection.emitter_sampled import EmitterSampled
+from torchtransient.plugins.transport.scattering.lambertian import Lambertian
 from torchtransient.plugins.transport.scattering.surface import Surface
 from torchtransient.plugins.transport.segment.vacuum import Vacuum
 
@@ -29,7 +30,8 @@ class TransientPath(TransientIntegrator):
     can_be_recorded = True
 
     def strategies(self, contents):
-        return Vacuum(), Surface(), [EmitterFound(), EmitterSampled()]
+        scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()
+        return Vacuum(), scattering, [EmitterFound(), EmitterSampled()]
 
 
 register("integrator", "transient_path", TransientPath)

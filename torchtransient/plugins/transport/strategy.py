@@ -78,8 +78,11 @@ class GuidedPoint(Local):
 class Event(Local):
     """Light that arrives: ``value`` (throughput included), ``opl`` (Float64, minus the film's start), ``active``,
     ``depth`` (UInt32, the smallest ``max_depth`` of a render that contains it), and what the strategy records of it.
-    The loop makes ``value`` zero where it is not active.
+    The loop makes ``value`` zero where it is not active. ``crowded`` (static): most paths have it at once, so that sums
+    are added up without a search for lanes that share an address.
     """
+
+    crowded = False
 
 
 class EventTerm(Local):
@@ -228,7 +231,7 @@ class Connection(Strategy):
 
     def connect(self, world: Any, path: Any, vertex: Vertex, proposal: Any, answer: Any, zeros: bool) -> Event:
         """The event. ``zeros`` (static): events of value zero matter for a derivative, so that the visible ones of
-        them are active, too.
+        them are active, too, unless no attached parameter can change them.
         """
         raise NotImplementedError
 
@@ -299,6 +302,8 @@ class Scattering(Strategy):
 
     name = "scattering"
     guides: Any = ()
+    # Static: whether its value is zero wherever its density is, for all values of its parameters.
+    samples_all = False
 
     def arrive(self, world: Any, path: Any, vertex: Vertex, sampler: Any) -> None:
         """Look up how the vertex scatters, before any connection is proposed."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.polarized import intensity, product, scatter_unpolarized
 from torchtransient.plugins.sampling.sun import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
@@ -29,6 +30,8 @@ class EmitterSampled(Connection):
         self.spheres = None if lights is None else lights.read(world.scene)
         sky = None if world.wanted is None else world.wanted.sky
         self.sun = None if sky is None else MovingSun(sky)
+        # A light without attached numbers is dark where it is dark.
+        self.lights_change = world.wanted is not None and any(map(carries_derivatives, world.scene.emitters()))
 
     def tables(self):
         return [] if self.spheres is None else self.spheres.tables()
@@ -71,13 +74,22 @@ class EmitterSampled(Connection):
         pdf = dr.select(ds.delta, 0, answer.pdf)
         value = product(vertex.β, answer.value) * self.weight(world, vertex.at, ds, ds.pdf, pdf, active)
         value *= mi.unpolarized_spectrum(proposal.weight)
-        if not zeros:  # shadow rays only where they can matter; the derivative of a zero may matter
-            active = active & (dr.max(dr.abs(intensity(value))) > 0)
+        # Shadow rays only where they can matter.
+        active = active & (self._may_change(world, proposal, answer) if zeros else is_light(intensity(value)))
         length = self._length(world, vertex.at.p, ds, ds.d) * (vertex.η * answer.eta)
         opl = vertex.scattered_τ + mi.Float64(length)
         active = world.counted(active, opl)
         active, T = world.segment.transmittance(world, vertex, ds, proposal.u, proposal.sampler, active)
-        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T)
+        return Event(value=value * T, opl=opl, active=active, depth=path.depth + 2, T=T, crowded=True)
+
+    def _may_change(self, world, proposal, answer):
+        """Whether a sample of value zero may have a derivative: with an albedo of zero, but not behind a surface."""
+        may = mi.Bool(True)
+        if not self.lights_change:
+            may &= is_light(mi.unpolarized_spectrum(proposal.weight))
+        if world.scattering.samples_all:
+            may &= answer.pdf > 0
+        return may
 
     @staticmethod
     def _length(world, p, ds, d):
@@ -234,3 +246,8 @@ class EmitterSampled(Connection):
         if wanted.sphere_lights:
             value = dr.select(light.cone, mi.unpolarized_spectrum(light.cone_weight), value)
         return dr.replace_grad(light.weight, value)
+
+
+def is_light(value):
+    """Whether a spectrum is not zero."""
+    return dr.max(dr.abs(value)) > 0

@@ -12,9 +12,15 @@ from torchtransient.plugins.transport.strategy import Answer, Step
 
 
 class Lambertian(Surface):
-    """:class:`.surface.Surface` for scenes that :meth:`fits`."""
+    """:class:`.surface.Surface` for scenes that :meth:`fits`. ``draws_lobe``: draw the number that chooses a lobe, so
+    that a seed gives the same paths as there.
+    """
 
-    turns_freely = True
+    turns_freely = samples_all = True
+
+    def __init__(self, guides=(), draws_lobe=False):
+        super().__init__(guides)
+        self.draws_lobe = draws_lobe
 
     @staticmethod
     def fits(contents):
@@ -27,12 +33,14 @@ class Lambertian(Surface):
         vertex.u_delay = vertex.u_part = None
         vertex.bsdf = si.bsdf(path.ray)
         vertex.delay, vertex.scattered_si = DelaySample(vertex.bsdf), si
-        vertex.side = _side(vertex.bsdf, si)
-        vertex.ρ = _albedo(vertex.bsdf, si, vertex.goes_on)
         vertex.connectable = mi.Bool(True)
 
     def scatter(self, world, path, vertex, proposals, sampler):
+        u_lobe = sampler.next_1d() if self.draws_lobe else mi.Float(0)
         u_dir = sampler.next_2d()
+        # After the lights were asked, as BSDFs are: kernels of a scene are then the same whatever was rendered before.
+        vertex.side = _side(vertex.bsdf, vertex.si)
+        vertex.ρ = _albedo(vertex.bsdf, vertex.si, vertex.goes_on)
         answers = [None if p is None else self._towards(vertex, p.d) for p in proposals]
         wo = mi.warp.square_to_cosine_hemisphere(u_dir)
         pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
@@ -40,7 +48,7 @@ class Lambertian(Surface):
         wo.z *= vertex.side
         step = Step(
             out=vertex.si.to_world(wo), wo=wo, weight=dr.select(lit, vertex.ρ, 0), pdf=dr.select(lit, pdf, 0),
-            eta=mi.Float(1), u_lobe=mi.Float(0), u_dir=u_dir, u_delay=None, u_part=None, delta=mi.Bool(False),
+            eta=mi.Float(1), u_lobe=u_lobe, u_dir=u_dir, u_delay=None, u_part=None, delta=mi.Bool(False),
             unconnected=mi.Bool(False),
         )  # fmt: skip
         if self.guides:

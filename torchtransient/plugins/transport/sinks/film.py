@@ -23,7 +23,7 @@ class FilmSink(Sink):
 
     def event(self, kept, event):
         kept["L"] = kept["L"] + event.value
-        before, after = self.block.put(kept["block"], event.opl, event.value, event.active)
+        before, after = self.block.put(kept["block"], event.opl, event.value, event.active, event.crowded)
         kept["before"] = kept["before"] + before
         kept["after"] = kept["after"] + after
 

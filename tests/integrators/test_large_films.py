@@ -1,0 +1,56 @@
+"""Films of many values: all threads make them zero, and lanes add to them directly."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.gradient_cases.scenes import camera, room
+
+VARIANT = "llvm_ad_rgb"
+pytestmark = pytest.mark.usefixtures("no_leftovers")
+BINS, SIZE = 700, 64
+
+
+@pytest.fixture
+def scene():
+    sensor = camera(fov=60.0, bins=BINS, width=0.02, start=4.0, size=SIZE, filter="box")
+    return mi.load_dict(room(sensor=sensor))
+
+
+def functions_of(film):
+    return type(film).prepare.__globals__
+
+
+def test_memory_is_zero_at_the_start_of_every_render(scene):
+    film = scene.sensors()[0].film()
+    assert SIZE * SIZE * film.entries_per_pixel() > functions_of(film)["MANY_VALUES"]
+    first = np.array(scene.integrator().render(scene, seed=1, spp=4)[1])
+    again = np.array(scene.integrator().render(scene, seed=1, spp=4)[1])
+    assert first.sum() > 0
+    np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-7)
+    film.prepare()
+    assert not np.array(film.band_array(0)).any()
+    assert film.band_array(0).state == dr.VarState.Evaluated
+
+
+def test_direct_sums_lose_nothing(scene, monkeypatch):
+    """The transient of lanes that add each by itself is that of lanes that add together, and sums to the image."""
+    film = scene.sensors()[0].film()
+    assert film.reduce_mode(dr.zeros(mi.Float, SIZE * SIZE * BINS * 3), False, True) == dr.ReduceMode.Direct
+    steady, direct = (np.array(t, dtype=np.float64) for t in scene.integrator().render(scene, seed=1, spp=64))
+    inside = direct.sum()
+    outside = (film.energy_before + film.energy_after) * film.channel_count()
+    np.testing.assert_allclose(inside + outside, steady.sum(), rtol=1e-5)
+    monkeypatch.setattr(type(film), "knows_crowds", False)
+    together = np.array(scene.integrator().render(scene, seed=1, spp=64)[1], dtype=np.float64)
+    np.testing.assert_allclose(direct, together, rtol=1e-4, atol=1e-6 * together.max())
+
+
+def test_few_bins_and_small_films_are_added_up_by_dr_jit(scene):
+    film = scene.sensors()[0].film()
+    assert film.reduce_mode(dr.zeros(mi.Float, 1000), False, True) == dr.ReduceMode.Auto
+    assert film.reduce_mode(dr.zeros(mi.Float, 2**24), False, False) == dr.ReduceMode.Auto
+    assert film.reduce_mode(dr.zeros(mi.Float, 2**24), True, True) == dr.ReduceMode.NoConflicts

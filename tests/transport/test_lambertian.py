@@ -1,0 +1,89 @@
+"""Scenes of Lambertian surfaces: the paths and derivatives of those of any BSDF, and shadow rays only where something
+can depend on them.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from support.gradient_cases.scenes import area_light, room, transform
+
+VARIANT = "llvm_ad_rgb"
+pytestmark = pytest.mark.usefixtures("no_leftovers")
+ALBEDO = "side.bsdf.reflectance.value"
+
+
+def described():
+    return room({"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.5}}, area_light())
+
+
+def name_in(integrator, name):
+    """What a module of the active variant calls so."""
+    return type(integrator).strategies.__globals__[name]
+
+
+def gradient(scene, key):
+    """The gradient of the transient times a pattern that differs from bin to bin."""
+    params = mi.traverse(scene)
+    value = type(params[key])(dr.detach(params[key]))
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    shape = scene.sensors()[0].film().cube_shape()
+    size = int(np.prod(shape))
+    pattern = mi.TensorXf(1 + dr.sin(dr.arange(mi.Float, size) * 0.01), shape)
+    scene.integrator().render_backward(scene, params, (None, pattern), seed=3, spp=256)
+    return np.array(dr.grad(value)).ravel()
+
+
+def test_paths_are_those_of_any_surface(monkeypatch):
+    """Same seed, same transient and gradient, whether BSDFs are asked or not."""
+    scene = mi.load_dict(described())
+    lambertian = name_in(scene.integrator(), "Lambertian")
+    assert lambertian.fits(scene.integrator().contents(scene, scene.sensors()[0]))
+    found = np.array(scene.integrator().render(scene, seed=1, spp=64)[1]), gradient(scene, ALBEDO)
+    monkeypatch.setattr(lambertian, "fits", staticmethod(lambda contents: False))
+    asked = np.array(scene.integrator().render(scene, seed=1, spp=64)[1]), gradient(scene, ALBEDO)
+    assert asked[0].max() > 0
+    np.testing.assert_allclose(found[0], asked[0], rtol=1e-4, atol=1e-5 * asked[0].max())
+    np.testing.assert_allclose(found[1], asked[1], rtol=1e-4)
+
+
+def test_samples_without_derivative_are_left_out(monkeypatch):
+    """The gradient by an albedo is the same when shadow rays are traced for all samples of value zero."""
+    scene = mi.load_dict(described())
+    few = gradient(scene, ALBEDO)
+    sampled = name_in(scene.integrator(), "EmitterSampled")
+    monkeypatch.setattr(sampled, "_may_change", lambda self, world, proposal, answer: mi.Bool(True))
+    np.testing.assert_allclose(few, gradient(scene, ALBEDO), rtol=1e-4)
+
+
+def test_black_texels_of_a_lamp_have_derivatives():
+    """Light is linear in the slide of a projecting lamp: derivatives are the same where the slide is black."""
+
+    def by_texel(texels):
+        bitmap = mi.Bitmap(np.repeat(np.float32(texels)[:, :, None], 3, axis=2))
+        slide = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+        pose = transform().look_at(origin=[0.5, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
+        lamp = {"type": "spot", "to_world": pose, "intensity": 10.0, "cutoff_angle": 30.0, "texture": slide}
+        return gradient(mi.load_dict(room(light=lamp)), "light.texture.data")
+
+    chequered = np.where(np.indices((4, 4)).sum(0) % 2, 1.0, 0.0)
+    expected = by_texel(np.ones((4, 4)))
+    assert (expected.reshape(16, 3)[chequered.ravel() == 0] > 0).any()
+    np.testing.assert_allclose(by_texel(chequered), expected, rtol=1e-4, atol=1e-5 * expected.max())
+
+
+def test_a_black_albedo_has_its_derivative():
+    """The derivative by an albedo, linear in the light that falls on a surface, has no jump at zero."""
+
+    def at(reflectance):
+        scene = mi.load_dict(described() | {"side": room(side_reflectance=reflectance)["side"]})
+        return gradient(scene, ALBEDO)
+
+    black, dark = at(0.0), at(1e-3)
+    assert (black > 0).all()
+    np.testing.assert_allclose(black, dark, rtol=0.01)
