@@ -321,9 +321,11 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         return contents, Wanted(effects, sensor, contents)
 
-    def _record(self, world, film, rays):
-        """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
-        sink = RecordSink()
+    def _record(self, world, film, rays, block=None):
+        """Record the paths of one pass, with their arrivals for the adjoint ``block``: (layout of the record, the
+        record, number of vertices).
+        """
+        sink = RecordSink(block)
         count, store = self._walk(world, film, rays, sink)
         return sink.layout, store, count
 
@@ -332,7 +334,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         match = self.channel_match(film, rays)
         _, pixel = self.pixel_indices(film, job, rays)
         block = incoming.block(rays, pixel, match)
-        adjoint = reverse(world, *self._record(world, film, rays), block, dr.detach(rays.ray))
+        adjoint = reverse(world, *self._record(world, film, rays, block), block, dr.detach(rays.ray))
         with dr.resume_grad():
             if world.wanted.sensor or dr.grad_enabled(rays.η):
                 # What carries a sensor may move without its rays: they go to points that are given.

@@ -10,17 +10,24 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.transport.sinks.arrivals import Arrivals
 from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Local
 
 
 class RecordSink(Sink):
-    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it."""
+    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
+
+    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them.
+    """
 
     zeros = True
 
+    def __init__(self, block=None):
+        self.block = block
+
     def begin(self, world):
-        self.layout = RecordLayout(world)
+        self.layout = RecordLayout(world, None if self.block is None else Arrivals(world, self.block))
         return self.layout.allocate(world.max_depth + 1)
 
     def vertex(self, kept, path, samples):
@@ -33,8 +40,9 @@ class RecordLayout:
     Masks share the bits of one word: Dr.Jit 1.5 cannot compile a local array of masks (invalid LLVM IR).
     """
 
-    def __init__(self, world):
+    def __init__(self, world, arrivals=None):
         self.world = world
+        self.arrivals = arrivals if arrivals is not None and arrivals.together else None
         types = {("walk", name): kind for name, kind in self._of_walk(world).items()}
         for s in world.strategies():
             types |= {(s.name, name): kind for name, kind in s.fields(world).items()}
@@ -52,6 +60,8 @@ class RecordLayout:
     def allocate(self, size):
         """Local arrays for ``size`` vertices."""
         arrays = {f"{s}.{name}": dr.alloc_local(kind, size) for (s, name), kind in self.types.items()}
+        if self.arrivals is not None:
+            arrays |= self.arrivals.allocate()
         return arrays | {"flags": dr.alloc_local(mi.UInt32, size)}
 
     def write(self, store, path, samples):
@@ -65,6 +75,8 @@ class RecordLayout:
         for (s, name), bit in self.bits.items():
             flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
         store["flags"].write(flags, k, active)
+        if self.arrivals is not None:
+            self.arrivals.write(store, k, samples)
 
     def mask(self, flags, s, name):
         """One mask out of the word ``flags`` of a vertex."""
@@ -95,6 +107,11 @@ class RecordedVertex(Local):
         if name not in self._read:
             self._read[name] = self.store[name].read(self.k, self.active)
         return self._read[name]
+
+    def place(self, name):
+        """The place of the event of a connection among the path's arrivals, None where they are not listed."""
+        arrivals = self.layout.arrivals
+        return None if arrivals is None else arrivals.place(self.k, name)
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
