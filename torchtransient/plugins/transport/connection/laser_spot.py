@@ -133,7 +133,7 @@ class LaserSpot(Connection):
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length + leg)
         value = product(vertex.carry.β, value)
-        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, place=vertex.v.place(self.name))]
+        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=vertex.v.arrival(self.name))]
 
 
 class GeneralSpot:

@@ -41,9 +41,9 @@ def step_back(world, layout, store, block, ray, k, live, adjoint, following):
 
 def adjoint_at(layout, store, block, term):
     """The film's adjoint at the arrival of an event, and its slope."""
-    if layout.arrivals is None or term.place is None:
+    if layout.arrivals is None or term.arrival is None:
         return block.read(term.opl, term.active)
-    return layout.arrivals.adjoint(store, block, term.place, term.active)
+    return layout.arrivals.adjoint(store, block, term.arrival, term.active)
 
 
 @dr.syntax

@@ -46,6 +46,8 @@ class RecordLayout:
         types = {("walk", name): kind for name, kind in self._of_walk(world).items()}
         for s in world.strategies():
             types |= {(s.name, name): kind for name, kind in s.fields(world).items()}
+        if self.arrivals is not None:
+            types |= {(arrivals.name, name): kind for name, kind in arrivals.fields().items()}
         masks = [key for key, kind in types.items() if kind is mi.Bool]
         if len(masks) > 32:
             raise SceneError(f"record of a path: expected at most 32 masks of all strategies, got {len(masks)}.")
@@ -69,14 +71,14 @@ class RecordLayout:
         k, active = path.depth, path.active
         values = {"walk": vars(samples["walk"])}
         values |= {s.name: s.record(samples[s.name]) for s in self.world.strategies()}
+        if self.arrivals is not None:
+            values[self.arrivals.name] = self.arrivals.append(store, samples)
         for s, name in self.types:
             store[f"{s}.{name}"].write(values[s][name], k, active)
         flags = mi.UInt32(0)
         for (s, name), bit in self.bits.items():
             flags |= dr.select(values[s][name], mi.UInt32(bit), 0)
         store["flags"].write(flags, k, active)
-        if self.arrivals is not None:
-            self.arrivals.write(store, k, samples)
 
     def mask(self, flags, s, name):
         """One mask out of the word ``flags`` of a vertex."""
@@ -108,10 +110,10 @@ class RecordedVertex(Local):
             self._read[name] = self.store[name].read(self.k, self.active)
         return self._read[name]
 
-    def place(self, name):
-        """The place of the event of a connection among the path's arrivals, None where they are not listed."""
+    def arrival(self, name):
+        """The number of a connection's event among the arrivals of the path, None where they are not listed."""
         arrivals = self.layout.arrivals
-        return None if arrivals is None else arrivals.place(self.k, name)
+        return None if arrivals is None else arrivals.number(self.of(arrivals.name), name)
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
