@@ -10,7 +10,7 @@ import mitsuba as mi
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.long_kernel import reduce_mode
-from torchtransient.plugins.films.phasor_adjoint import AdjointRows, PhasorAdjointBlock, Phases, read_arrivals
+from torchtransient.plugins.films.phasor_adjoint import AdjointRows, Phases, PhasorAdjointBlock, read_arrivals
 from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, rotation, slots_for
 from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 

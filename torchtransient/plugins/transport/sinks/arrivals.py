@@ -21,10 +21,11 @@ class Arrivals:
         self.most = world.max_depth * len(self.connections)
         self.together = block.together(self.most, self.with_slope)
         self.channels = block.film.channel_count()
+        self.lanes = dr.width(block.base)
 
     def fields(self):
         """Types of what a vertex records."""
-        return {"first": mi.UInt32} | {name: mi.Bool for name in self.connections}
+        return {"first": mi.UInt32} | dict.fromkeys(self.connections, mi.Bool)
 
     def allocate(self):
         """Thread-local memory of a path."""
@@ -33,7 +34,8 @@ class Arrivals:
         # What is read at once may end behind the last one.
         size = -(-self.most // self.together) * self.together
         kept = {name: dr.alloc_local(mi.Float, size) for name in numbers}
-        return kept | {"arrivals": mi.UInt32(0), "opl": dr.alloc_local(mi.Float64, size)}
+        # As wide as the lanes: Dr.Jit takes an index of one entry to be the same in all of them.
+        return kept | {"arrivals": dr.zeros(mi.UInt32, self.lanes), "opl": dr.alloc_local(mi.Float64, size)}
 
     def append(self, kept, samples):
         """List the events of a vertex; returns what it records."""
