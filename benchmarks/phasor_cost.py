@@ -1,10 +1,10 @@
 """Phasor film against Mitsuba's steady `path`: 1, 16, 64 and 301 frequencies, and a list that is no grid.
 
 Cornell box, 128 x 128, 64 spp, depth 8. Bars: 1.5 x the steady `path` for 16 frequencies and 5 x for 301, both on a
-uniform grid. `--gradients` times render and backward together through the phasors too, albedo and position of a wall: bars
-2.5 x and 8 x the steady `path`, which renders once, for the albedo. With
-`--peer-python` mitransient runs 16 and 301 frequencies between our runs, in its own process and environment, and is
-compared with its own `path`; it renders phasors in monochromatic variants only, so give `--variant llvm_ad_mono` then.
+uniform grid. `--gradients` times a render and the backward pass through its phasors together: derivatives by an albedo
+(bars 2.5 x and 8 x one render of the steady `path`), and by the position of a wall, too. With `--peer-python`
+mitransient runs 16 and 301 frequencies between our runs, in its own process and environment, and is compared with its
+own `path`; it renders phasors in monochromatic variants only, so give `--variant llvm_ad_mono` then.
 """
 
 from __future__ import annotations

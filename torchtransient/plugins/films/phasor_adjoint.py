@@ -15,9 +15,9 @@ import mitsuba as mi
 from torchtransient.plugins.films.block import AdjointBlock
 from torchtransient.plugins.films.phasor_events import rotation
 
-# Frequencies of a grid from one phase in double precision to the next. The phase of a step is off by 2.5e-7 at most (its
-# turns as a float, their product with 2 pi, sine and cosine), and a product of rotations rounds by sqrt(5) 2^-24: 15 of
-# them stay below 6e-6, which is 1e-6 cycles.
+# Frequencies of a grid from one phase in double precision to the next. The phase of a step is off by 2.5e-7 at most
+# (its turns as a float, their product with 2 pi, sine and cosine), and a product of rotations rounds by sqrt(5) 2^-24:
+# 15 of them stay below 6e-6, which is 1e-6 cycles.
 STEPS = 16
 # Sums that are kept while frequencies go by: a value, or a value and a slope, for each channel of each arrival. More of
 # them do not fit the registers of processors.
