@@ -19,8 +19,8 @@ from torchtransient.plugins.films.phasor_events import rotation
 # (its turns as a float, their product with 2 pi, sine and cosine), and a product of rotations rounds by sqrt(5) 2^-24:
 # 15 of them stay below 6e-6, which is 1e-6 cycles.
 STEPS = 16
-# Sums that are kept while frequencies go by: a value, or a value and a slope, for each channel of each arrival. They are
-# more than processors have registers: sums in the nearest memory cost less than to read frequencies more often.
+# Sums that are kept while frequencies go by: a value, or a value and a slope, for each channel of each arrival. They
+# are more than processors have registers: sums in the nearest memory cost less than to read frequencies more often.
 SUMS = 48
 # Arrivals that share what is read: more of them would mostly be missing.
 MOST_ARRIVALS = 8
