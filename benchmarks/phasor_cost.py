@@ -1,9 +1,10 @@
 """Phasor film against Mitsuba's steady `path`: 1, 16, 64 and 301 frequencies, and a list that is no grid.
 
 Cornell box, 128 x 128, 64 spp, depth 8. Bars: 1.5 x the steady `path` for 16 frequencies and 5 x for 301, both on a
-uniform grid. `--gradients` times render and backward through the phasors too, albedo and position of a wall. With
-`--peer-python` mitransient runs 16 and 301 frequencies between our runs, in its own process and environment, and is
-compared with its own `path`; it renders phasors in monochromatic variants only, so give `--variant llvm_ad_mono` then.
+uniform grid. `--gradients` times a render and the backward pass through its phasors together: derivatives by an albedo
+(bars 2.5 x and 8 x one render of the steady `path`), and by the position of a wall, too. With `--peer-python`
+mitransient runs 16 and 301 frequencies between our runs, in its own process and environment, and is compared with its
+own `path`; it renders phasors in monochromatic variants only, so give `--variant llvm_ad_mono` then.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from _runner import steady
 from torchtransient.scenes import cornell_box
 
 BARS = {"grid of 16": 1.5, "grid of 301": 5.0}
+BACKWARD_BARS = {"grid of 16": 2.5, "grid of 301": 8.0}
 STEP = 0.05
 ALBEDO, WALL = "red.reflectance.value", {"red-wall.to_world": [1.0, 0.0, 0.0]}
 
@@ -55,10 +57,17 @@ def rows(scene: dict[str, Any], films: dict[str, dict[str, Any]]) -> list[Row]:
 
 def backward_rows(films: dict[str, dict[str, Any]], counts: tuple[int, ...]) -> list[Row]:
     """Render and backward pass: an albedo, and with it the position of a wall."""
-    path: dict[str, float | None] = {"path": None}
     few, many = (f"grid of {n}" for n in (counts[1], counts[-1]))
-    albedo = [Row(f"{name}, render and backward", films[name], (ALBEDO,), against=path) for name in (few, many)]
-    return [*albedo, Row(f"{few}, render and backward, with a wall", films[few], (ALBEDO,), WALL, path)]
+    names = few, many, f"list of {counts[-1]}"
+    albedo = [
+        Row(f"{name}, render and backward", films[name], (ALBEDO,), against={"path": BACKWARD_BARS.get(name)})
+        for name in names
+    ]
+    path: dict[str, float | None] = {"path": None}
+    walls = [
+        Row(f"{name}, render and backward, with a wall", films[name], (ALBEDO,), WALL, path) for name in (few, many)
+    ]
+    return albedo + walls
 
 
 def main() -> None:

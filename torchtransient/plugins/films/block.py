@@ -75,6 +75,19 @@ class AdjointBlock:
             return self.match.to_spectrum(A), self.match.to_spectrum(slope)
         if self.response is None:
             return self.match.to_spectrum(self.steady), light_type()(0)
-        A, slope = self.film.read(self.response, self.base, opl, active)
+        return self.as_spectra(*self.film.read(self.response, self.base, opl, active))
+
+    def as_spectra(self, A, slope):
+        """The two by channel, the adjoint of the steady image added, as spectra; ``slope`` may be None."""
         A = [a + s for a, s in zip(A, self.steady, strict=True)]
-        return self.match.to_spectrum(A), self.match.to_spectrum(slope)
+        return self.match.to_spectrum(A), None if slope is None else self.match.to_spectrum(slope)
+
+    def together(self, most, with_slope):
+        """How many arrivals of a path, which has ``most``, are read at once and ahead, 0 where each is read when it is
+        asked for: of films where reading costs more than to keep what was read.
+        """
+        return 0
+
+    def read_together(self, opls, with_slope, active):
+        """(A, its slope or None) by channel, for each of several arrivals."""
+        raise NotImplementedError

@@ -10,6 +10,7 @@ import mitsuba as mi
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.base import TimeResolvedFilm
 from torchtransient.plugins.films.long_kernel import reduce_mode
+from torchtransient.plugins.films.phasor_adjoint import AdjointRows, Phases, PhasorAdjointBlock, read_arrivals
 from torchtransient.plugins.films.phasor_events import EVENT_BYTES, EventBlock, rotation, slots_for
 from torchtransient.plugins.films.phasor_grid import frequencies_of, step_of
 
@@ -47,27 +48,6 @@ def add_event(table, base, opl, value, slope, active):
             table.add(re, index, live)
             table.add(im, index + 1, live)
         f += 1
-
-
-@dr.syntax
-def read_event(table, base, stride, entry, opl, active):
-    """``A`` and its slope for one event, over all frequencies."""
-    A = [mi.Float(0) for _ in range(table.channels)]
-    slope = [mi.Float(0) for _ in range(table.channels)]
-    f = mi.UInt32(0)
-    live = mi.Bool(active)
-    while dr.hint(live & (f < table.count), label="phasor read"):
-        ν = dr.gather(mi.Float64, table.frequencies, f, live)
-        cos, sin = rotation(ν * opl)
-        ω = mi.Float(2 * math.pi * ν)
-        for c in range(table.channels):
-            index = base + f * stride + 2 * c * entry
-            a = dr.gather(mi.Float, table.flat, index, live)
-            b = dr.gather(mi.Float, table.flat, index + entry, live)
-            A[c] += a * cos - b * sin
-            slope[c] -= ω * (a * sin + b * cos)
-        f += 1
-    return A, slope
 
 
 class PhasorHDRFilm(TimeResolvedFilm):
@@ -123,7 +103,8 @@ class PhasorHDRFilm(TimeResolvedFilm):
         # In memory, so that kernels do not depend on their values and number.
         self.frequency_array = mi.Float64(self.frequencies)
         self.frequency_total = mi.UInt32(len(self.frequencies))
-        dr.make_opaque(self.frequency_array, self.frequency_total)
+        self.step_array = mi.Float64(self.step or 0.0)
+        dr.make_opaque(self.frequency_array, self.frequency_total, self.step_array)
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -154,6 +135,9 @@ class PhasorHDRFilm(TimeResolvedFilm):
     def create_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
         return EventBlock(self, job, base, match, most_events, tangents, origin)
 
+    def create_adjoint_block(self, response, base, steady, match):
+        return PhasorAdjointBlock(self, response, base, steady, match)
+
     def _table(self, flat, exclusive=False):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)
 
@@ -171,8 +155,9 @@ class PhasorHDRFilm(TimeResolvedFilm):
         ``adjoint`` is ``(flat array, frequency stride, entry stride)``; ``steady`` is always None, since the film keeps
         a steady image.
         """
-        flat, stride, entry = adjoint
-        return read_event(self._table(flat), base, stride, entry, opl_from_start, active)
+        rows = AdjointRows(adjoint, base, self.channel_count())
+        A, slope = read_arrivals(Phases(self, [opl_from_start]), rows, True, active)
+        return A[0], slope[0]
 
     def to_string(self):
         return (

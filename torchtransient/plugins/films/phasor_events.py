@@ -22,9 +22,12 @@ MAX_EVENTS = 16
 EVENT_BYTES = 8
 # Samples of a pixel that one thread of the second kernel sums up.
 GROUP = 64
-# Frequencies that one thread of the second kernel sums up, for one channel value. In a grid each block starts from a
-# phase in double precision, so that rounding does not build up.
-BLOCK = 16
+# Complex sums that one thread of the second kernel keeps, frequencies times channel values. What an event costs beside
+# them is paid for once a thread.
+BLOCK = 48
+# Frequencies of a thread at most: those of a grid start from a phase in double precision and go on by multiplication,
+# which must not build up rounding.
+MOST_FREQUENCIES = 16
 
 
 def slots_for(most_events: int) -> int:
@@ -98,7 +101,7 @@ class EventBlock(FilmBlock):
         dr.eval(self.count, self.opl, *self.values, self.cube, self.film.steady)
         job, film = self.job, self.film
         groups = -(-job.spp // GROUP)
-        per_block = max(1, BLOCK // len(self.values))
+        per_block = min(max(1, BLOCK // len(self.values)), MOST_FREQUENCIES, film.frequency_count())
         blocks = -(-film.frequency_count() // per_block)
         index = dr.arange(mi.UInt32, self.width * job.rows * groups * blocks)
         rest = index // dr.opaque(mi.UInt32, blocks)

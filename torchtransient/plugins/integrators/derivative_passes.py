@@ -46,9 +46,11 @@ def _start(job, launch):
     return rays, integrator.channel_match(world.contents, job.film, rays), base, pixel
 
 
-def _record(job, rays):
-    """Record the paths of one pass: (layout of the record, the record, number of vertices)."""
-    sink = RecordSink()
+def _record(job, rays, block=None):
+    """Record the paths of one pass, with their arrivals for the adjoint ``block``: (layout of the record, the record,
+    number of vertices).
+    """
+    sink = RecordSink(block)
     count, store = job.integrator.walk(job.world, job.film, rays, sink)
     return sink.layout, store, count
 
@@ -57,7 +59,7 @@ def _backward_pass(job, launch):
     world = job.world
     rays, match, _, pixel = _start(job, launch)
     block = job.incoming.block(rays, pixel, match)
-    adjoint = reverse_over(world, *_record(job, rays), block, dr.detach(rays.ray))
+    adjoint = reverse_over(world, *_record(job, rays, block), block, dr.detach(rays.ray))
     with dr.resume_grad():
         if world.wanted.sensor or dr.grad_enabled(rays.η):
             # What carries a sensor may move without its rays: they go to points that are given.

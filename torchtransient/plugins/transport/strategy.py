@@ -87,11 +87,15 @@ class Event(Local):
 
 class EventTerm(Local):
     """An event with derivatives: ``value`` (attached, times the attached throughput), ``slope`` (Float: zero with the
-    derivative of the arrival), ``opl`` (Float64, detached), ``active``.
+    derivative of the arrival), ``opl`` (Float64, detached), ``active``; ``arrival``, as ``v.arrival(name)`` says,
+    where it is the recorded event of a connection, which then was active wherever the term is.
 
     ``value`` has to be zero where it is not active, selected before it is multiplied with the throughput: what an idle
     lane holds must not reach the adjoint.
     """
+
+    # Otherwise the film is asked for the adjoint at ``opl``.
+    arrival = None
 
 
 class Strategy:

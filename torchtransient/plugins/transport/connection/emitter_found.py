@@ -83,7 +83,8 @@ class EmitterFound(Connection):
         if elsewhere is not None:
             hit &= v.before(world.scattering.name, "delta", at_sensor=True) | ~elsewhere
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
-        return EventTerm(value=first_column(vertex.carry.β) * Le, slope=vertex.slope, opl=v.τ, active=hit)
+        value = first_column(vertex.carry.β) * Le
+        return EventTerm(value=value, slope=vertex.slope, opl=v.τ, active=hit, arrival=v.arrival(self.name))
 
     def _claimed(self, world, emitter, d, wanted):
         """Mask of the emitters, in the direction ``d``, that derivatives reach by another strategy alone; None for
@@ -120,4 +121,4 @@ class EmitterFound(Connection):
         T = world.segment.weight(following) * world.segment.attached_transmittance(world, vertex, end, lit)
         value = product(vertex.carry.β, dr.select(lit, value * T, 0))
         slope = vertex.scattered_slope + slope_only(step.carry.η * distance(si.p, light.p, lit))
-        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit)
+        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))

@@ -147,7 +147,7 @@ class EmitterSampled(Connection):
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * length)
-        return [EventTerm(value=value, slope=slope, opl=opl, active=lit)]
+        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))]
 
     def _light(self, world, si, u, lit, wanted):
         """The sampled point of a light, attached: ``p, n``, its ``area`` element, and what kind it is of."""

@@ -132,7 +132,8 @@ class LaserSpot(Connection):
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length + leg)
-        return [EventTerm(value=product(vertex.carry.β, value), slope=slope, opl=opl, active=lit)]
+        value = product(vertex.carry.β, value)
+        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=vertex.v.arrival(self.name))]
 
 
 class GeneralSpot:

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from torchtransient.plugins.transport.carry import Carry, adjoint_of, choose, inner, total_of
 from torchtransient.plugins.transport.derivative.vertex import VertexEnd, attached_carry, vertex_terms
+from torchtransient.plugins.transport.sinks.arrivals import read_ahead
 from torchtransient.plugins.transport.sinks.record import RecordedVertex
 
 
@@ -29,7 +30,7 @@ def step_back(world, layout, store, block, ray, k, live, adjoint, following):
         terms, out, vertex = vertex_terms(world, v, carry, wanted)
         objective = inner(adjoint, out, world.carried)
         for term in terms:
-            A, slope = block.read(term.opl, term.active)
+            A, slope = adjoint_at(layout, store, block, term)
             objective += total_of(A, term.value)
             if wanted.geometry:
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
@@ -38,12 +39,21 @@ def step_back(world, layout, store, block, ray, k, live, adjoint, following):
     return choose(live, before, adjoint, world.carried), vertex.end
 
 
+def adjoint_at(layout, store, block, term):
+    """The film's adjoint at the arrival of an event, and its slope."""
+    if layout.arrivals is None or term.arrival is None:
+        return block.read(term.opl, term.active)
+    return layout.arrivals.adjoint(store, block, term.arrival, term.active)
+
+
 @dr.syntax
 def reverse(world, layout, store, count, block, ray):
     """Accumulate the gradients of the recorded paths; returns the adjoint of the Carry of the primary ``ray``.
 
     ``count``: number of recorded vertices. ``block`` reads the film's adjoint. Must run with gradients suspended.
     """
+    if dr.hint(layout.arrivals is not None, mode="scalar"):
+        store = read_ahead(layout.arrivals, store, block)
     i = mi.Int32(count) - 1
     live = i >= 0
     adjoint, following = Carry.zeros(), VertexEnd.nowhere()

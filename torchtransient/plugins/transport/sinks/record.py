@@ -10,17 +10,24 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.transport.sinks.arrivals import Arrivals
 from torchtransient.plugins.transport.sinks.sink import Sink
 from torchtransient.plugins.transport.strategy import Local
 
 
 class RecordSink(Sink):
-    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it."""
+    """Writes what every strategy says of itself. ``layout`` tells :class:`RecordedVertex` how to read it.
+
+    ``block``: the film's adjoint block, where arrivals are to be read ahead; None for no list of them.
+    """
 
     zeros = True
 
+    def __init__(self, block=None):
+        self.block = block
+
     def begin(self, world):
-        self.layout = RecordLayout(world)
+        self.layout = RecordLayout(world, None if self.block is None else Arrivals(world, self.block))
         return self.layout.allocate(world.max_depth + 1)
 
     def vertex(self, kept, path, samples):
@@ -33,11 +40,14 @@ class RecordLayout:
     Masks share the bits of one word: Dr.Jit 1.5 cannot compile a local array of masks (invalid LLVM IR).
     """
 
-    def __init__(self, world):
+    def __init__(self, world, arrivals=None):
         self.world = world
+        self.arrivals = arrivals if arrivals is not None and arrivals.together else None
         types = {("walk", name): kind for name, kind in self._of_walk(world).items()}
         for s in world.strategies():
             types |= {(s.name, name): kind for name, kind in s.fields(world).items()}
+        if self.arrivals is not None:
+            types |= {(arrivals.name, name): kind for name, kind in arrivals.fields().items()}
         masks = [key for key, kind in types.items() if kind is mi.Bool]
         if len(masks) > 32:
             raise SceneError(f"record of a path: expected at most 32 masks of all strategies, got {len(masks)}.")
@@ -52,6 +62,8 @@ class RecordLayout:
     def allocate(self, size):
         """Local arrays for ``size`` vertices."""
         arrays = {f"{s}.{name}": dr.alloc_local(kind, size) for (s, name), kind in self.types.items()}
+        if self.arrivals is not None:
+            arrays |= self.arrivals.allocate()
         return arrays | {"flags": dr.alloc_local(mi.UInt32, size)}
 
     def write(self, store, path, samples):
@@ -59,6 +71,8 @@ class RecordLayout:
         k, active = path.depth, path.active
         values = {"walk": vars(samples["walk"])}
         values |= {s.name: s.record(samples[s.name]) for s in self.world.strategies()}
+        if self.arrivals is not None:
+            values[self.arrivals.name] = self.arrivals.append(store, samples)
         for s, name in self.types:
             store[f"{s}.{name}"].write(values[s][name], k, active)
         flags = mi.UInt32(0)
@@ -95,6 +109,11 @@ class RecordedVertex(Local):
         if name not in self._read:
             self._read[name] = self.store[name].read(self.k, self.active)
         return self._read[name]
+
+    def arrival(self, name):
+        """The number of a connection's event among the arrivals of the path, None where they are not listed."""
+        arrivals = self.layout.arrivals
+        return None if arrivals is None else arrivals.number(self.of(arrivals.name), name)
 
     def numbers(self):
         """Two uniform random numbers that were drawn at this vertex."""
