@@ -84,12 +84,12 @@ def test_what_the_system_refuses_is_taken_back(monkeypatch):
     with monkeypatch.context() as patch:
         # The second call puts back.
         patch.setattr(dr, "set_thread_count", lambda n: refuse(n) if n == 5 else set_count(n))
-        with pytest.raises(DeviceError, match="5 threads cannot be had: Resource.*stays at 2"):
+        with pytest.raises(DeviceError, match=r"5 threads cannot be had: Resource.*stays at 2"):
             tt.threads(5)
     assert tt.threads() == before
     with monkeypatch.context() as patch:
         patch.setattr(torch, "set_num_threads", lambda n: None)
-        with pytest.raises(DeviceError, match="asked for 5 of torch and 5 of Dr.Jit, which took 2 and 5"):
+        with pytest.raises(DeviceError, match=r"asked for 5 of torch and 5 of Dr\.Jit, which took 2 and 5"):
             tt.threads(5)
     assert tt.threads() == before
 

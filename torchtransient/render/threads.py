@@ -39,7 +39,7 @@ class Threads:
 
 
 def threads(n: int | None = None) -> Threads:
-    """Let torch and Dr.Jit, which has a pool of its own beside torch's, compute with ``n`` threads each; None only asks.
+    """Let torch and Dr.Jit, which has a pool of its own, compute with ``n`` threads each; None only asks.
 
     Returns the counts in use. As a context manager it puts back what was there before::
 
