@@ -1,11 +1,12 @@
 """Training steps on demand in a process of its own; driven by `step_cost.py` through one JSON object per line.
 
-Run as `python _step_worker.py SIDE VARIANT` with SIDE `torchtransient` (the package on PYTHONPATH) or `mitsuba` (its own
-integrators, without torch). Requests:
-  {"do": "load", "name", "scene", "keys", "frequencies", "tent", "freeze", "gradient"}    -> {"ok": true}
-  {"do": "step", "name", "seed", "count"}       `count` steps                             -> {"seconds" of one, "recorded"}
-  {"do": "kernels", "name", "seed", "count"}    `count` steps with their kernels          -> {"steps": [...], "recorded"}
-  {"do": "torch", "name", "seed", "count"}      loss and its derivative, no renders       -> {"seconds" of one}
+Run as `python _step_worker.py SIDE VARIANT` with SIDE `torchtransient` (the package on PYTHONPATH) or `mitsuba` (its
+own integrators, without torch). Requests:
+  {"do": "load", "name", "scene", "keys", "frequencies", "tent", "freeze", "gradient"} -> {"ok": true}
+  {"do": "step", "name", "seed", "count"}      `count` steps               -> {"seconds" of one, "recorded"}
+  {"do": "kernels", "name", "seed", "count"}   the same with their kernels -> {"steps": [...]}
+  {"do": "torch", "name", "seed", "count"}     losses without renders      -> {"seconds" of one}
+  {"do": "threads", "count"}                   torch's and Dr.Jit's        -> {"ok": true}
 A step is a render, and with "gradient" the sum of squares of what it measured and its derivative. Scenes: as in
 `_worker.py`. "freeze": null for a package that does not know it.
 """
@@ -138,6 +139,11 @@ def answer_to(request, jobs, kind, variant, scenes):
     match request["do"]:
         case "load":
             jobs[request["name"]] = kind(request, variant, scenes)
+            return {"ok": True}
+        case "threads":
+            # As `tt.threads` does, which older commits lack.
+            dr.set_thread_count(request["count"])
+            torch.set_num_threads(request["count"])
             return {"ok": True}
         case "step":
             seconds, said = timed(jobs[request["name"]].step, request["seed"], request["count"])

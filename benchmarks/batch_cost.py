@@ -121,6 +121,7 @@ def alone(name: str, side: int, options: Any) -> int:
     """Peak memory of a side of a pair in a process of its own."""
     command = [sys.executable, __file__, "--alone", name, str(side), "--variant", options.variant]
     command += ["--quick"] * options.quick
+    command += [] if options.threads is None else ["--threads", str(options.threads)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return int(json.loads(done.stdout.splitlines()[-1]))
 
@@ -129,7 +130,9 @@ def main() -> None:
     parser = arguments(__doc__, peer=False)
     parser.add_argument("--only", default="", help="pairs whose names have this in them")
     parser.add_argument("--alone", nargs=2, metavar=("PAIR", "SIDE"), help="peak memory of one side, in this process")
+    parser.add_argument("--threads", type=int, help="threads of torch and of Dr.Jit, else theirs")
     options = parser.parse_args()
+    tt.threads(options.threads)
     every = pairs(options.quick, options.variant)
     if options.alone:
         job = every[options.alone[0]]()[int(options.alone[1])]
@@ -147,13 +150,14 @@ def main() -> None:
         repeats = options.repeats or (2 if options.quick else 30 if small else 7)
         count = 5 if small and not options.quick else 1
         names = {f"{name}: loop": timed(loop, count), f"{name}: batch": timed(batch, count)}
-        seconds = interleave(names, repeats, warm_up=3)
+        seconds = interleave(names, repeats, warm_up=3 if small else 1)
         cases |= {case: summary(values) for case, values in seconds.items()}
         ratios.append(ratio(seconds, f"{name}: batch", f"{name}: loop", bar))
         peaks = [alone(name, side, options) for side in (0, 1)]
         memory[name] = {"loop": peaks[0], "batch": peaks[1], "batch_over_loop": round(peaks[1] / peaks[0], 3)}
     results = {"cases": cases, "ratios": ratios, "peak_bytes": memory, "environment": environment(options.variant)}
-    settings = {"entries": ENTRIES, "large": "256^2 x 300 x 16 spp", "small": "8^2 x 16 x 1 spp", "quick": options.quick}
+    settings = {"entries": ENTRIES, "large": "256^2 x 300 x 16 spp", "small": "8^2 x 16 x 1 spp"}
+    settings |= {"threads": repr(tt.threads()), "quick": options.quick}
     report("batch_cost", settings, results, options.json)
 
 

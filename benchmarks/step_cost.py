@@ -117,6 +117,8 @@ def measure(kind: Kind, resolution: int, options: Any, repeats: int) -> dict[str
     if kind.name == "colour":
         workers["mi.render"] = start("mitsuba", options.variant)
         requests["mi.render"] = {**kind.request(resolution, None), "scene": encoded(steady(box(resolution), "prb"))}
+    for worker in set(workers.values()) if options.threads else ():
+        worker.ask(do="threads", count=options.threads)
     for name, worker in workers.items():
         worker.ask(do="load", name=name, **requests[name])
     said: list[str] = []
@@ -189,6 +191,7 @@ def table(rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     parser = arguments(__doc__, peer=False)
     add_baseline(parser)
+    parser.add_argument("--threads", type=int, help="threads of torch and of Dr.Jit in every process, else theirs")
     options = parser.parse_args()
     repeats = options.repeats or (2 if options.quick else 15)
     sizes = (8,) if options.quick else (8, 32, 128)
@@ -198,7 +201,8 @@ def main() -> None:
         "ratios": [{**each, "of": name + each["of"]} for name, each in named],
     }
     first = [] if options.baseline is None else [first_calls(kind, options) for kind in KINDS]
-    settings = {"bins": BINS, "spp": 1, "frequencies": len(FREQUENCIES), "repeats": repeats, "quick": options.quick}
+    settings = {"bins": BINS, "spp": 1, "frequencies": len(FREQUENCIES), "repeats": repeats}
+    settings |= {"threads": options.threads, "quick": options.quick}
     report("step_cost", settings, results, None)
     table(rows)
     for call in first:
