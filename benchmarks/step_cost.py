@@ -5,9 +5,9 @@ squares of what it measured, and its derivative by nothing ("render": no derivat
 a wall (tent filter), by a colour through a phasor film of 16 frequencies, and by a colour with a medium in the room.
 Steps that are launched from recordings and steps that are traced (`freeze=False`) take turns in one process. `tracing`
 is what a traced step takes beyond a launched one; `kernels` the time that Dr.Jit gives for the kernels of a launched
-step, in a run of their own; `torch` the loss and its derivative on tensors of the same layout, without a render;
-`layer` the rest of the launched step. A colour step stands beside `mi.render` of Mitsuba's steady `prb` on the same
-film, with `dr.backward`, which is traced at every call.
+step, in steps of their own of the same round; `torch` the loss and its derivative on tensors of the same layout,
+without a render; `layer` the rest of the launched step. A colour step stands beside `mi.render` of Mitsuba's steady
+`prb` on the same film, with `dr.backward`, which is traced at every call.
 
 With `--baseline PATH`, the root of a checkout of the commit before recordings (`git worktree add PATH a78a191`), the
 steps of 8^2 run there as well, in a process that takes turns with ours, and the first three calls of either in
@@ -108,6 +108,8 @@ def measure(kind: Kind, resolution: int, options: Any, repeats: int) -> dict[str
     """One line of the table, and its ratios."""
     count = 2 if options.quick else 20 if resolution <= 32 else 5
     small = resolution == 8
+    # A run at toy size judges no bar.
+    judged = small and not options.quick
     ours = start("torchtransient", options.variant)
     workers = {"launched": ours, "traced": ours}
     requests = {"launched": kind.request(resolution, True), "traced": kind.request(resolution, False)}
@@ -122,12 +124,18 @@ def measure(kind: Kind, resolution: int, options: Any, repeats: int) -> dict[str
     for name, worker in workers.items():
         worker.ask(do="load", name=name, **requests[name])
     said: list[str] = []
+    steps: list[dict[str, Any]] = []
+    torch_alone: list[float] = []
 
     def case(name: str) -> Any:
         def run(seed: int) -> float:
             answer = workers[name].ask(do="step", name=name, seed=seed, count=count)
             if name == "launched":
                 said[:] = answer["recorded"]
+                # In the same round, so that the noise of the machine is that of the step; the last of four, so that
+                # it is launched whatever the history of kernels changes.
+                steps.append(ours.ask(do="kernels", name=name, seed=seed, count=4)["steps"][-1])
+                torch_alone.append(ours.ask(do="torch", name=name, seed=seed, count=count)["seconds"])
             return float(answer["seconds"])
 
         return run
@@ -135,21 +143,27 @@ def measure(kind: Kind, resolution: int, options: Any, repeats: int) -> dict[str
     # Three calls until a step is launched.
     print(f"{resolution}^2, {kind.name}", file=sys.stderr)
     seconds = interleave({name: case(name) for name in workers}, repeats, warm_up=4 if options.quick else 2)
-    steps = ours.ask(do="kernels", name="launched", seed=10**6, count=4 + repeats)["steps"][4:]
-    torch_alone = [ours.ask(do="torch", name="launched", seed=0, count=count)["seconds"] for _ in range(repeats)][1:]
     for worker in set(workers.values()):
         worker.close()
-    kernels, launched = [step["kernel_seconds"] for step in steps], median(seconds["launched"])
-    parts = {"tracing": median(seconds["traced"]) - launched, "kernels": median(kernels), "torch": median(torch_alone)}
-    parts["layer"] = launched - parts["kernels"] - parts["torch"]
+    launched = seconds["launched"]
+    # Without the warm-up.
+    steps, torch_alone = steps[-repeats:], torch_alone[-repeats:]
+    kernels = [step["kernel_seconds"] for step in steps]
+    rest = [whole - kernel - alone for whole, kernel, alone in zip(launched, kernels, torch_alone, strict=True)]
+    parts = {
+        "tracing": median(traced - whole for traced, whole in zip(seconds["traced"], launched, strict=True)),
+        "kernels": median(kernels),
+        "torch": median(torch_alone),
+        "layer": median(rest),
+    }
     ratios = [ratio(seconds, "launched", "traced")]
     if "baseline" in seconds:
-        ratios.append(ratio(seconds, "launched", "baseline", BASELINE_BARS.get(kind.name)))
+        ratios.append(ratio(seconds, "launched", "baseline", BASELINE_BARS.get(kind.name) if judged else None))
     if "mi.render" in seconds:
-        ratios.append(ratio(seconds, "launched", "mi.render", MITSUBA_BAR if small else None))
+        ratios.append(ratio(seconds, "launched", "mi.render", MITSUBA_BAR if judged else None))
     if kind.name in KERNEL_BARS:
-        over = summary([s / median(kernels) for s in seconds["launched"]])
-        bar = {"bar": KERNEL_BARS[kind.name], "within": over["median"] <= KERNEL_BARS[kind.name]} if small else {}
+        over = summary([whole / kernel for whole, kernel in zip(launched, kernels, strict=True)])
+        bar = {"bar": KERNEL_BARS[kind.name], "within": over["median"] <= KERNEL_BARS[kind.name]} if judged else {}
         ratios.append({"of": "launched", "to": "its kernels", **over, **bar})
     return {
         "resolution": resolution,
