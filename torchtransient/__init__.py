@@ -33,6 +33,7 @@ _LAZY = {
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
+    "threads": "torchtransient.render.threads",
     "vis": "torchtransient.vis",
 }
 

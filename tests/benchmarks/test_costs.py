@@ -1,0 +1,52 @@
+"""Benchmarks of recorded calls, at toy size: they run, and their reports hold what they are for."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow
+
+
+def run(script, tmp_path, *arguments):
+    report = tmp_path / "report.json"
+    command = [sys.executable, str(ROOT / "benchmarks" / script), "--quick", "--json", str(report), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(report.read_text(encoding="utf-8")), done.stdout
+
+
+def test_steps_and_their_parts(tmp_path):
+    report, printed = run("step_cost.py", tmp_path, "--threads", "1")
+    rows = {row["kind"]: row for row in report["rows"]}
+    assert list(rows) == ["render", "colour", "pose", "phasor film", "medium"]
+    assert set(rows["colour"]["seconds"]) == {"launched", "traced", "mi.render"}
+    for row in rows.values():
+        assert row["parts"]["kernels"] > 0 and row["launches"] > 0
+        assert row["compiled_when_launched"] == 0
+    assert set(rows["pose"]["recorded"]) == {"launched"} and len(rows["pose"]["recorded"]) == 2
+    assert "within" not in json.dumps(report["ratios"]) and "phasor film" in printed
+
+
+def test_batches_and_cameras(tmp_path):
+    report, _ = run("batch_cost.py", tmp_path, "--only", "cameras, render and", "--threads", "1")
+    assert list(report["peak_bytes"]) == ["cameras, render and sum", "cameras, render and squares"]
+    assert all(peak["loop"] > 1e8 and peak["batch"] > 1e8 for peak in report["peak_bytes"].values())
+    assert [ratio["to"] for ratio in report["ratios"]] == [f"{name}: loop" for name in report["peak_bytes"]]
+
+
+def test_recordings_stay_what_they_are(tmp_path):
+    report, printed = run("frozen_memory.py", tmp_path)
+    assert report["recordings_added"] == report["calls_traced_when_settled"] == 0
+    assert report["kernels_compiled_when_settled"] == 0
+    assert report["every"][-1]["step"] == 60 and "60 steps, 3 parameters" in printed
+
+
+def test_threads_and_processes(tmp_path):
+    report, _ = run("thread_cost.py", tmp_path)
+    assert len(report["cases"]) == 6 and len(report["ratios"]) == 4

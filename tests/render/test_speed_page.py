@@ -1,0 +1,81 @@
+"""docs/speed.md: its blocks run in the order that they stand in, and do what the page says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.render import recordings
+from torchtransient.render.batch import LARGE_FILM
+from torchtransient.render.carry_out import MOST_AT_ONCE
+
+VARIANT = "llvm_ad_rgb"
+PAGE = Path(__file__).parents[2] / "docs" / "speed.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+NEW = [recordings.FIRST, recordings.RECORDED, recordings.LAUNCHED]
+
+
+@pytest.fixture(scope="module")
+def names():
+    """What stands there after every block has run, in one session from top to bottom."""
+    found: dict[str, object] = {}
+    before = tt.threads()
+    for code in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL):
+        exec(compile(code, str(PAGE), "exec"), found)
+    assert tt.threads() == before
+    return found
+
+
+def test_calls_are_traced_recorded_and_launched(names):
+    assert names["history"] == [(said, said) for said in [*NEW, recordings.LAUNCHED]]
+    assert names["difference"].item() < 1e-5 * names["out"].transient.max().item()
+    assert names["reason"] == recordings.SWITCHED_OFF
+
+
+def test_another_layout_is_another_kind_of_call(names):
+    assert names["layouts"] == {"squares": [recordings.LAUNCHED] * 2, "sum": NEW}
+
+
+def test_so_is_another_number_of_samples(names):
+    assert names["several"] == {4: NEW, 16: NEW}
+
+
+def test_progress_is_traced(names):
+    assert names["shown"] == recordings.PROGRESS
+
+
+def test_a_batch_is_a_launch_an_entry(names):
+    assert names["batch"].transient.shape == (8, 3, 16, 8, 8)
+    assert names["batch"].stats.recorded == (recordings.LAUNCHED,) * 8
+
+
+def test_threads(names):
+    assert (names["counts"].torch, names["counts"].drjit) == (1, 1)
+    assert names["after"] == names["before"]
+    expected = names["traced"](seed=0).transient
+    torch.testing.assert_close(names["alone"].transient, expected, rtol=1e-5, atol=1e-5 * expected.max().item())
+
+
+def test_numbers_and_reasons_are_those_of_the_code():
+    assert f"recordings of {recordings.MAX_STRUCTURES} kinds of calls" in TEXT
+    assert f"and {recordings.MAX_RECORDINGS} for sizes" in TEXT
+    assert f"that {recordings.IN_VAIN} calls in a row" in TEXT
+    assert f"up to {MOST_AT_ONCE} at once" in TEXT
+    assert LARGE_FILM == 2**18 and "films below 2^18 values" in TEXT
+    for said in (recordings.FIRST, recordings.SWITCHED_OFF, recordings.SEVERAL, recordings.LARGE, recordings.PROGRESS):
+        assert f"`{said}`" in TEXT
+
+
+def test_links_lead_somewhere():
+    for link in set(re.findall(r"\]\(([^)#:]+\.md)(?:#[^)]*)?\)", TEXT)):
+        assert (PAGE.parent / link).exists(), link
+    titles = {title.lower().replace(" ", "-") for title in re.findall(r"^## (.*)$", TEXT, flags=re.MULTILINE)}
+    assert set(re.findall(r"\]\(#([^)]+)\)", TEXT)) <= titles
+    for script in set(re.findall(r"benchmarks/\w+\.py", TEXT)):
+        assert (PAGE.parents[1] / script).is_file(), script
+    for page in ("README.md", "docs/torch_layer.md"):
+        assert "speed.md" in (PAGE.parents[1] / page).read_text(encoding="utf-8"), page
