@@ -361,8 +361,7 @@ def test_numbers_of_a_plugin_in_python_count(room_scene):
     """What is no array becomes part of the kernels: another number is another recording."""
     scene = tt.load(make_room(), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
-    for seed in range(3):
-        before = renderer(seed=0)
+    before = [renderer(seed=0) for _ in range(3)][-1]
     integrator = scene_integrator(renderer)
     integrator.max_depth = 2
     after = [renderer(seed=0) for _ in range(3)]
@@ -379,10 +378,14 @@ def test_numbers_of_a_plugin_in_python_count(room_scene):
 def test_recordings_are_bounded_and_said(monkeypatch):
     monkeypatch.setattr(recordings, "MAX_STRUCTURES", 3)
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR])
-    with pytest.warns(UserWarning, match="more than 3 kinds of calls take turns"), torch.no_grad():
+
+    def take_turns():
         for _ in range(5):
             for spp in range(1, 7):
                 renderer(seed=0, spp=spp)
+
+    with torch.no_grad(), pytest.warns(UserWarning, match="more than 3 kinds of calls take turns"):
+        take_turns()
     kept = renderer.scene.recordings((COLOUR,), renderer._options)
     assert len(kept) == 3
     with warnings.catch_warnings(), torch.no_grad():  # once
@@ -397,3 +400,39 @@ def test_calls_that_are_launched_do_not_warn(room_scene):
         warnings.simplefilter("error")
         for seed in range(30):
             step(renderer, seed)
+
+
+def test_many_kinds_of_calls_by_turns_do_not_warn():
+    scene = tt.load(make_room(), variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=[COLOUR])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(4):
+            for spp in range(1, 21):
+                out = renderer(seed=0, spp=spp)
+                out.transient.sum().backward()
+    assert out.stats.recorded == (LAUNCHED,) and out.stats.derivatives_recorded == [LAUNCHED]
+
+
+def test_what_changes_is_said(room_scene):
+    """Another number in a plugin at every call."""
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=2)
+    integrator = scene_integrator(renderer)
+
+    def change():
+        for depth in range(2, 80):
+            integrator.max_depth = depth
+            renderer(seed=0)
+
+    with torch.no_grad(), pytest.warns(UserWarning, match=r"changed from \d+ to \d+"):
+        change()
+
+
+def test_a_second_filter_leaves_the_recordings_of_the_first(room_scene):
+    scene = tt.load(make_room(), variant=VARIANT)
+    first = tt.TransientRenderer(scene, parameters=[COLOUR], spp=2, temporal_filter="tent")
+    second = tt.TransientRenderer(scene, parameters=[COLOUR], spp=2, temporal_filter="gaussian")
+    for renderer in (first, second):
+        said = [renderer(seed=0).stats.recorded[0] for _ in range(3)]
+        assert said == [FIRST, RECORDED, LAUNCHED]
+    assert first(seed=0).stats.recorded == (LAUNCHED,)

@@ -340,6 +340,7 @@ def test_cube_that_does_not_fit_is_refused_before_it_is_allocated(room):
 def test_batch_that_does_not_fit_counts_all_its_films(monkeypatch):
     cube = 3 * 4 * 24 * 3 * 4
     monkeypatch.setattr(memory, "available_bytes", lambda variant: 3 * cube)
+    monkeypatch.setattr(memory, "_SMALL", 0)
     memory.check_fits((3, 4, 24, 3), 1, VARIANT)
     memory.check_fits((3, 4, 24, 3), 2, VARIANT)
     with pytest.raises(tt.errors.StorageError, match="4 of them for 3 renders"):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.render import engine
+from torchtransient.render import batch
 from torchtransient.render.variant import active_variant
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
@@ -36,13 +36,13 @@ def big_room(bins):
 
 def test_tensor_is_the_films_own_memory(room_scene, monkeypatch):
     addresses = []
-    take = engine._take
+    take = batch.take
 
     def spy(film, into):
         addresses.append(film.transient_bands()[0][2].torch().data_ptr())
         return take(film, into)
 
-    monkeypatch.setattr(engine, "_take", spy)
+    monkeypatch.setattr(batch, "take", spy)
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     assert renderer(seed=0).transient.data_ptr() == addresses[0]
     assert renderer({COLOUR: torch.rand(1, 3)}, seed=0).transient.data_ptr() == addresses[1]

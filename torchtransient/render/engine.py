@@ -1,7 +1,7 @@
 """Runs of a Mitsuba scene on torch tensors: primal, reverse and forward mode, without any torch graph.
 
-Every run installs its values in the scene, renders, reads the result and puts the described values back, under one
-lock: between two runs a scene is always in the state of its description, and no Dr.Jit graph outlives a run.
+Every run installs its values in the scene, renders and reads the result, under one lock. The described values are put
+back before anybody else looks at the scene (:meth:`.scene_handle.Scene.leave`), and no Dr.Jit graph outlives a run.
 
 Tensors are real and in the film's layout here: steady (H, W, C) and the film's response, which is the transient (H, W,
 T, C) or the phasors (H, W, F, 2 C) with real and imaginary parts in turn; with a leading dimension of items when there

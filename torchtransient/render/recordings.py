@@ -19,7 +19,7 @@ from torchtransient.plugins.frozen_state import not_recordable
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
-# Calls in a row none of which could be launched, after which it is said.
+# Calls in a row none of which could be launched, after which it is said; as many kinds as are kept may take turns.
 IN_VAIN = 24
 
 FIRST, RECORDED, LAUNCHED = "traced: the first call", "recorded", "launched"
@@ -39,7 +39,8 @@ class Recordings:
     def __init__(self) -> None:
         self._found: OrderedDict[Any, Recording] = OrderedDict()
         self._in_vain = 0
-        self._before: tuple[Any, ...] = ()
+        # The last structure of each kind of job.
+        self._before: dict[str, tuple[Any, ...]] = {}
         self._warned = False
 
     def __len__(self) -> int:
@@ -50,11 +51,15 @@ class Recordings:
         one set of values: how, and what each film has taken (:meth:`~.FilmInterface.taken`), nothing in reverse mode.
         Raises NotRecordedError where they are to be traced; nothing has been rendered then.
         """
+        import drjit as dr
+
         for job in jobs:
             if job.refusal is not None or len(job.launches) > 1:
                 raise NotRecordedError(SEVERAL if job.refusal is None else f"traced: {job.refusal}")
             job.film.clear()
         structure, arrays = jobs[0].integrator.state_of(jobs)
+        # A recording holds memory for each thread's share of a sum.
+        structure = (("threads", dr.thread_count()), *structure)
         found = self._found.get(structure)
         if found is None:
             found = self._found[structure] = Recording()
@@ -65,26 +70,28 @@ class Recordings:
         try:
             results, launched = found.run(jobs, arrays)
         finally:
-            self._watch(launched, structure)
+            self._watch(launched, jobs[0].kind, structure)
         return LAUNCHED if launched else RECORDED, results
 
-    def _watch(self, launched: bool, structure: tuple[Any, ...]) -> None:
+    def _watch(self, launched: bool, kind: str, structure: tuple[Any, ...]) -> None:
         self._in_vain = 0 if launched else self._in_vain + 1
-        if self._in_vain >= IN_VAIN and not self._warned:
+        # Calls that come again are launched from the third time on: of many kinds that take turns, each is owed two.
+        owed = 2 * sum(found.calls > 1 for found in self._found.values())
+        if self._in_vain >= max(IN_VAIN, MAX_STRUCTURES) + owed and not self._warned:
             self._warned = True
             warnings.warn(
-                f"the last {IN_VAIN} renders and derivatives of a scene were all traced anew, none could use a "
-                f"recording: {self._reason(structure)}. Tracing costs some milliseconds a call; keep "
-                "spp, keys, shapes and which values need gradients the same from call to call, or switch recordings "
-                "off with freeze=False.",
+                f"the last {self._in_vain} renders and derivatives of a scene were all traced anew, none could use a "
+                f"recording: {self._reason(kind, structure)}. Tracing costs some milliseconds a call; keep spp, keys, "
+                "shapes and which values need gradients the same from call to call, or switch recordings off with "
+                "freeze=False.",
                 stacklevel=2,
             )
-        self._before = structure
+        self._before[kind] = structure
 
-    def _reason(self, structure: tuple[Any, ...]) -> str:
+    def _reason(self, kind: str, structure: tuple[Any, ...]) -> str:
         if len(self._found) == MAX_STRUCTURES:
             return f"more than {MAX_STRUCTURES} kinds of calls take turns"
-        return _difference(self._before, structure)
+        return _difference(self._before.get(kind, ()), structure)
 
 
 def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
@@ -109,9 +116,11 @@ class Recording:
         self._jobs: Sequence[Any] = ()
         self._frozen: Any = None
         self._refusal: str | None = FIRST
+        self.calls = 0
 
     def run(self, jobs: Sequence[Any], arrays: list[Any]) -> tuple[list[list[Any]], bool]:
         """(what the films have taken, whether kernels were launched without tracing). Raises NotRecordedError."""
+        self.calls += 1
         if self._refusal is not None:
             refusal = self._refusal
             if refusal == FIRST:

@@ -132,12 +132,14 @@ class Scene:
             tables[wanted] = SlotTable(built, wanted)
         return tables[wanted]
 
-    def leave(self, options: BuildOptions, slots: SlotTable) -> None:
+    def leave(self, options: BuildOptions, slots: SlotTable, attached: bool) -> None:
         """End of a run: the described values are put back when the built scene is asked for by anyone but a run with
-        the same keys.
+        the same keys, and at once where values are ``attached``, so that no graph outlives a run.
         """
         if slots.originals and self._builds.get(options) is slots.built:
             self._unsettled[options] = slots
+            if attached:
+                self._settle(options)
 
     def _settle(self, options: BuildOptions) -> None:
         slots = self._unsettled.pop(options, None)

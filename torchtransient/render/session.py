@@ -174,7 +174,6 @@ def session_of(job: RenderJob) -> Iterator[Session]:
             with named_errors(), temporal_filter(job.temporal_filter, session.integrator, films):
                 yield session
         except BaseException:
-            job.scene.leave(job.options, slots)
-            job.scene.built(job.options)  # puts the described values back, or drops the scene
+            job.scene.leave(job.options, slots, attached=True)
             raise
-        job.scene.leave(job.options, slots)
+        job.scene.leave(job.options, slots, attached=any(job.needs))

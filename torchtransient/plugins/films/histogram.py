@@ -25,6 +25,12 @@ MANY_BINS = 64
 MAX_FILTERS = 8
 
 
+class Filters(dict):
+    """Temporal filters by what they were made for: recorded calls depend on the one in use."""
+
+    only_remembers = True
+
+
 class HistogramBlock(FilmBlock):
     """Events whose lengths are counted from an origin of their sample: its bin is found once, in double precision, and
     from there on bins are counted in single precision, which is as good as the lengths are.
@@ -108,7 +114,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         self.pulses = [p for p in (pulse_of(props, name, self.plugin) for name in ("pulse", "irf")) if p is not None]
         self._check()
         # Temporal filters by what they were made for, since a renderer changes the film's and puts it back.
-        self._filters = {}
+        self._filters = Filters()
         self.take_filter("", None)
 
     # ------------------------------------------------------------------------------------- parameters
