@@ -195,6 +195,10 @@ class FilmInterface(abc.ABC):
         """Count the light of pixels that a window missed; nothing to do for a film without one."""
 
     @abc.abstractmethod
+    def tabulate_filter(self) -> None:
+        """Compute what ``sample_offset`` needs, where there is nothing yet: before anything is recorded."""
+
+    @abc.abstractmethod
     def finish_render(self) -> None:
         """End of a render: sums become single precision, and a film without a steady image sums one up."""
 
@@ -204,7 +208,9 @@ class FilmInterface(abc.ABC):
 
     @abc.abstractmethod
     def can_borrow(self, samples: int) -> bool:
-        """Whether renders of ``samples`` per pixel can add to an array of somebody else's, see :meth:`lend`."""
+        """Whether renders of ``samples`` per pixel can add to an array of somebody else's, see :meth:`lend`. Films with
+        storage of their own answer no.
+        """
 
     @abc.abstractmethod
     def lend(self, storage: tuple[Any, int] | None) -> None:
@@ -214,11 +220,13 @@ class FilmInterface(abc.ABC):
 
     @abc.abstractmethod
     def first_entry(self) -> Any:
-        """Index of the film's first value in its band (``UInt32``), None for zero."""
+        """Index of the film's first value in its band (``UInt32``), None for zero: whoever computes a base adds it."""
 
     @abc.abstractmethod
     def taken(self) -> list[Any]:
-        """The arrays of a finished render, as a list that :meth:`hold` takes; the film has none of them any more."""
+        """The arrays of a finished render, as a list that :meth:`hold` takes; the film has none of them any more. Other
+        arrays of the film stay where they are: Dr.Jit writes attributes of plugins back after a recorded call.
+        """
 
     @abc.abstractmethod
     def hold(self, arrays: list[Any]) -> None:
@@ -301,10 +309,11 @@ class IntegratorInterface(abc.ABC):
 
     @abc.abstractmethod
     def prepared(
-        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, kind: str = RENDER, grad_in: Any = None
+        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, kind: str = RENDER, grad_in: Any = (None, None)
     ) -> Any:
         """A job of :data:`JOBS` with all that is looked up and computed beforehand
-        (:class:`~torchtransient.plugins.integrators.prepared.Prepared`).
+        (:class:`~torchtransient.plugins.integrators.prepared.Prepared`). ``grad_in``: (steady, transient) of a
+        backward job, as :meth:`render_backward` takes it.
         """
 
     @staticmethod
@@ -316,7 +325,10 @@ class IntegratorInterface(abc.ABC):
 
     @abc.abstractmethod
     def run(self, prepared: Any, evaluate: bool = True, progress: Any = None) -> None:
-        """Carry out a job that is prepared; this alone is recorded."""
+        """Carry out a job that is prepared; this alone is recorded: nothing that Python does in it happens again when
+        its kernels are launched. ``evaluate``: False leaves what is traced to the caller; ``progress(fraction)`` is
+        called after every launch. Both are for renders.
+        """
 
     @abc.abstractmethod
     def passes(self, world: Any, sensor: Any, film: Any, seed: Any, spp: int) -> tuple[list[Any], int]:

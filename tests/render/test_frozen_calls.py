@@ -349,10 +349,10 @@ def _number_in_memory():
     return float(dr.opaque(mi.Float, 1.0)[0])
 
 
-def test_a_class_made_out_of_a_plugin_is_not_recorded(room_scene, monkeypatch):
+def test_a_class_made_out_of_a_plugin_is_not_recorded():
     recorded = pair(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=4)[1]
-    cls = type(scene_integrator(recorded))
-    monkeypatch.delattr(cls, "can_be_recorded")
+    integrator = scene_integrator(recorded)
+    integrator.__class__ = type("OfAUser", (type(integrator),), {"__module__": "of.a.user"})
     said = [recorded(seed=seed).stats.recorded[0] for seed in range(3)]
     assert all("does not say that it can be" in words for words in said)
 

@@ -9,6 +9,13 @@ no arrays become part of the kernels: a recording is good for one structure alon
 from __future__ import annotations
 
 import enum
+import sys
+from array import array
+from collections import deque
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from functools import partial
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -18,9 +25,9 @@ import numpy as np
 
 from torchtransient.plugins.remembered import digest
 
-# Objects of these look after themselves, or hold no arrays.
+# Their objects are known one by one below, or not comparable.
 _OTHERS = ("builtins", "drjit", "mitsuba", "numpy", "torch")
-_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+_PLAIN = (type(None), bool, int, str, bytes)
 # What Dr.Jit says of functions that it cannot record.
 _NOT_RECORDABLE = (
     "recording a frozen function",
@@ -29,12 +36,17 @@ _NOT_RECORDABLE = (
     "validate(): ",
     "within frozen functions",
     "cannot be recorded",
+    "FlatVariables",
 )
+
+
+class NotComparableError(Exception):
+    """Whether a job is like another one cannot be told: it holds something of a type that is not known."""
 
 
 def arrays_below(value: Any) -> list[Any]:
     """The Dr.Jit arrays in plain objects and in the containers they hold, each once and in order, and Mitsuba's
-    structures of arrays.
+    structures of arrays. Raises NotComparableError.
     """
     return state_below(value)[1]
 
@@ -42,7 +54,7 @@ def arrays_below(value: Any) -> list[Any]:
 def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
     """(structure, arrays). The structure is all that is no array in plain objects and in the containers they hold, with
     the places and types of arrays: of two jobs with the same structure the same kernels are traced. Hashable; Mitsuba's
-    objects count by their address. Arrays: as :func:`arrays_below`.
+    objects count by their address. Arrays: as :func:`arrays_below`. Raises NotComparableError.
     """
     walk = _Walk(value)
     return tuple(walk.structure), walk.arrays
@@ -56,68 +68,140 @@ class _Walk:
     def __init__(self, value: Any) -> None:
         self.arrays: list[Any] = []
         self.structure: list[Any] = []
-        numbers: dict[int, int] = {}
-        waiting = [value]
-        note = self.structure.append
-        while waiting:
-            current = waiting.pop()
-            if isinstance(current, _PLAIN):
-                note((type(current), current))
-                continue
-            number = numbers.setdefault(id(current), len(numbers))
-            if number != len(numbers) - 1:
-                note(number)
-                continue
-            kind = type(current)
-            if dr.is_array_v(current):
-                if dr.is_jit_v(current):
-                    self.arrays.append(current)
-                    note(kind)
-                else:
-                    note((kind, str(current)))
-            elif kind in (list, tuple):
-                note((kind, len(current)))
-                waiting += current
-            elif kind is dict:
-                note((kind, *current))
-                waiting += current.values()
-            elif isinstance(current, mi.Object):
-                note((kind, current.ptr))
-            else:
-                self._object(current, kind, waiting)
+        # Objects are told by their numbers in order: what is made on the way has to live as long.
+        self._seen: dict[int, tuple[int, Any]] = {}
+        self._waiting = [value]
+        while self._waiting:
+            self._next(self._waiting.pop())
 
-    def _object(self, current: Any, kind: type, waiting: list[Any]) -> None:
-        note = self.structure.append
-        if getattr(kind, "only_remembers", False):
+    def _next(self, current: Any) -> None:
+        note, kind = self.structure.append, type(current)
+        if kind is float:
+            note(current.hex())  # tells zeros apart, and a NaN is like another
+            return
+        if isinstance(current, _PLAIN):
+            note((kind, current))
+            return
+        seen = self._seen.get(id(current))
+        if seen is not None:
+            note(seen[0])
+            return
+        self._seen[id(current)] = len(self._seen), current
+        if dr.is_array_v(current):
+            if dr.is_jit_v(current):
+                self.arrays.append(current)
+                note(kind)
+            else:
+                note((kind, digest(np.array(current))))
+        elif isinstance(current, mi.Object):
+            note((kind, current.ptr))
+        elif getattr(kind, "only_remembers", False):
             note(kind)  # what follows from the rest
-        elif isinstance(current, np.ndarray):
-            note((kind, digest(current)))
-        elif isinstance(current, (enum.Enum, range, type, frozenset)):
-            note(current)
-        elif isinstance(current, MethodType):
-            note((kind, current.__func__))
-            waiting.append(current.__self__)
-        elif isinstance(current, FunctionType):
-            note(current)
-            waiting += [cell.cell_contents for cell in current.__closure__ or ()]
+        elif not (self._container(current, kind) or self._library(current, kind) or self._callable(current, kind)):
+            self._object(current, kind)
+
+    def _container(self, current: Any, kind: type) -> bool:
+        if isinstance(current, Mapping):
+            self.structure.append((kind, len(current)))
+            for item in current.items():
+                self._waiting += item
+        elif isinstance(current, (list, tuple, deque)):
+            self.structure.append((kind, len(current)))
+            self._waiting += current
+        elif isinstance(current, (set, frozenset)):
+            self.structure.append((kind, frozenset(current)))
+            if not all(isinstance(entry, (*_PLAIN, enum.Enum)) for entry in current):
+                raise NotComparableError(f"a {kind.__name__} of objects")
+        else:
+            return False
+        if kind.__module__.split(".")[0] not in (*_OTHERS, "collections", "types"):
+            self._attributes(current, kind)  # of a class made out of a container
+        return True
+
+    def _library(self, current: Any, kind: type) -> bool:
+        """Things of Python, NumPy, torch, Dr.Jit and Mitsuba that are values."""
+        note = self.structure.append
+        if isinstance(current, (np.ndarray, np.generic)):
+            if np.asarray(current).dtype.hasobject:
+                raise NotComparableError("a NumPy array of objects")
+            note((kind, digest(np.asarray(current))))
+        elif isinstance(current, _torch_tensor()):
+            note((kind, current.requires_grad, digest(current.detach().cpu().numpy())))
+        elif isinstance(current, (enum.Enum, range, type, complex, array, bytearray, Fraction, Decimal)):
+            note((kind, str(current)) if isinstance(current, (array, bytearray)) else current)
         elif hasattr(kind, "_traverse_1_cb_ro"):
             # Mitsuba's distributions: Dr.Jit finds their arrays.
             self.arrays.append(current)
             note(kind)
         elif isinstance(fields := getattr(kind, "DRJIT_STRUCT", None), dict) and kind.__module__ in _OTHERS:
-            jit = any(dr.is_jit_v(getattr(current, name)) for name in fields)
-            if jit:
+            note(kind)
+            values = [getattr(current, name) for name in fields]
+            if any(dr.is_jit_v(value) for value in values):
                 self.arrays.append(current)
-            note(kind if jit else (kind, str(current)))
-        elif kind.__module__.split(".")[0] not in _OTHERS:
-            held = getattr(current, "__dict__", {})
-            note((kind, *held))
-            waiting += held.values()
-        elif isinstance(current, (dict, list, tuple)):
-            note((kind, *current) if isinstance(current, dict) else (kind, len(current)))
-            waiting += current.values() if isinstance(current, dict) else current
-        else:
+            else:
+                self._waiting += values
+        elif "Transform" in kind.__name__ and kind.__module__ == "mitsuba":
+            note((kind, digest(np.array(current.matrix))))
+        elif kind.__module__ == "mitsuba" and "Bounding" in kind.__name__:
             note((kind, str(current)))
+        else:
+            return False
+        return True
+
+    def _callable(self, current: Any, kind: type) -> bool:
+        if isinstance(current, MethodType):
+            self.structure.append(kind)
+            self._waiting += [current.__func__, current.__self__]
+        elif isinstance(current, FunctionType):
+            # Its code, not itself: a structure holds nothing that a closure may hold.
+            self.structure.append(current.__code__)
+            self._waiting += [current.__defaults__, current.__kwdefaults__]
+            for cell in current.__closure__ or ():
+                try:
+                    self._waiting.append(cell.cell_contents)
+                except ValueError:  # not filled yet
+                    self.structure.append("empty")
+        elif isinstance(current, partial):
+            self.structure.append(kind)
+            self._waiting += [current.func, current.args, current.keywords]
+        else:
+            return False
+        return True
+
+    def _object(self, current: Any, kind: type) -> None:
+        if kind.__module__.split(".")[0] in _OTHERS or not (hasattr(current, "__dict__") or _slots_of(kind)):
+            raise NotComparableError(f"a {kind.__module__}.{kind.__qualname__}")
+        self._attributes(current, kind)
+
+    def _attributes(self, current: Any, kind: type) -> None:
+        slots = [name for name in _slots_of(kind) if hasattr(current, name)]
+        held = getattr(current, "__dict__", {})
+        self.structure.append((kind, *held, *slots))
+        self._waiting += held.values()
+        self._waiting += [getattr(current, name) for name in slots]
+
+
+def _slots_of(kind: type) -> list[str]:
+    names: list[str] = []
+    for base in kind.__mro__:
+        slots = vars(base).get("__slots__", ())
+        names += [slots] if isinstance(slots, str) else slots
+    return [name for name in names if name not in ("__dict__", "__weakref__")]
+
+
+def _torch_tensor() -> tuple[type, ...]:
+    """The class of torch's tensors where somebody has imported it: plugins do not."""
+    torch = sys.modules.get("torch")
+    return () if torch is None else (torch.Tensor,)
+
+
+def says_it_can_be_recorded(plugin: Any) -> bool:
+    """Whether the class of a plugin says that it can be recorded, itself: one that is made out of it may do otherwise.
+    Those of this library are known to.
+    """
+    kind = type(plugin)
+    known = kind.__module__.startswith("torchtransient.plugins.")
+    return bool(vars(kind).get("can_be_recorded", known))
 
 
 def not_recordable(error: BaseException) -> str | None:

@@ -21,8 +21,7 @@ class Kept:
 
     The arrays it was computed from are held with it: so none is written in place meanwhile, and no later one can be
     taken for it because it got the same number from Dr.Jit. While a call is recorded (``dr.freeze``) nothing is kept,
-    since the recording has to compute it for other numbers: without a ``__dict__`` this stays out of
-    :mod:`.frozen_state`.
+    since the recording has to compute it for other numbers: this is no part of what :mod:`.frozen_state` compares.
     """
 
     only_remembers = True

@@ -22,6 +22,9 @@ class ShownValue(NamedTuple):
     flags: int
     cpptype: Any
 
+    # An address in a plugin, which recorded calls are handed.
+    only_remembers = True
+
     def read(self, node: Any) -> Any:
         """The value now, attached where it is; ``node`` is the plugin that showed it."""
         return self.handle if self.cpptype is None else unshared(mi.get_property(self.handle, self.cpptype, node))

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from torchtransient.errors import ShapeError
+from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.render.carry_out import LARGE_FILM
 
 
@@ -19,8 +20,8 @@ class Batch:
     Large films write straight to their place: a copy would cost as much as a third of a render of 16 samples per pixel.
     """
 
-    def __init__(self, count: int, films: Sequence[Any]) -> None:
-        self.count, self.films = count, films
+    def __init__(self, count: int, films: Sequence[Any], integrator: Any) -> None:
+        self.count, self.films, self.integrator = count, films, integrator
         self._steady: torch.Tensor | None = None
         self._response: torch.Tensor | None = None
         self._memory: Any = None
@@ -31,7 +32,9 @@ class Batch:
         """Whether the film writes to the place of item ``n``."""
         entries = math.prod(film.cube_shape())
         large = self.count > 1 and entries >= LARGE_FILM and self.count * entries < 2**32
-        if not large or not all(other.can_borrow(spp) for other in self.films):
+        # An integrator of others may not know of first entries.
+        able = large and says_it_can_be_recorded(self.integrator)
+        if not able or not all(other.can_borrow(spp) for other in self.films):
             yield False
             return
         self._lend(film, n, entries)

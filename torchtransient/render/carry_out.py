@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from torchtransient.interfaces import BACKWARD, RENDER
-from torchtransient.render.recordings import LARGE, PROGRESS, SWITCHED_OFF, NotRecordedError
+from torchtransient.errors import SceneError
+from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
+from torchtransient.render.recordings import LARGE, OWN_ENTRY, PROGRESS, SWITCHED_OFF, NotRecordedError
 from torchtransient.render.seeds import Item
 from torchtransient.render.session import Session
 
@@ -54,13 +55,15 @@ def carry_out(
         seed, spp = (item.seed, job.spp) if kind == RENDER else (item.grad_seed, job.spp_grad)
         return integrator.prepared(session.scene, item.sensor, seed, spp, kind, grad_in(n))
 
-    reason = _refusal(session, group, report, lent)
+    own = _entry_of_its_own(integrator, kind)
+    reason = OWN_ENTRY if own is not None else _refusal(session, group, report, lent)
     install(group[0][1])
     if reason is None:
         jobs = [prepared(n, item) for n, item in group]
         try:
             said, results = session.recordings.run(jobs)
         except NotRecordedError as error:
+            _check_whole(session, error)
             reason = str(error)
             del jobs
             if kind != RENDER:
@@ -77,9 +80,29 @@ def carry_out(
     for i, (n, item) in enumerate(group):
         if i > 0 and kind != RENDER:
             install(item)
-        integrator.run(prepared(n, item), progress=report(n))
+        if own is None:
+            integrator.run(prepared(n, item), progress=report(n))
+        else:
+            _call(own, session, kind, item, grad_in(n), report(n))
         collect(n, item)
     return [reason] * len(group)
+
+
+def _entry_of_its_own(integrator: Any, kind: str) -> Any:
+    """The method of an integrator for a kind of job, where its class has another one than the library's base."""
+    name = {RENDER: "render", BACKWARD: "render_backward", FORWARD: "render_forward"}[kind]
+    owner = next(base for base in type(integrator).__mro__ if name in vars(base))
+    return None if owner.__module__ == "torchtransient.plugins.integrators.base" else getattr(integrator, name)
+
+
+def _check_whole(session: Session, error: NotRecordedError) -> None:
+    if error.broken:
+        session.job.scene.drop(session.job.options)
+        raise SceneError(
+            "a plugin written in Python changed the type of an attribute while its calls were recorded, for instance "
+            "from None to an array. Make it in parameters_changed, or take can_be_recorded = True out of its class. "
+            f"{error}"
+        ) from error
 
 
 def _refusal(
@@ -91,3 +114,16 @@ def _refusal(
         return PROGRESS
     # A recording would write to a copy of it.
     return LARGE if lent else None
+
+
+def _call(entry: Any, session: Session, kind: str, item: Item, grad_in: tuple[Any, Any], report: Any) -> None:
+    """A job by a method of the integrator's own."""
+    job = session.job
+    seed, spp = (item.seed, job.spp) if kind == RENDER else (item.grad_seed, job.spp_grad)
+    common = {"sensor": item.sensor, "seed": seed, "spp": spp}
+    if kind == RENDER:
+        entry(session.scene, **common, develop=False, progress_callback=report)
+    elif kind == BACKWARD:
+        entry(session.scene, session.params, grad_in, **common)
+    else:
+        entry(session.scene, session.params, **common, develop=False)

@@ -52,7 +52,7 @@ def _render_items(
     session: Session, values: Sequence[torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor, tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
     job = session.job
-    batch = Batch(len(job.items), [session.film(item) for item in job.items])
+    batch = Batch(len(job.items), [session.film(item) for item in job.items], session.integrator)
     energies: list[tuple[float, float]] = []
     said: list[str] = []
     for group in groups_of(session):

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchtransient.interfaces import BACKWARD
-from torchtransient.plugins.frozen_state import not_recordable
+from torchtransient.plugins.frozen_state import NotComparableError, not_recordable
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
@@ -27,10 +27,15 @@ SWITCHED_OFF = "traced: freeze=False"
 SEVERAL = "traced: it takes several kernel launches, beside which tracing costs little"
 LARGE = "traced: a large film of a batch, beside which tracing costs little"
 PROGRESS = "traced: progress is reported"
+OWN_ENTRY = "traced: the integrator has a render of its own"
 
 
 class NotRecordedError(Exception):
-    """A call could not be recorded, and is to be traced from its installation on; the text says why."""
+    """A call could not be recorded, and is to be traced from its installation on; the text says why. ``broken``: the
+    scene is not what it was.
+    """
+
+    broken = False
 
 
 class Recordings:
@@ -57,7 +62,10 @@ class Recordings:
             if job.refusal is not None or len(job.launches) > 1:
                 raise NotRecordedError(SEVERAL if job.refusal is None else f"traced: {job.refusal}")
             job.film.clear()
-        structure, arrays = jobs[0].integrator.state_of(jobs)
+        try:
+            structure, arrays = jobs[0].integrator.state_of(jobs)
+        except NotComparableError as error:
+            raise NotRecordedError(f"traced: whether a call is like the last one cannot be told of {error}") from None
         # A recording holds memory for each thread's share of a sum.
         structure = (("threads", dr.thread_count()), *structure)
         found = self._found.get(structure)
@@ -89,9 +97,10 @@ class Recordings:
         self._before[kind] = structure
 
     def _reason(self, kind: str, structure: tuple[Any, ...]) -> str:
-        if len(self._found) == MAX_STRUCTURES:
-            return f"more than {MAX_STRUCTURES} kinds of calls take turns"
-        return _difference(self._before.get(kind, ()), structure)
+        difference = _difference(self._before.get(kind, ()), structure)
+        if len(self._found) < MAX_STRUCTURES:
+            return difference
+        return f"more than {MAX_STRUCTURES} kinds of calls take turns, and {difference}"
 
 
 def _difference(before: tuple[Any, ...], now: tuple[Any, ...]) -> str:
@@ -138,7 +147,9 @@ class Recording:
             if reason is None:
                 raise
             self._refusal = f"traced: Dr.Jit cannot record it: {reason}"
-            raise NotRecordedError(self._refusal) from error
+            refused = NotRecordedError(self._refusal)
+            refused.broken = "FlatVariables" in reason
+            raise refused from error
         finally:
             self._jobs = ()
 

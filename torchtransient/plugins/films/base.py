@@ -11,6 +11,7 @@ from torchtransient.interfaces import FilmInterface
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.response import SensorResponse
+from torchtransient.plugins.frozen_state import says_it_can_be_recorded
 from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effects
 from torchtransient.plugins.properties import truth, whole_number
 
@@ -55,8 +56,6 @@ class TimeResolvedFilm(mi.Film):
     has_window = True
     # Whether ``put`` takes the word that every lane has an array of its own.
     knows_exclusive_lanes = False
-    # Films outside of this library say it of themselves, see :class:`..integrators.base.TransientIntegrator`.
-    can_be_recorded = False
     # Whether ``put`` takes the word that most lanes add something at once.
     knows_crowds = False
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
@@ -232,8 +231,9 @@ class TimeResolvedFilm(mi.Film):
         self.bands, self.steady, self.outside = [], None, None
 
     def can_borrow(self, samples):
-        # Samplers may round up; a sum over the array needs one that starts with the film.
-        in_single = 4 * samples <= MAX_SINGLE_PRECISION_SAMPLES
+        # Samplers may round up; a sum over the array needs one that starts with the film; classes made out of this one
+        # may have storage of their own.
+        in_single = 4 * samples <= MAX_SINGLE_PRECISION_SAMPLES and says_it_can_be_recorded(self)
         return in_single and len(self.band_layout()) == 1 and self.keeps_steady
 
     def lend(self, storage):

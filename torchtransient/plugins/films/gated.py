@@ -42,7 +42,6 @@ class GatedHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "gated_hdr_film"
-    can_be_recorded = True
     knows_exclusive_lanes = True
     measures = "gated"
     has_window = False

@@ -100,7 +100,6 @@ class TransientHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "transient_hdr_film"
-    can_be_recorded = True
     knows_exclusive_lanes = knows_crowds = True
     measures = "transient"
 

@@ -92,7 +92,6 @@ class PhasorHDRFilm(TimeResolvedFilm):
     """
 
     plugin = "phasor_hdr_film"
-    can_be_recorded = True
     measures = "phasor"
     has_window = False
 

@@ -7,11 +7,11 @@ import mitsuba as mi
 
 from torchtransient._collection import no_collection
 from torchtransient.errors import GradientError, SceneError, VariantError
-from torchtransient.interfaces import BACKWARD, FORWARD, RENDER, IntegratorInterface, is_time_resolved
+from torchtransient.interfaces import BACKWARD, FORWARD, JOBS, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
 from torchtransient.plugins.films.temporal_filter import check_name, check_stddev
-from torchtransient.plugins.frozen_state import arrays_below
+from torchtransient.plugins.frozen_state import arrays_below, says_it_can_be_recorded
 from torchtransient.plugins.integrators.derivative_passes import backward, forward
 from torchtransient.plugins.integrators.incoming_adjoint import IncomingAdjoint
 from torchtransient.plugins.integrators.launch import Job, Pass, laser_count, passes_of, seed_array
@@ -65,9 +65,6 @@ class TransientIntegrator(mi.CppADIntegrator):
     # Whether the laser of a scan lights one position after the other, and whether beams without width are seen.
     scans_exhaustively = False
     aims_lasers = False
-    # Plugins outside of this library say it of themselves: what they compute of numbers that are no arrays, or read of
-    # arrays, would be that of the first call for ever.
-    can_be_recorded = False
 
     def traverse(self, cb):
         super().traverse(cb)
@@ -241,6 +238,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         checked and computed once; arguments and errors as in :meth:`render`, :meth:`render_backward` and
         :meth:`render_forward`.
         """
+        if kind not in JOBS:
+            raise SceneError(f"prepared: expected a kind of job, one of {', '.join(JOBS)}, got {kind!r}.")
         with dr.suspend_grad():
             sensor, film = self.resolve(scene, sensor)
             contents, wanted = self.contents(scene, sensor), None
@@ -266,9 +265,8 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     def refusal_of(self, job) -> str | None:
         """Why ``dr.freeze`` cannot record a job, None where it can."""
-        for plugin in (self, job.film):
-            # Of the class itself: one made out of it may do otherwise.
-            if not vars(type(plugin)).get("can_be_recorded", False):
+        for plugin in job.plugins:
+            if not says_it_can_be_recorded(plugin):
                 return f"the plugin {type(plugin).__name__} does not say that it can be (can_be_recorded)"
         return "derivatives beside paths read numbers of the scene" if job.beside else None
 

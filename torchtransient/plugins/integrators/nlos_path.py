@@ -103,7 +103,6 @@ class TransientNLOSPath(base.TransientIntegrator):
     (as that of point lights elsewhere).
     """
 
-    can_be_recorded = True
     walks_through_media = True
     scans_exhaustively = True
 

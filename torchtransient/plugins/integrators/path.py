@@ -27,8 +27,6 @@ class TransientPath(TransientIntegrator):
     Not supported: participating media (``SceneError``).
     """
 
-    can_be_recorded = True
-
     def strategies(self, contents):
         scattering = Lambertian(draws_lobe=True) if Lambertian.fits(contents) else Surface()
         return Vacuum(), scattering, [EmitterFound(), EmitterSampled()]

@@ -16,8 +16,8 @@ class Prepared:
     :meth:`~.base.TransientIntegrator.prepared`, carried out by :meth:`~.base.TransientIntegrator.run`.
 
     ``kind``: one of :data:`~torchtransient.interfaces.JOBS`. ``launches``: the :class:`.launch.Pass` of its paths;
-    ``seed``, ``samples``: as it was asked for, and the largest number of samples of a pixel. ``incoming``: the film's
-    adjoint in reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
+    ``seed`` (``UInt32``) of the job; ``samples``: the largest number of a pixel. ``incoming``: the film's adjoint in
+    reverse mode. ``beside``: what derivatives have beside paths. ``plugins``: those of the scene that are
     written in Python, whose numbers become part of the kernels. ``refusal``: why it cannot be recorded, None where it
     can.
     """

@@ -71,7 +71,9 @@ class SeenScene:
         return self._tracker
 
     def python_plugins(self, scene: Any) -> list[Any]:
-        """The plugins of the scene that are written in Python, integrator and films included."""
+        """The plugins of the scene that are written in Python: integrator, films, samplers and filters included, and
+        without what plugins do not show.
+        """
         self._forget_replaced(scene)
         if self._python is None:
             # Of these alone: who holds a light or a sensor may hold its shape, and so on up to the scene.
@@ -79,8 +81,10 @@ class SeenScene:
             found = [one for one in objects_below(scene, mi.Object) if isinstance(one, below)]
             self._python = list({one.ptr: one for one in found if _is_python(one)}.values())
         sensors = scene.sensors()
-        others = [*sensors, *(sensor.film() for sensor in sensors), *scene.emitters(), *scene.shapes()]
-        return [*self._python, *filter(_is_python, others), scene.integrator()]
+        films = [sensor.film() for sensor in sensors]
+        others = [*sensors, *films, *(sensor.sampler() for sensor in sensors), *(film.rfilter() for film in films)]
+        others += [*scene.emitters(), *scene.shapes(), scene.integrator()]
+        return [*self._python, *filter(_is_python, others)]
 
     def _forget_replaced(self, scene: Any) -> None:
         """Look up anew when a shape was given another BSDF (``shape.set_bsdf``) or a BSDF got another lobe."""

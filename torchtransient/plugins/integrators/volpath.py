@@ -30,7 +30,6 @@ class TransientVolpath(path.TransientPath):
     attenuated, as in Mitsuba.
     """
 
-    can_be_recorded = True
     walks_through_media = True
 
     def strategies(self, contents):
