@@ -15,7 +15,7 @@ import torch
 import torchtransient as tt
 from support.frozen_runs import Runs
 from torchtransient.render import recordings
-from torchtransient.render.recordings import FIRST, LAUNCHED, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
+from torchtransient.render.recordings import FIRST, LAUNCHED, NO_FREEZING, PROGRESS, RECORDED, SEVERAL, SWITCHED_OFF
 from torchtransient.render.variant import active_variant
 from torchtransient.testing.gradient_sweep.measure import quiet
 from torchtransient.testing.gradient_sweep.settings import Setting, all_settings
@@ -272,12 +272,19 @@ def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
     out = recorded(seed=7) if kind == "backward" else None
     integrator = scene_integrator(recorded)
 
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
+    failed = []
+    walk = type(integrator).walk
+
+    def interrupt(*args, **kwargs):
+        if not failed:
+            failed.append(True)
+            raise KeyboardInterrupt
+        return walk(*args, **kwargs)
 
     with monkeypatch.context() as patched:
         if stage == "recorded":
-            patched.setattr(type(integrator), "run", interrupt)
+            # In the middle of it, once: a call that is tried again must not hide it.
+            patched.setattr(type(integrator), "walk", interrupt)
         else:
             patched.setattr(recordings.Recording, "run", interrupt)
         with pytest.raises(KeyboardInterrupt):
@@ -287,6 +294,7 @@ def test_interrupts_leave_everything_as_it_was(stage, kind, monkeypatch):
         same(expected[0].transient, got[0].transient)
         for a, b in zip(expected[1], got[1], strict=True):
             same(a, b)
+    assert got[0].stats.recorded == (LAUNCHED,) and got[0].stats.derivatives_recorded == [LAUNCHED]
 
 
 def scene_integrator(renderer):
@@ -436,3 +444,17 @@ def test_a_second_filter_leaves_the_recordings_of_the_first(room_scene):
         said = [renderer(seed=0).stats.recorded[0] for _ in range(3)]
         assert said == [FIRST, RECORDED, LAUNCHED]
     assert first(seed=0).stats.recorded == (LAUNCHED,)
+
+
+def test_flags_of_dr_jit(room_scene):
+    import drjit as dr
+
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        assert {renderer(seed=0).stats.recorded[0] for _ in range(4)} == {NO_FREEZING}
+    with (
+        active_variant(VARIANT),
+        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
+        pytest.raises(tt.errors.VariantError, match="SymbolicLoops"),
+    ):
+        renderer(seed=0)

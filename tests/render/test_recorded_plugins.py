@@ -1,4 +1,4 @@
-"""Plugins of others under recorded calls: right whatever they keep and however they keep it, or traced with a reason."""
+"""Plugins of others under recorded calls: right whatever they keep and however they keep it, or traced."""
 
 from __future__ import annotations
 
@@ -58,9 +58,13 @@ def test_whatever_a_plugin_keeps(kept, says):
 
 def test_an_attribute_that_changes_its_type_is_an_error():
     traced, recorded = painted("float", lazy=True)
-    with pytest.raises(tt.errors.SceneError, match="changed the type of an attribute"):
+
+    def fail():
         for value in (0.5, 0.5, 0.5, 0.9):
             steady(recorded, value)
+
+    with pytest.raises(tt.errors.SceneError, match="changed the type of an attribute"):
+        fail()
     # Nothing of it is left in the scene.
     fresh = painted("float", lazy=True)[0]
     assert steady(traced, 0.9)[0] == pytest.approx(steady(fresh, 0.9)[0], rel=1e-6)

@@ -40,6 +40,16 @@ _NOT_RECORDABLE = (
 )
 
 
+# Without numbers and addresses, which differ from run to run.
+_REASONS = {
+    "was created before recording": "a plugin of the scene does not show Dr.Jit all of its arrays",
+    "validate(): ": "a plugin of the scene does not show Dr.Jit all of its arrays",
+    "not supplied as an input": "a plugin of the scene does not show Dr.Jit all of its arrays",
+    "reading from evaluated variables": "numbers of arrays are read while it is traced",
+    "FlatVariables": "an attribute of a plugin changes its type while it is recorded",
+}
+
+
 class NotComparableError(Exception):
     """Whether a job is like another one cannot be told: it holds something of a type that is not known."""
 
@@ -204,13 +214,18 @@ def says_it_can_be_recorded(plugin: Any) -> bool:
     return bool(vars(kind).get("can_be_recorded", known))
 
 
-def not_recordable(error: BaseException) -> str | None:
-    """What Dr.Jit says of a function that it cannot record; None for other errors."""
-    found, seen = None, error
-    while seen is not None:
-        text = str(seen)
-        if isinstance(seen, RuntimeError) and any(words in text for words in _NOT_RECORDABLE):
-            # What it came of says more.
-            found = text if found is None or "(see above)" in found else found
-        seen = seen.__cause__ or seen.__context__  # type: ignore[assignment]
-    return found
+def not_recordable(error: BaseException, before: BaseException | None = None) -> str | BaseException:
+    """Why Dr.Jit could not record a call that has raised, or, where it was something else that went wrong, that error.
+    ``before``: what was being handled when the call was made.
+    """
+    seen: BaseException | None = error
+    found = error
+    while seen is not None and seen is not before:
+        found, seen = seen, seen.__cause__ or seen.__context__
+    text = str(found)
+    if not isinstance(found, RuntimeError) or not any(words in text for words in _NOT_RECORDABLE):
+        return found
+    for words, reason in _REASONS.items():
+        if words in text:
+            return reason
+    return text[:120]

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import BACKWARD, FORWARD, RENDER
-from torchtransient.render.recordings import LARGE, OWN_ENTRY, PROGRESS, SWITCHED_OFF, NotRecordedError
+from torchtransient.render.recordings import LARGE, NO_FREEZING, OWN_ENTRY, PROGRESS, SWITCHED_OFF, NotRecordedError
 from torchtransient.render.seeds import Item
 from torchtransient.render.session import Session
 
@@ -108,8 +108,15 @@ def _check_whole(session: Session, error: NotRecordedError) -> None:
 def _refusal(
     session: Session, group: Sequence[Numbered], report: Callable[[int], Callable[[float], None] | None], lent: bool
 ) -> str | None:
+    import drjit as dr
+
     if not session.job.freeze:
         return SWITCHED_OFF
+    if not dr.flag(dr.JitFlag.KernelFreezing):
+        return NO_FREEZING
+    for slot in session.slots.slots:
+        if slot.is_number_of_kernels():
+            return f"traced: numbers of {slot.key} become part of the kernels"
     if report(group[0][0]) is not None:
         return PROGRESS
     # A recording would write to a copy of it.

@@ -16,6 +16,7 @@ import numpy as np
 
 from torchtransient.errors import SceneError, UnknownKeyError
 from torchtransient.interfaces import IntegratorInterface
+from torchtransient.plugins.mitsuba_numbers import check_pose, is_number_of_kernels, is_turned_by_reflections
 from torchtransient.plugins.node_walk import ShownValue, unshared
 from torchtransient.plugins.parameters import SILHOUETTES, ParameterEffect, ParameterTracker
 from torchtransient.plugins.swept_parameters import UNCHECKED, is_checked
@@ -276,6 +277,20 @@ class Slot:
         scene = self._built.scene
         node = self._built.params.properties[self.key][2]
         return bool(scene.integrator().parameters(scene).loses_black(node, self.key.rsplit(".", 1)[-1]))
+
+    def is_number_of_kernels(self) -> bool:
+        """Whether Mitsuba reads numbers of the value while it is installed, and keeps them as plain ones."""
+        return is_number_of_kernels(*self._class_and_name())
+
+    def check(self, value: Any) -> None:
+        """Raise SceneError for a value that Mitsuba would keep wrongly."""
+        if is_turned_by_reflections(*self._class_and_name()):
+            check_pose(self.key, self.initial, value)
+
+    def _class_and_name(self) -> tuple[str, str]:
+        if self.kind == "mesh_transform":
+            return "", "to_world"
+        return self._built.params.properties[self.key][2].class_name(), self.key.rsplit(".", 1)[-1]
 
     @property
     def size(self) -> int:

@@ -60,7 +60,7 @@ class PhysicsWatch:
             raise PhysicsError(f"{message} With physics='warn' it is computed all the same.")
         if about not in self._told:
             self._told.add(about)
-            warnings.warn(message, PhysicsWarning, stacklevel=_level_of_user())
+            warnings.warn(message, PhysicsWarning, stacklevel=level_of_user())
 
     def scene(self, findings: Mapping[str, str]) -> None:
         """Say what is found in the description itself, by key: the first ones, where there are many."""
@@ -180,7 +180,7 @@ def are_finite(low: float, high: float) -> bool:
 _INSIDE = (str(Path(__file__).parents[1]), str(Path(torch.__file__).parent))
 
 
-def _level_of_user() -> int:
+def level_of_user() -> int:
     """How far above the line that warns the first one outside of this library and torch is."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_INSIDE):

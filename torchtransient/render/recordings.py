@@ -9,6 +9,7 @@ it. Recordings hold kernels alone, no results; they are bounded in number and go
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from typing import Any
 
 from torchtransient.interfaces import BACKWARD
 from torchtransient.plugins.frozen_state import NotComparableError, not_recordable
+from torchtransient.render.physics import level_of_user
 
 # Structures of one built scene and set of keys, and recordings of each of them for other sizes and flags of arrays.
 MAX_STRUCTURES, MAX_RECORDINGS = 64, 8
@@ -26,6 +28,7 @@ FIRST, RECORDED, LAUNCHED = "traced: the first call", "recorded", "launched"
 SWITCHED_OFF = "traced: freeze=False"
 SEVERAL = "traced: it takes several kernel launches, beside which tracing costs little"
 LARGE = "traced: a large film of a batch, beside which tracing costs little"
+NO_FREEZING = "traced: the flag KernelFreezing of Dr.Jit is off"
 PROGRESS = "traced: progress is reported"
 OWN_ENTRY = "traced: the integrator has a render of its own"
 
@@ -92,11 +95,14 @@ class Recordings:
                 f"recording: {self._reason(kind, structure)}. Tracing costs some milliseconds a call; keep spp, keys, "
                 "shapes and which values need gradients the same from call to call, or switch recordings off with "
                 "freeze=False.",
-                stacklevel=2,
+                stacklevel=level_of_user(),
             )
         self._before[kind] = structure
 
     def _reason(self, kind: str, structure: tuple[Any, ...]) -> str:
+        refusal = self._found[structure].refusal
+        if refusal not in (None, FIRST):
+            return str(refusal)
         difference = _difference(self._before.get(kind, ()), structure)
         if len(self._found) < MAX_STRUCTURES:
             return difference
@@ -124,31 +130,34 @@ class Recording:
     def __init__(self) -> None:
         self._jobs: Sequence[Any] = ()
         self._frozen: Any = None
-        self._refusal: str | None = FIRST
+        self._traced = False
+        self.refusal: str | None = FIRST
         self.calls = 0
 
     def run(self, jobs: Sequence[Any], arrays: list[Any]) -> tuple[list[list[Any]], bool]:
         """(what the films have taken, whether kernels were launched without tracing). Raises NotRecordedError."""
         self.calls += 1
-        if self._refusal is not None:
-            refusal = self._refusal
+        if self.refusal is not None:
+            refusal = self.refusal
             if refusal == FIRST:
-                self._refusal = None
+                self.refusal = None
             raise NotRecordedError(refusal)
         if self._frozen is None:
             self._frozen = self._made()
-        before, self._jobs = self._frozen.n_recordings, jobs
+        before, self._jobs, self._traced = sys.exc_info()[1], jobs, False
         try:
             results = self._frozen(jobs[0].scene, arrays)
-            return results, self._frozen.n_recordings == before
+            return results, not self._traced
         except BaseException as error:
             self._frozen = None
-            reason = not_recordable(error)
-            if reason is None:
-                raise
-            self._refusal = f"traced: Dr.Jit cannot record it: {reason}"
-            refused = NotRecordedError(self._refusal)
-            refused.broken = "FlatVariables" in reason
+            reason = not_recordable(error, before)
+            if isinstance(reason, BaseException):
+                if reason is error:
+                    raise
+                raise reason from None
+            self.refusal = f"traced: Dr.Jit cannot record it: {reason}"
+            refused = NotRecordedError(self.refusal)
+            refused.broken = "changes its type" in reason
             raise refused from error
         finally:
             self._jobs = ()
@@ -158,6 +167,7 @@ class Recording:
 
         def call(scene: Any, arrays: list[Any]) -> list[list[Any]]:
             # Scene and arrays are those of the jobs; a recording finds them by being handed them.
+            self._traced = True
             results = []
             for job in self._jobs:
                 job.integrator.run(job)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from torchtransient._collection import no_collection
-from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.errors import SceneError, TorchTransientError, VariantError
 from torchtransient.plugins.black_textures import lifted
 from torchtransient.render.build import BuildOptions
 from torchtransient.render.filter_override import temporal_filter
@@ -100,6 +100,7 @@ class Session:
         leaves = []
         for slot, value, batched, need in zip(self.slots.slots, values, self.job.batched, needs, strict=True):
             entry = value[item.entry] if batched else value
+            slot.check(entry)
             leaf = own_array(entry)
             if need and slot.loses_black():
                 leaf = lifted(leaf)
@@ -164,9 +165,20 @@ def _quiet() -> Iterator[None]:
         logger.set_log_level(before)
 
 
+def _check_flags() -> None:
+    import drjit as dr
+
+    if not dr.flag(dr.JitFlag.SymbolicLoops):
+        raise VariantError(
+            "the flag SymbolicLoops of Dr.Jit is off, without which gradients of a render are wrong; switch it on: "
+            "drjit.set_flag(drjit.JitFlag.SymbolicLoops, True)."
+        )
+
+
 @contextmanager
 def session_of(job: RenderJob) -> Iterator[Session]:
     with active_variant(job.scene.variant), no_collection():
+        _check_flags()
         slots = job.scene.slots(job.keys, job.options)
         session = Session(job, slots)
         films = [sensor.film() for sensor in session.sensors]

@@ -1,0 +1,59 @@
+"""What Mitsuba keeps of installed values in plain numbers: shown on Mitsuba alone, and what the layer makes of it."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.testing.small_room import make_room
+
+VARIANT = "llvm_ad_rgb"
+UPRIGHT, REFLECTED = np.diag([0.3, 0.3, 0.3, 1.0]), np.diag([-0.3, 0.3, 0.3, 1.0])
+
+
+def outwards(shape):
+    """Whether the first thing that a ray from outside meets looks at it."""
+    si = shape.ray_intersect(mi.Ray3f([0, -5, 0.1], [0, 1, 0]))
+    return bool((si.n.y < 0)[0])
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_a_reflection_turns_a_shape_inside_out_at_every_update(kind):
+    shape = mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(UPRIGHT)})
+    params = mi.traverse(shape)
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    del scene
+    seen = []
+    for _ in range(4):
+        params["to_world"] = mi.Transform4f(REFLECTED)
+        params.update()
+        seen.append(outwards(mi.load_dict({"type": "scene", "shape": shape})))
+    assert seen[0] != seen[1] and seen[:2] == seen[2:]
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+@pytest.mark.parametrize("described", [UPRIGHT, REFLECTED], ids=["upright", "reflected"])
+def test_poses_that_reflect_are_refused(kind, described):
+    scene = tt.load(make_room() | {"ball": {"type": kind, "to_world": described}}, variant=VARIANT)
+    renderer = tt.TransientRenderer(scene, parameters=["ball.to_world"], spp=2, physics="ignore")
+    with pytest.raises(tt.errors.SceneError, match="without a reflection"):
+        renderer({"ball.to_world": torch.tensor(REFLECTED)}, seed=0)
+
+
+def test_the_ends_of_an_irregular_spectrum_are_not_recorded():
+    room = make_room()
+    spectrum = {"type": "irregular", "wavelengths": "450, 550, 650", "values": ".2, .8, .4"}
+    room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": spectrum}
+    key = "wall.bsdf.reflectance.wavelengths"
+    steady = []
+    for freeze in (False, True):
+        scene = tt.load(room, variant="llvm_ad_spectral")
+        renderer = tt.TransientRenderer(scene, parameters=[key], spp=64, freeze=freeze, physics="ignore")
+        for nodes in ([450.0, 550.0, 650.0],) * 3 + ([400.0, 550.0, 700.0],):
+            out = renderer({key: torch.tensor(nodes)}, seed=0)
+        steady.append(out.steady)
+    torch.testing.assert_close(steady[1], steady[0], rtol=2e-5, atol=1e-6)
+    assert out.stats.recorded[0].startswith("traced: numbers of wall.bsdf.reflectance.wavelengths")
