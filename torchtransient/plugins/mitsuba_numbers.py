@@ -32,7 +32,7 @@ def check_pose(key: str, *poses: Any) -> None:
     """Raise SceneError for poses (4, 4) that reflect, of a shape that they would turn inside out."""
     if any(np.linalg.det(np.asarray(pose, dtype=np.float64).reshape(4, 4)[:3, :3]) < 0 for pose in poses):
         raise SceneError(
-            f"value of {key!r}: expected poses without a reflection, got one whose determinant is negative: Mitsuba turns "
-            "such a shape inside out once more at every change. Turn it by a rotation, use flip_normals, or describe it "
-            "as a mesh."
+            f"value of {key!r}: expected poses without a reflection, got one whose determinant is negative: Mitsuba "
+            "turns such a shape inside out once more at every change. Turn it by a rotation, use flip_normals, or "
+            "describe it as a mesh."
         )
