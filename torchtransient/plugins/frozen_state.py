@@ -9,6 +9,7 @@ no arrays become part of the kernels: a recording is good for one structure alon
 from __future__ import annotations
 
 import enum
+import functools
 import sys
 from array import array
 from collections import deque
@@ -28,6 +29,8 @@ from torchtransient.plugins.remembered import digest
 # Their objects are known one by one below, or not comparable.
 _OTHERS = ("builtins", "drjit", "mitsuba", "numpy", "torch")
 _PLAIN = (type(None), bool, int, str, bytes)
+# By class: how a walk deals with its objects.
+_TREATED: dict[type, str] = {**dict.fromkeys(_PLAIN, "plain"), float: "float", list: "list", tuple: "list"}
 # What Dr.Jit says of functions that it cannot record.
 _NOT_RECORDABLE = (
     "recording a frozen function",
@@ -81,32 +84,46 @@ class _Walk:
         # Objects are told by their numbers in order: what is made on the way has to live as long.
         self._seen: dict[int, tuple[int, Any]] = {}
         self._waiting = [value]
-        while self._waiting:
-            self._next(self._waiting.pop())
-
-    def _next(self, current: Any) -> None:
-        note, kind = self.structure.append, type(current)
-        if kind is float:
-            note(current.hex())  # tells zeros apart, and a NaN is like another
-            return
-        if isinstance(current, _PLAIN):
-            note((kind, current))
-            return
-        seen = self._seen.get(id(current))
-        if seen is not None:
-            note(seen[0])
-            return
-        self._seen[id(current)] = len(self._seen), current
-        if dr.is_array_v(current):
-            if dr.is_jit_v(current):
+        # A walk is part of every call: most of what it meets is plain, or an array, and is dealt with here.
+        note, seen, waiting, pop = self.structure.append, self._seen, self._waiting, self._waiting.pop
+        while waiting:
+            current = pop()
+            kind = type(current)
+            treated = _TREATED.get(kind)
+            if treated == "plain":
+                note((kind, current))
+                continue
+            if treated == "float":
+                note(current.hex())  # tells zeros apart, and a NaN is like another
+                continue
+            met = seen.get(id(current))
+            if met is not None:
+                note(met[0])
+                continue
+            seen[id(current)] = len(seen), current
+            if treated == "array":
                 self.arrays.append(current)
                 note(kind)
+            elif treated == "list":
+                note((kind, len(current)))
+                waiting += current
+            elif treated == "plugin":
+                note((kind, current.ptr))
+            elif treated == "remembers":
+                note(kind)  # what follows from the rest
+            elif treated == "object":
+                self._attributes(current, kind)
             else:
-                note((kind, digest(np.array(current))))
-        elif isinstance(current, mi.Object):
-            note((kind, current.ptr))
-        elif getattr(kind, "only_remembers", False):
-            note(kind)  # what follows from the rest
+                self._other(current, kind)
+
+    def _other(self, current: Any, kind: type) -> None:
+        if kind not in _TREATED:
+            _TREATED[kind] = _treatment(current, kind)
+            # Again, as that.
+            del self._seen[id(current)]
+            self._waiting.append(current)
+        elif dr.is_array_v(current):
+            self.structure.append((kind, digest(np.array(current))))
         elif not (self._container(current, kind) or self._library(current, kind) or self._callable(current, kind)):
             self._object(current, kind)
 
@@ -191,6 +208,20 @@ class _Walk:
         self._waiting += [getattr(current, name) for name in slots]
 
 
+def _treatment(current: Any, kind: type) -> str:
+    """How a walk deals with objects of a class."""
+    if getattr(kind, "only_remembers", False):
+        return "remembers"
+    if dr.is_array_v(current):
+        return "array" if dr.is_jit_v(current) else "other"
+    if isinstance(current, mi.Object):
+        return "plugin"
+    ours = kind.__module__.split(".")[0] == "torchtransient"
+    containers = (Mapping, list, tuple, deque, set, frozenset, enum.Enum)
+    return "object" if ours and hasattr(current, "__dict__") and not isinstance(current, containers) else "other"
+
+
+@functools.cache
 def _slots_of(kind: type) -> list[str]:
     names: list[str] = []
     for base in kind.__mro__:
