@@ -407,3 +407,10 @@ def test_whole_numbers_of_any_type_are_seeds(room_scene, seed):
 def test_other_seeds_are_refused(room_scene, seed):
     with pytest.raises(ValueError, match="seed: expected a whole number"):
         tt.TransientRenderer(room_scene, parameters=[], spp=2)(seed=seed)
+
+
+@pytest.mark.parametrize("values", [0, 1, False, [], (), [0.1, 0.2, 0.3], torch.rand(3), "seed"], ids=repr)
+def test_values_that_are_no_mapping(room_scene, values):
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
+    with pytest.raises(tt.errors.SceneError, match="expected a mapping from keys to values"):
+        renderer(values)

@@ -131,6 +131,16 @@ def film_asked_for(film: Any, named: Mapping[str, Any]) -> FilmChoice | None:
     return film
 
 
+def given_values(values: Any) -> dict[str, Any]:
+    """The values of a call. Raises SceneError for what is no mapping: a seed, most likely."""
+    if values is not None and not isinstance(values, Mapping):
+        raise SceneError(
+            f"values: expected a mapping from keys to values, got {type(values).__name__}; write {{key: value}}, and a "
+            "seed as seed=0."
+        )
+    return dict(values or {})
+
+
 class Values(Mapping[str, nn.Parameter]):
     """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does."""
 

@@ -24,6 +24,7 @@ from torchtransient.render.arguments import (
     checked_grad_seed,
     film_asked_for,
     fit_shape,
+    given_values,
     mangle,
     samples,
     sensor_list,
@@ -308,7 +309,7 @@ class TransientRenderer(nn.Module):
 
         ``seed``: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
         every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed per
-        entry.
+        entry. ``spp``: instead of the renderer's. ``progress``: a bar.
 
         Returns a :class:`RenderOutput` whose tensors carry gradients to the values. Raises ``SceneError`` for
         unknown keys, ``ShapeError``, ``DeviceError``, ``UnitError`` for values that are not finite, ``StorageError``
@@ -349,7 +350,7 @@ class TransientRenderer(nn.Module):
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """The tensors of a call in the order of the keys, which of them are batched, and the batch size."""
-        given = dict(values or {})
+        given = given_values(values)
         for key in given:
             if key not in self._shapes:
                 hint = unknown_key(key, list(self._shapes), "this renderer")
