@@ -40,8 +40,10 @@ def outcomes(setting, folder, most):
     with active_variant(setting.variant), quiet(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = tt.load(setting.make(folder), variant=setting.variant)
-        keys = [key for key in scene.parameters().differentiable() if setting.takes(key)][:most]
-        return {key: Runs(scene, key).outcome() for key in keys}
+        every = scene.parameters().differentiable()
+        # A plugin without numbers that move (a sky by its date) is recorded as a part of what others move.
+        keys = [key for key in every if setting.takes(key)] or list(every)
+        return {key: Runs(scene, key).outcome() for key in keys[:most]}
 
 
 def check(setting, folder, most):
@@ -63,7 +65,12 @@ def test_numbers_of_traced_calls(setting, tmp_path):
 @pytest.mark.parametrize("setting", settings(bare=True), ids=lambda one: one.name)
 def test_numbers_of_traced_calls_for_every_plugin(setting, tmp_path):
     """Some plugins do not show Dr.Jit all of their arrays: their scenes are traced (docs/speed.md has a list)."""
-    check(setting, tmp_path, 1)
+    if setting.plugin == "timed_sunsky":
+        # Not in Mitsuba's kernels either: it evaluates arrays while they are built.
+        with pytest.raises(tt.errors.SceneError, match="describe a 'sunsky' at its time"):
+            check(setting, tmp_path, 1)
+    else:
+        check(setting, tmp_path, 1)
 
 
 # ------------------------------------------------------------------------------------------- films, batches, sensors

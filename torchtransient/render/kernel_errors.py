@@ -11,6 +11,8 @@ from torchtransient.errors import GradientError, SceneError, TorchTransientError
 # Dr.Jit's words for an exception inside a loop or call that it traces, and for forward mode that it cannot do.
 _INSIDE = "encountered an exception"
 _ACROSS = "dr.isolate_grad() scope"
+# And for a plugin that asks for the numbers of an array which is not there yet.
+_EVALUATED = ": not permitted. "
 
 
 @contextmanager
@@ -38,6 +40,13 @@ def _named(reason: BaseException) -> TorchTransientError:
             "forward mode: Dr.Jit cannot push the tangent of a value into the calls that read it (known of attributes "
             "of shapes with one number at each place, read as a roughness or the weight of a lobe). Use reverse mode, "
             "or a 'bitmap' in the surface itself."
+        )
+    if _EVALUATED in words:
+        return SceneError(
+            f"the scene cannot be rendered: one of its plugins evaluates an array while its kernel is built "
+            f"({words.split(_EVALUATED)[0]}). Mitsuba's 'timed_sunsky' does: describe a 'sunsky' at its time. A plugin "
+            "of your own may not look at values (print them, compare them in an `if`, make numpy arrays of them) in "
+            "methods that paths call."
         )
     hint = " A texture or volume may have another number of channels than the place that it stands in."
     return SceneError(
