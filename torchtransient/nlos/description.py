@@ -25,11 +25,11 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import KINDS
+from torchtransient.data.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
-from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.quantities import shown
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
