@@ -66,5 +66,5 @@ def folder(path, n=10, per_shard=4, **options):
     path.mkdir(exist_ok=True)
     for number in range(-(-n // per_shard)):
         samples = [sample(i) for i in range(number * per_shard, min(n, (number + 1) * per_shard))]
-        write(path / f"shard-{number:06d}.h5", samples, **options, **{"shard": number})
+        write(path / f"shard-{number:06d}.h5", samples, **options, shard=number)
     return path
