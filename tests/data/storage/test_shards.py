@@ -1,0 +1,212 @@
+"""Shards: what is written is read, bytes are a function of the samples, nothing half written appears."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.stored_samples import cube, header, sample, write
+from torchtransient.data.storage.chunks import COMPRESSIONS, chunk_shape
+from torchtransient.data.storage.part_files import sweep_parts
+from torchtransient.data.storage.shard_file import Shard, ShardWriter, stored_checksum
+from torchtransient.errors import StorageError
+
+
+def digest(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_what_is_written_is_read(tmp_path, compression):
+    samples = [sample(i) for i in range(3)]
+    with Shard(write(tmp_path / "a.h5", samples, compression=compression)) as shard:
+        assert shard.header == header() and shard.index == {0: 0, 1: 1, 2: 2} and shard.failed == {}
+        assert shard.names == tuple(sorted(samples[0].arrays))
+        for row, made in enumerate(samples):
+            for name, array in made.arrays.items():
+                found = shard.read(name, row)
+                assert found.dtype == array.dtype and np.array_equal(found, array)
+            values = shard.values(row)
+            assert values["box.filename"] == made.values["box.filename"] and values["count"] == row
+            assert np.array_equal(values["red.reflectance.value"], made.values["red.reflectance.value"])
+            assert shard.seeds[row] == made.seed and tuple(shard.outside[row]) == made.outside
+        assert shard.structure == ["structure 0", "structure 1", "structure 0"]
+        assert shard.verify() is None
+
+
+@pytest.mark.parametrize("store", ["exact", "rounded", "counts"])
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_bytes_do_not_tell_the_order(tmp_path, store, compression):
+    samples = [sample(i, counts=store == "counts") for i in range(4)]
+    for k in (2, 3):  # counts that need wider types, at different places
+        if store == "counts":
+            samples[k].arrays["measurement"][0, 0, 0, 0] = 100 ** (k - 1)
+    samples[1] = ValueError("no light")
+    found = set()
+    for number, rows in enumerate([[0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]]):
+        found.add(digest(write(tmp_path / f"{number}.h5", samples, store, compression, rows)))
+        time.sleep(0.02)
+    assert len(found) == 1
+
+
+def test_failures_are_named(tmp_path):
+    samples = [sample(0), ValueError("the box left the room"), sample(2)]
+    with Shard(write(tmp_path / "a.h5", samples)) as shard:
+        assert shard.index == {0: 0, 2: 2} and shard.failed == {1: "the box left the room"}
+        for call in (lambda: shard.read("transient", 1), lambda: shard.values(1)):
+            with pytest.raises(StorageError, match="the box left the room"):
+                call()
+        assert np.array_equal(shard.read("depth", 2), samples[2].arrays["depth"])
+
+
+def test_a_shard_of_failures(tmp_path):
+    with Shard(write(tmp_path / "a.h5", [ValueError("a"), ValueError("b")])) as shard:
+        assert shard.index == {} and shard.names == () and shard.failed == {0: "a", 1: "b"}
+        with pytest.raises(StorageError, match="no sample at all"):
+            shard._dataset("transient")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: replace(s, arrays={**s.arrays, "transient": s.arrays["transient"][:, :-1]}), "'transient' as in"),
+        (lambda s: replace(s, arrays={**s.arrays, "depth": s.arrays["depth"].astype(float)}), "'depth' as in"),
+        (lambda s: replace(s, arrays={"transient": s.arrays["transient"]}), "expected the arrays"),
+        (lambda s: replace(s, values={**s.values, "new": 1}), "expected values"),
+        (lambda s: replace(s, values={**s.values, "count": "many"}), "expected values"),
+        (lambda s: replace(s, arrays={**s.arrays, "depth": np.array(["a"])}), "array of numbers"),
+        (lambda s: replace(s, arrays={**s.arrays, "depth": np.zeros((0, 3))}), "array of numbers"),
+    ],
+)
+def test_samples_of_a_recipe_are_alike(tmp_path, change, message):
+    with pytest.raises(StorageError, match=message):
+        write(tmp_path / "a.h5", [sample(0), change(sample(1))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_come_once(tmp_path):
+    def put(rows):
+        with ShardWriter(tmp_path / "a.h5", 2, header()) as shard:
+            for row in rows:
+                shard.put(row, sample(row))
+
+    for rows, message in (([0, 0], "was put before"), ([0], r"\[1\] were neither"), ([0, 2], "below 2")):
+        with pytest.raises(StorageError, match=message):
+            put(rows)
+    with pytest.raises(StorageError, match="every sample once"):
+        write(tmp_path / "a.h5", [sample(3), sample(3)])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rows": 0}, "rows"), ({"rows": 1.5}, "rows"), ({"store": "lossy"}, "store"),
+        ({"compression": "zip"}, "compression"), ({"header": {"a": object()}}, "plain data"),
+        ({"header": {"a": float("nan")}}, "plain data"),
+        ({"path": "missing/a.h5"}, "does not exist"), ({"path": "."}, "folder"),
+    ],
+)  # fmt: skip
+def test_arguments(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StorageError, match=message):
+        ShardWriter(**{"path": "a.h5", "rows": 1, "header": {}, **arguments})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_inside_leave_nothing(tmp_path):
+    def failing(error):
+        with ShardWriter(tmp_path / "a.h5", 2, header()) as shard:
+            shard.put(0, sample(0))
+            assert len(list(tmp_path.iterdir())) == 1
+            raise error
+
+    for error in (OSError("texture missing"), KeyboardInterrupt(), ValueError("x")):
+        with pytest.raises(type(error)) as found:
+            failing(error)
+        assert found.value is error
+        assert list(tmp_path.iterdir()) == []
+
+
+def killed_while_writing(path):
+    with ShardWriter(path, 2, header()) as shard:
+        shard.put(0, sample(0))
+        print("writing", flush=True)
+        time.sleep(60)
+
+
+def test_parts_of_the_dead_are_swept_and_those_of_the_living_stay(tmp_path):
+    tests = Path(__file__).parents[2]
+    code = f"import sys; sys.path[:0] = {sys.path!r}; from data.storage.test_shards import killed_while_writing as k; "
+    code += f"from pathlib import Path; k(Path({str(tmp_path / 'a.h5')!r}))"
+    environment = {**os.environ, "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert process.stdout.readline() == "writing\n"
+        assert sweep_parts(tmp_path) == [] and len(list(tmp_path.iterdir())) == 1
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert len(list(tmp_path.iterdir())) == 1
+        assert len(sweep_parts(tmp_path)) == 1 and list(tmp_path.iterdir()) == []
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_shard_that_is_there_is_replaced_at_the_end(tmp_path):
+    path = write(tmp_path / "a.h5", [sample(0)])
+    before = digest(path)
+    with pytest.raises(ValueError, match="x"), ShardWriter(path, 1, header()):
+        raise ValueError("x")
+    assert digest(path) == before
+    write(path, [sample(1)])
+    assert digest(path) != before and list(tmp_path.iterdir()) == [path]
+
+
+def test_windows_and_pixels(tmp_path):
+    x = cube(0)
+    with Shard(write(tmp_path / "a.h5", [sample(0)])) as shard:
+        found = shard.read("transient", 0, slice(100, 164), (slice(2, 4), slice(5, None)))
+        assert np.array_equal(found, x[:, 100:164, 2:4, 5:])
+        assert np.array_equal(shard.read("depth", 0, pixels=(slice(3, 5), slice(None))), sample(0).arrays["depth"][3:5])
+        for arguments, message in (
+            ({"window": slice(5, 5)}, "some of 256"), ({"window": slice(0, 9, 2)}, "without steps"),
+            ({"window": 3}, "as slices"), ({"pixels": (slice(16, 17), slice(None))}, "some of 16"),
+            ({"window": slice("a", 2)}, "whole numbers"),
+        ):  # fmt: skip
+            with pytest.raises(StorageError, match=message):
+                shard.read("transient", 0, **arguments)
+        with pytest.raises(StorageError, match="no time axis"):
+            shard.read("depth", 0, window=slice(0, 1))
+        for name, row, message in (("none", 0, "has no 'none'"), ("depth", 1, "row from 0"), ("depth", -1, "row from")):
+            with pytest.raises(StorageError, match=message):
+                shard.read(name, row)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        ((1, 1024, 32, 32), (1, 64, 32, 32)), ((1, 1024, 8, 8), (1, 1024, 8, 8)),
+        ((1, 2048, 8, 8), (1, 256, 8, 8)), ((1, 100, 8, 8), (1, 100, 8, 8)),
+        ((3, 1024, 256, 256), (3, 64, 21, 256)), ((), ()), ((16, 16), (16, 16)), ((4096, 4096), (256, 4096)),
+        ((4, 3, 1000, 64, 64), (4, 3, 64, 21, 64)), ((10**7,), (1048576,)),
+    ],
+)  # fmt: skip
+def test_chunks(shape, expected):
+    found = chunk_shape(shape)
+    assert found == expected
+    assert 4 * np.prod(found) <= 2**22 and (4 * np.prod(shape) <= 2**18 or 4 * np.prod(found) >= 2**16)
+
+
+def test_the_seal(tmp_path):
+    path = write(tmp_path / "a.h5", [sample(0)])
+    assert stored_checksum(path) == hashlib.sha256(path.read_bytes()[:-40]).hexdigest()

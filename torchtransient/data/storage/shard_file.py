@@ -1,0 +1,231 @@
+"""Reading shards: files that anyone may have written, of which nothing is believed before it is checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.data.array_file import check_source, damage_said
+from torchtransient.data.hdf5_limits import check_memory, dataset_of, read_dataset
+from torchtransient.data.hdf5_writing import hdf5_package
+from torchtransient.data.storage.chunks import check_chunks
+from torchtransient.data.storage.encodings import ENCODINGS, decoded
+from torchtransient.data.storage.shard_writing import (
+    FORMAT,
+    SEAL,
+    SEAL_BYTES,
+    WHAT,
+    hash_of,
+    member_name,
+)
+from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
+from torchtransient.errors import StorageError
+from torchtransient.quantities import shown
+
+_TEXTS = ("format", "store", "compression")
+
+
+class Shard:
+    """An open shard. ``header``: as it was written. ``index``: rows by the index of their sample, those that exist, in
+    order of rows. ``failed``: reasons by the index of the sample. ``names``: of the arrays. ``keys``: of the values.
+
+    Use it as a context, or close it. Handles belong to one process. Raises StorageError for a file that is missing,
+    damaged or no shard; so does every method.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = check_source(path, WHAT)
+        self._datasets: dict[str, Any] = {}
+        self._values: dict[str, NDArray[Any]] = {}
+        with damage_said(self.path, WHAT):
+            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0)
+        try:
+            with damage_said(self.path, WHAT):
+                self._read_about()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._datasets.clear()
+        self._file.close()
+
+    def read(
+        self, name: str, row: int, window: slice | None = None, pixels: tuple[slice, slice] | None = None,
+        *, as_stored: bool = False,
+    ) -> NDArray[Any]:  # fmt: skip
+        """One array of a row. ``window``: a slice of the bins, the third axis from the end, of which alone what is
+        asked for is read. ``pixels``: slices of rows and columns of the image. Counts are float32, unless
+        ``as_stored``.
+        """
+        with damage_said(self.path, WHAT):
+            return self._read(name, row, window, pixels, as_stored)
+
+    def values(self, row: int) -> dict[str, NDArray[Any] | str]:
+        """What was drawn for a row, by key."""
+        with damage_said(self.path, WHAT):
+            self._check_row(row)
+            for key in self._about["values"]:
+                if key not in self._values:
+                    array = read_dataset(self._file, f"values/{member_name(key)}", WHAT)
+                    if not isinstance(array, np.ndarray) or array.shape[:1] != (self.rows,):
+                        raise StorageError(f"{WHAT}: '{self.path}': expected a row of '{key}' for each sample.")
+                    self._values[key] = array
+            found: dict[str, Any] = {key: self._values[key][row].copy() for key in self._about["values"]}
+            found |= {key: self._about["texts"][key][row] for key in self._about["texts"]}
+            return {key: found[key] for key in sorted(found)}
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of an array of one sample."""
+        with damage_said(self.path, WHAT):
+            return tuple(self._dataset(name).shape[1:])
+
+    def dtype(self, name: str, *, as_stored: bool = False) -> str:
+        """The dtype that an array is read as, NumPy's name; ``as_stored``: that in the file."""
+        with damage_said(self.path, WHAT):
+            found = self._dataset(name).dtype
+            return str(found if as_stored else decoded(np.empty(0, found), self.encoding(name)).dtype)
+
+    def encoding(self, name: str) -> str:
+        """How an array is stored: "exact", "rounded" or "counts"."""
+        return str(self._about["arrays"][name]["encoding"])
+
+    def verify(self) -> str | None:
+        """What is wrong with the file, None where all of its bytes are those that were written."""
+        size = self.path.stat().st_size - SEAL_BYTES
+        with self.path.open("rb") as file:
+            found = hash_of(file, size)
+            stored = file.read(SEAL_BYTES)
+        if stored[: len(SEAL)] != SEAL:
+            return "the checksum at its end is missing: the file was cut or changed"
+        return None if stored[len(SEAL) :] == found else "its bytes are not those that were written"
+
+    # -------------------------------------------------------------------------------------------------------- reading
+
+    def _read_about(self) -> None:
+        kinds = {"about": "u1", "index": "i8", "seed": "u4", "outside": "f8", "there": "u1"}
+        numbers: dict[str, NDArray[Any]] = {}
+        for name, kind in kinds.items():
+            array = read_dataset(self._file, name, WHAT)
+            if not isinstance(array, np.ndarray) or array.dtype.str[1:] != kind:
+                raise ValueError(f"'{name}' is missing or of another kind")
+            numbers[name] = array
+        about: dict[str, Any] = json.loads(numbers["about"].tobytes())
+        if about["format"] != FORMAT:
+            raise StorageError(
+                f"{WHAT}: '{self.path}' is of format {shown(about['format'])}; this version reads '{FORMAT}'."
+            )
+        index, self.seeds, self.outside, there = (numbers[name] for name in ("index", "seed", "outside", "there"))
+        self.rows = len(index)
+        shapes = [array.shape for name, array in numbers.items() if name != "about"]
+        if shapes != [(self.rows,), (self.rows,), (self.rows, 2), (self.rows,)]:
+            raise ValueError(f"rows disagree: {shapes}")
+        _check_about(about, self.rows)
+        self._about, self._there = about, there.astype(bool)
+        self.header: dict[str, Any] = about["header"]
+        self.store, self.compression = str(about["store"]), str(about["compression"])
+        self.index = {int(index[row]): row for row in np.flatnonzero(self._there).tolist()}
+        self.failed = {int(number): str(reason) for _, number, reason in about["failed"]}
+        if len(self.index) + len(self.failed) != self.rows or set(self.index) & set(self.failed):
+            raise ValueError("samples are doubled or missing")
+        self.names = tuple(about["arrays"])
+        self.keys = tuple(sorted([*about["values"], *about["texts"]]))
+        self.structure: list[str] = about["structure"]
+
+    def _dataset(self, name: str) -> Any:
+        if name in self._datasets:
+            return self._datasets[name]
+        if name not in self._about["arrays"]:
+            raise StorageError(
+                f"{WHAT}: '{self.path}' has no '{name}'; it has {', '.join(self.names) or 'no sample at all'}."
+            )
+        dataset = dataset_of(self._file, f"arrays/{name}", WHAT)
+        if dataset is None or dataset.shape[:1] != (self.rows,) or dataset.dtype.kind not in "biufc":
+            raise ValueError(f"'arrays/{name}' is missing or of another kind")
+        check_chunks(dataset, int(self._there.sum()), f"{WHAT}: '{self.path}': '{name}' {dataset.shape}")
+        self._datasets[name] = dataset
+        return dataset
+
+    def _read(self, name: str, row: int, window: Any, pixels: Any, as_stored: bool) -> NDArray[Any]:
+        self._check_row(row)
+        dataset = self._dataset(name)
+        shape = dataset.shape[1:]
+        part = [slice(0, n) for n in shape]
+        if window is not None:
+            _check_axes(shape, 3, name)
+            part[-3] = _slice(window, shape[-3], "window")
+        if pixels is not None:
+            _check_axes(shape, 2, name)
+            rows, columns = pixels
+            part[-2], part[-1] = _slice(rows, shape[-2], "pixels"), _slice(columns, shape[-1], "pixels")
+        size = tuple(cut.stop - cut.start for cut in part)
+        check_memory(int(np.prod(size, dtype=object)) * dataset.dtype.itemsize, f"{WHAT}: '{name}' {size}")
+        # Into memory of its own: h5py would fill what it allocates with zeros first.
+        array: NDArray[Any] = np.empty(size, dataset.dtype)
+        dataset.read_direct(array, (row, *part))
+        return array if as_stored else decoded(array, self.encoding(name))
+
+    def _check_row(self, row: int) -> None:
+        if not (isinstance(row, int | np.integer) and 0 <= row < self.rows):
+            raise StorageError(f"{WHAT}: '{self.path}': expected a row from 0 to {self.rows - 1}, got {shown(row)}.")
+        if not self._there[row]:
+            reason = next((text for number, _, text in self._about["failed"] if number == row), "no reason")
+            raise StorageError(f"{WHAT}: '{self.path}': the sample of row {row} could not be made: {reason}")
+
+
+def stored_checksum(path: Path) -> str:
+    """The checksum at the end of a shard, as hexadecimal digits, without comparing it. Raises StorageError."""
+    with damage_said(path, WHAT), path.open("rb") as file:
+        file.seek(-SEAL_BYTES, 2)
+        found = file.read(SEAL_BYTES)
+    if found[: len(SEAL)] != SEAL or len(found) != len(SEAL) + hashlib.sha256().digest_size:
+        raise StorageError(f"{WHAT}: '{path}' has no checksum at its end: it was cut or changed.")
+    return found[len(SEAL) :].hex()
+
+
+def _check_about(about: Mapping[str, Any], rows: int) -> None:
+    """Raise ValueError for what is not as :class:`ShardWriter` writes it."""
+    right = isinstance(about["header"], dict) and isinstance(about["arrays"], dict)
+    right &= all(isinstance(about[name], str) for name in _TEXTS)
+    right &= all(entry["encoding"] in ENCODINGS for entry in about["arrays"].values())
+    right &= isinstance(about["values"], list) and all(isinstance(key, str) for key in about["values"])
+    lists = [about["structure"], *about["texts"].values()]
+    right &= all(isinstance(one, list) and len(one) == rows for one in lists)
+    right &= all(isinstance(text, str) for one in lists for text in one)
+    if not right:
+        raise ValueError("'about' does not tell what is stored")
+
+
+def _check_axes(shape: tuple[int, ...], from_end: int, name: str) -> None:
+    if len(shape) < from_end:
+        what = "time axis" if from_end == 3 else "rows and columns"
+        raise StorageError(f"{WHAT}: '{name}' {shape} has no {what}; read all of it.")
+
+
+def _slice(given: Any, size: int, name: str) -> slice:
+    """A slice with its bounds. Raises StorageError for steps, and for nothing."""
+    if not isinstance(given, slice):
+        raise StorageError(f"{WHAT}: expected {name} as slices, got {shown(given)}.")
+    try:
+        start, stop, step = given.indices(size)
+    except (TypeError, ValueError):
+        raise StorageError(f"{WHAT}: expected {name} as slices of whole numbers, got {shown(given)}.") from None
+    if step != 1 or stop <= start:
+        raise StorageError(f"{WHAT}: expected {name} to be some of {size} without steps, got {shown(given)}.")
+    return slice(start, stop)
