@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,6 +99,10 @@ class Maker:
     def about(self) -> dict[str, Any]:
         """How samples are made, plain data: the same for all structures of a recipe."""
         return self.kept(self.recipe.structure(0)).about()
+
+    def forget(self, structure: Structure) -> None:
+        """Free the scene of a structure."""
+        self._kept.pop(structure.text, None)
 
     def close(self) -> None:
         """Free the scenes."""
@@ -346,15 +351,7 @@ def changed(device: Device, key: str, value: Any) -> Device:
 
 def versions() -> dict[str, str]:
     """Of the packages that decide about the numbers."""
-    import drjit
-    import mitsuba
-
-    from torchtransient import __version__
-
-    return {
-        "torchtransient": __version__, "mitsuba": str(mitsuba.__version__), "drjit": str(drjit.__version__),
-        "torch": str(torch.__version__), "numpy": str(np.__version__),
-    }  # fmt: skip
+    return {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
 
 
 def _outside(out: RenderOutput) -> tuple[float, float]:

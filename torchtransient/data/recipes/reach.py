@@ -90,9 +90,10 @@ def _place_of(emitter: Any, drawn: Mapping[str, Any], boxes: Mapping[str, Box]) 
     if shape is not None:
         return boxes.get(shape.id(), _box(shape.bbox()))
     box = emitter.bbox()
-    for entry, at in (("position", lambda value: value), ("to_world", lambda value: value[:3, 3])):
-        if f"{emitter.id()}.{entry}" in drawn:
-            point = np.asarray(at(drawn[f"{emitter.id()}.{entry}"]), dtype=np.float64)
+    for entry in ("position", "to_world"):
+        value = drawn.get(f"{emitter.id()}.{entry}")
+        if value is not None:
+            point = np.asarray(value if entry == "position" else value[:3, 3], dtype=np.float64)
             return np.stack([point, point])
     return _box(box) if box.valid() else None
 
