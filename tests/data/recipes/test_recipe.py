@@ -168,7 +168,8 @@ def test_standard_error_falls_with_samples():
         np.mean([D.Recipe(plane, variant=VARIANT, spp=spp)._maker.standard_error(i) for i in range(3)])
         for spp in (256, 4096)
     )
-    assert few / many == pytest.approx(4, rel=0.2) and many < 0.2
+    # By the power of the light instead of that of light and noise.
+    assert (few / np.sqrt(1 - few**2)) / (many / np.sqrt(1 - many**2)) == pytest.approx(4, rel=0.2)
     assert 0.8 < small(spp=1, time_axis=tt.TimeAxis(2.0, 0.01, 1200))._maker.standard_error(0) < 1.1
 
 
