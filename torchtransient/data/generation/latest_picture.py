@@ -1,0 +1,72 @@
+"""``latest.png``: the last sample, small, as a sign that a night's run does what was meant."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+NAME = "latest.png"
+EVERY_S = 10.0
+SIDE = 256
+
+
+class LatestPicture:
+    """Writes the picture of a sample where the one that is there is older than ten seconds. Never raises: a data set is
+    worth more than its picture.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        self._next = 0.0
+
+    def __call__(self, sample: Any) -> None:
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + EVERY_S
+        part = self._path.with_name(f".{NAME}.{os.getpid()}.part")
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                if abs(time.time() - self._path.stat().st_mtime) < EVERY_S:
+                    return
+            _save(picture_of(sample), part)
+            part.replace(self._path)
+        except Exception:  # noqa: BLE001  a picture is never a reason to fail
+            self._next = now + 60 * EVERY_S
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+
+def picture_of(sample: Any) -> NDArray[np.uint8]:
+    """The light of a sample summed over time, (H, W, 3); the brightest percent is white."""
+    name = next((n for n in ("transient", "gated", "phasor", "steady") if n in sample.arrays), None)
+    if name is None:
+        raise ValueError("no light in the sample")
+    array = sample.arrays[name]
+    over_time = np.abs(array) if np.iscomplexobj(array) else array
+    image = over_time if name == "steady" else over_time.sum(axis=-3, dtype=np.float32)
+    image = image[0] if image.ndim == 4 else image
+    image = image if image.shape[0] in (1, 3) else image.mean(axis=0, keepdims=True)
+    white = float(np.quantile(image.max(axis=0), 0.99)) or 1.0
+    shown = np.clip(np.nan_to_num(image / white), 0, 1) ** (1 / 2.2)
+    rgb = np.broadcast_to(np.moveaxis(shown, 0, -1), (*shown.shape[1:], 3))
+    factor = max(1, SIDE // max(rgb.shape[:2]))
+    pixels = (rgb * 255 + 0.5).astype(np.uint8)
+    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def _save(pixels: NDArray[np.uint8], path: Path) -> None:
+    try:
+        from PIL import Image
+    except ImportError:
+        from matplotlib.image import imsave
+
+        imsave(path, pixels, format="png")
+    else:
+        Image.fromarray(pixels).save(path, format="PNG")
