@@ -1,4 +1,4 @@
-"""A recipe that renders nothing and is quick: what is drawn, and what goes wrong at which sample, is said beforehand."""
+"""A recipe that renders nothing and is quick, and what goes wrong at which of its samples."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class FakeSample:
 @dataclass(frozen=True)
 class FakeRecipe:
     """``shape`` of the transient; ``seconds`` a sample takes. ``raising``, ``hanging``, ``crashing``, ``dying``: samples
-    at which it raises, hangs, has a segmentation fault, is killed; ``once``: a folder, in which what went wrong is noted
-    and goes well from then on. ``late``: samples with light outside. ``unbuilt``: the maker cannot be made.
+    at which it raises, hangs, has a segmentation fault, is killed; ``once``: a folder, in which what went wrong is
+    noted and goes well from then on. ``late``: samples with light outside. ``unbuilt``: the maker cannot be made.
     """
 
     shape: tuple = (1, 8, 4, 4)

@@ -36,8 +36,8 @@ _WHAT = "generate"
 
 @dataclass(frozen=True)
 class Generated:
-    """What a run has done. ``samples``, ``failed``, ``bytes`` of the shards that it made; ``kept`` samples stood in shards that
-    were there; ``restarts`` of workers; ``seconds`` from the call to the end.
+    """What a run has done. ``samples``, ``failed``, ``bytes`` of the ``shards`` that it made; ``kept`` samples stood in
+    shards that were there; ``restarts`` of workers; ``seconds`` from the call to the end.
     """
 
     folder: Path
@@ -59,7 +59,8 @@ class Generated:
         told += [f"{self.failed} failed"] if self.failed else []
         told += [f"{self.kept} were there"] if self.kept else []
         told += [f"{self.restarts} worker{'s' * (self.restarts != 1)} replaced"] if self.restarts else []
-        told += [f"{self.seconds:.1f} s, {self.samples_per_second:.3g} samples a second"]
+        rate = f", {self.samples_per_second:.3g} samples a second" if self.samples else ""
+        told += [f"{self.seconds:.1f} s{rate}"]
         return f"{self.folder}: {'; '.join(told)}"
 
 
@@ -91,19 +92,20 @@ def generate(
     after worker dies or says nothing for ``timeout_s``. To try failed samples again, delete their shard.
 
     ``workers``: processes of one thread each, replaced when they die. ``shard``: (i, k) makes every k-th shard from the
-    i-th on, so that k machines that see one folder divide the work. ``per_shard``: samples in a file; by default 64 to 256 MB
-    before compression, and 64 files at least. ``store``, ``compression``: see ``ShardWriter``. ``timeout_s``: seconds for one
-    sample, the compilation of a new scene included; by default 30 times the slowest so far, at least 120.
+    i-th on, so that k machines that see one folder divide the work. ``per_shard``: samples in a file; by default 64 to
+    256 MB before compression, and 64 files at least. ``store``, ``compression``: see ``ShardWriter``. ``timeout_s``:
+    seconds for one sample, the compilation of a new scene included; by default 30 times the slowest so far, at least
+    120. ``max_outside``: in [0, 1].
     ``engine="ray"``: actors on the cluster at ``address``, or a running or new local one; all machines have to see
     ``folder``. ``resume=False``: an error where the folder has a data set.
 
-    The folder holds ``recipe.json``, ``shard-*.h5``, ``manifest.json`` (made of the shards), ``log.jsonl`` (times, deaths,
-    failures) and ``latest.png``.
+    The folder holds ``recipe.json``, ``shard-*.h5``, ``manifest.json`` (made of the shards), ``log.jsonl`` (times,
+    deaths, failures) and ``latest.png``.
 
     Raises ``StorageError`` for a full disk (finished shards stay whole; the same call goes on) and for a folder that
-    belongs to another recipe or other settings, ``UnitError`` for arguments out of range, ``SceneError`` where no sample can be
-    made, ``TorchTransientError`` where workers die without end. ``KeyboardInterrupt`` passes, with workers stopped.
-    Scripts that call it need ``if __name__ == "__main__"``: workers import them.
+    belongs to another recipe or other settings, ``UnitError`` for arguments out of range, ``SceneError`` where no
+    sample can be made, ``TorchTransientError`` where workers die without end. ``KeyboardInterrupt`` passes, with
+    workers stopped. Scripts that call it need ``if __name__ == "__main__"``: workers import them.
     """
     start = time.monotonic()
     _check_process()
@@ -141,9 +143,8 @@ def generate(
         ledger.bar.close()
         log.close()
         _sweep(place)
-    return Generated(
-        place, ledger.samples, ledger.failed, kept, ledger.shards, ledger.bytes, time.monotonic() - start, ledger.restarts
-    )
+    done = facts(ledger)
+    return Generated(place, kept=kept, seconds=time.monotonic() - start, **done)
 
 
 def _begin(crew: Any, settings: Settings, per_shard: int | None, wanted: dict[str, Any]) -> dict[str, Any]:
@@ -182,7 +183,9 @@ def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] 
 def _survey(
     place: Path, settings: Settings, described: dict[str, Any], share: range, log: RunLog
 ) -> tuple[list[int], int]:
-    """Shards that are missing, and how many samples stand in the others. Raises StorageError for those of another set."""
+    """Shards that are missing, and how many samples stand in the others. Raises StorageError for those of another data
+    set.
+    """
     from torchtransient.data.storage.shard_file import Shard
 
     left, kept = [], 0
@@ -215,7 +218,8 @@ def _check_made(place: Path, made: list[int], engine: str) -> None:
     missing = next((k for k in made if not (place / Plan.name(k)).exists()), None)
     if missing is not None:
         more = " All machines of the cluster have to see this folder under this name." if engine == "ray" else ""
-        raise StorageError(f"{_WHAT}: shard {missing} was written, and '{place / Plan.name(missing)}' is not there.{more}")
+        path = place / Plan.name(missing)
+        raise StorageError(f"{_WHAT}: shard {missing} was written, and '{path}' is not there.{more}")
 
 
 def _write_manifest(place: Path) -> None:
@@ -269,14 +273,15 @@ def _check_numbers(
     if per_shard is not None:
         _check_whole(per_shard, "per_shard", 1)
     if shard is not None:
-        pair = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
-        whole = all(isinstance(k, int) and not isinstance(k, bool) for k in pair)
-        if not whole or not 0 <= pair[0] < pair[1]:
+        pair: Any = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
+        if not all(isinstance(k, int) and not isinstance(k, bool) for k in pair) or not 0 <= pair[0] < pair[1]:
             raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
-    for name, value, most in (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0)):
+    limits: tuple[tuple[str, Any, float], ...] = (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0))
+    for name, value, most in limits:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if value is not None and not (number and 0 <= value <= most and (value > 0 or name == "max_outside")):
-            raise UnitError(f"{_WHAT}: expected {name} to be a number above 0, at most {most:g}, or None, got {shown(value)}.")
+            wanted = "in [0, 1]" if name == "max_outside" else "above 0"
+            raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
 
 
 def _check_whole(value: Any, name: str, least: int) -> None:
@@ -302,7 +307,7 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
     try:
         pickle.dumps(recipe)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise SceneError(f"{_WHAT}: expected a recipe that pickles, for it goes to other processes: {error}.") from error
+        raise SceneError(f"{_WHAT}: expected a recipe that pickles, since workers get it: {error}.") from error
 
 
 def _folder(folder: Any) -> Path:

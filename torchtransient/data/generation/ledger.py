@@ -91,7 +91,9 @@ class Ledger:
         self.log("shard", shard=shard, samples=samples - failed, failed=failed, bytes=size)
 
     def lost(self, shard: int | None, index: int | None, how: str, own_fault: bool) -> None:
-        """A worker is gone, in the middle of a sample or elsewhere. Raises TorchTransientError where that has no end."""
+        """A worker is gone, in the middle of a sample or elsewhere. Raises TorchTransientError where there is no end to
+        it.
+        """
         self.restarts += 1
         self.log("death", shard=shard, sample=index, how=how)
         now = self._under_way.pop(shard, UnderWay()) if shard is not None else UnderWay()

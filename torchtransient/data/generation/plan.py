@@ -40,9 +40,9 @@ class Plan:
 def samples_per_shard(n: int, sample_bytes: int) -> int:
     """Samples in a shard of ``n`` samples that have ``sample_bytes`` bytes each before compression.
 
-    Shards have 64 MB; where there would be more than 256 of them, larger ones up to 256 MB. They are smaller where there
-    would be fewer than 64 otherwise. It depends on nothing else, above all not on how many workers there are: files
-    have to be the same ones everywhere.
+    Shards have 64 MB; where there would be more than 256 of them, up to 256 MB. They are smaller where there would be
+    fewer than 64 otherwise. It depends on nothing else, above all not on how many workers there are: files have to be
+    the same ones everywhere.
     """
     sample_bytes = max(1, sample_bytes)
     least, most = LEAST_BYTES // sample_bytes, MOST_BYTES // sample_bytes

@@ -44,9 +44,9 @@ def _ends(plan: Plan, shard: int) -> tuple[int, int]:
     return indices.start, indices.stop
 
 
-def description(settings: Settings, per_shard: int, about: Any, standard_error: Any) -> dict[str, Any]:
-    """What ``recipe.json`` holds, plain data. ``standard_error``: of which sample, and its value."""
-    return plain(
+def description(settings: Settings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
+    """What ``recipe.json`` holds, plain data."""
+    found: dict[str, Any] = plain(
         {
             "format": FORMAT,
             "key": settings.recipe.key(),
@@ -60,6 +60,7 @@ def description(settings: Settings, per_shard: int, about: Any, standard_error: 
             "recipe": settings.recipe.to_dict(),
         }
     )
+    return found
 
 
 def plain(value: Any) -> Any:
@@ -71,14 +72,14 @@ def plain(value: Any) -> Any:
 
 
 def read_description(folder: Path) -> dict[str, Any] | None:
-    """What is in the folder's ``recipe.json``; None where there is none. Raises StorageError for one that is damaged."""
+    """What is in the folder's ``recipe.json``, None where there is none. Raises StorageError for a damaged one."""
     path = folder / RECIPE_FILE
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {error}. Choose another folder.") from None
+        raise StorageError(f"{_WHAT}: '{path}' cannot be read, or is damaged: {error}. Take another.") from error
     missing = [name for name in (*DECIDING, "about") if not isinstance(found, dict) or name not in found]
     if missing:
         raise StorageError(f"{_WHAT}: '{path}' is none of a data set: it lacks {missing[0]!r}. Choose another folder.")
@@ -123,7 +124,9 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def check_same(found: Mapping[str, Any], wanted: Mapping[str, Any], where: Path, names: tuple[str, ...] = DECIDING) -> None:
+def check_same(
+    found: Mapping[str, Any], wanted: Mapping[str, Any], where: Path, names: tuple[str, ...] = DECIDING
+) -> None:
     """Raise StorageError where a data set that is there is not the one that is asked for; only names in both count."""
     for name in names:
         if name in found and name in wanted and found[name] != wanted[name]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,7 +42,7 @@ class Measured:
 
     sample_bytes: int
     about: dict[str, Any]
-    standard_error: dict[str, Any] | None
+    standard_error: float | None
 
 
 class ShardMaker:
@@ -150,15 +151,15 @@ class ShardMaker:
             f"{before:.3g} of its light lies before the window and {after:.3g} after it, more than max_outside={most:g}"
         )
 
-    def _standard_error(self, index: int, told: Told) -> dict[str, Any] | None:
+    def _standard_error(self, index: int, told: Told) -> float | None:
         told.begin(-1, index)
+        value: float | None = None
         try:
             value = float(self._maker.standard_error(index))
         except TorchTransientError as error:
-            told.end(-1, index, None)
-            return {"sample": index, "failed": reason_of(error)}
+            told.retry(-1, index, f"no standard error: {reason_of(error)}")
         told.end(-1, index, None)
-        return {"sample": index, "value": value}
+        return value if value is not None and math.isfinite(value) else None
 
 
 def reason_of(error: BaseException) -> str:
