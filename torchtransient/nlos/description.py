@@ -25,11 +25,11 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import KINDS
+from torchtransient.data.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz
-from torchtransient.nlos.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.quantities import shown
 from torchtransient.scenes import bounds
 from torchtransient.sensing import Device
@@ -75,7 +75,7 @@ def read_description(source: str | Path) -> CaptureDescription:
     data, folder = read_yaml(source, "capture description")
     section = Section(data, "capture description", ENTRIES)
     hidden = described_shapes(section.get("hidden"), folder)
-    scan = _scan(Section(section.get("scan"), "scan", _SCAN), _wall(section.get("wall", {}), folder))
+    scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
     frequencies = _frequencies(section)
     if frequencies is not None and "time_axis" in section:
         raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
@@ -98,7 +98,8 @@ def _name(source: str | Path) -> str:
     return "capture" if isinstance(source, str) and "\n" in source else Path(source).stem
 
 
-def _wall(data: Any, folder: Path) -> Wall:
+def wall_of(data: Any, folder: Path) -> Wall:
+    """The relay wall of an entry 'wall'. Raises SceneError."""
     if isinstance(data, Mapping) and "file" in data:
         section = Section(data, "wall", ("file", "up", "albedo"))
         path = file_beside(section.text("file"), (folder,), "wall")
@@ -112,7 +113,9 @@ def _wall(data: Any, folder: Path) -> Wall:
     return Wall.plane(**sizes, **places, albedo=albedo_of(section))
 
 
-def _scan(section: Section, wall: Wall) -> Scan:
+def scan_of(data: Any, wall: Wall) -> Scan:
+    """The scan of an entry 'scan'. Raises SceneError."""
+    section = Section(data, "scan", _SCAN)
     kind = section.choice("kind", KINDS)
     lists = {"laser": (2, 3), "sensor_origin": (3,), "laser_origin": (3,), "extent": (4,)}
     sizes = {name: _size(section, name) for name in ("size", "laser_grid") if name in section}

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.data.array_file import path_of
+from torchtransient.data.yaml_files import read_yaml
 from torchtransient.errors import SceneError
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
-from torchtransient.nlos.yaml_files import read_yaml
 from torchtransient.render.scene_handle import load
 
 # Bounces of light that goes from spot to scan point, and around one corner.

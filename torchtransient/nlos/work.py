@@ -12,7 +12,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.nlos.recipe_key import recipe_key
+from torchtransient.data.content_key import content_key
 from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
 from torchtransient.nlos.scene_files import files_of
@@ -62,7 +62,7 @@ class HiddenWork:
 
     def key(self, seed: int) -> str:
         """What a part file of this work is known by."""
-        return recipe_key(self.hidden, self.scan, self._settings, seed, self._runs)
+        return content_key(self.hidden, self.scan, self._settings, seed, self._runs)
 
     def weight(self, number: int) -> float:
         """Parts are not added up."""
@@ -124,7 +124,7 @@ class SceneWork:
     def key(self, seed: int) -> str:
         """What a part file of this work is known by."""
         scene = self._renderer.scene
-        return recipe_key(scene._description, files_of(scene), self.film, self.variant.name, seed, self.count)
+        return content_key(scene._description, files_of(scene), self.film, self.variant.name, seed, self.count)
 
     def weight(self, number: int) -> float:
         """What a pass counts in the mean of all samples."""

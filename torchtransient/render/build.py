@@ -96,13 +96,16 @@ class BuildOptions:
 
 @dataclass
 class BuiltScene:
-    """A Mitsuba scene with what has to be known about its nodes. ``to_world``: all transforms as described, by key."""
+    """A Mitsuba scene with what has to be known about its nodes. ``to_world``: all transforms as described, by key.
+    ``label_tables``: what labels look up, once they are asked for.
+    """
 
     scene: Any
     params: Any
     mesh_to_world: dict[str, np.ndarray] = field(default_factory=dict)
     integrator: str = ""
     to_world: dict[str, np.ndarray] = field(default_factory=dict)
+    label_tables: Any = None
 
     def findings(self) -> dict[str, str]:
         """What is unphysical in the description, by key."""

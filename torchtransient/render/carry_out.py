@@ -56,14 +56,14 @@ def carry_out(
         return integrator.prepared(session.scene, item.sensor, seed, spp, kind, grad_in(n))
 
     own = _entry_of_its_own(integrator, kind)
-    reason = OWN_ENTRY if own is not None else _refusal(session, group, report, lent)
+    reason = OWN_ENTRY if own is not None else refusal(session, group, report, lent)
     install(group[0][1])
     if reason is None:
         jobs = [prepared(n, item) for n, item in group]
         try:
             said, results = session.recordings.run(jobs)
         except NotRecordedError as error:
-            _check_whole(session, error)
+            check_whole(session, error)
             reason = str(error)
             del jobs
             if kind != RENDER:
@@ -95,7 +95,8 @@ def _entry_of_its_own(integrator: Any, kind: str) -> Any:
     return None if owner.__module__ == "torchtransient.plugins.integrators.base" else getattr(integrator, name)
 
 
-def _check_whole(session: Session, error: NotRecordedError) -> None:
+def check_whole(session: Session, error: NotRecordedError) -> None:
+    """Raise ``SceneError``, and forget the built scene, where a recording that failed has left it broken."""
     if error.broken:
         session.job.scene.drop(session.job.options)
         raise SceneError(
@@ -105,9 +106,13 @@ def _check_whole(session: Session, error: NotRecordedError) -> None:
         ) from error
 
 
-def _refusal(
-    session: Session, group: Sequence[Numbered], report: Callable[[int], Callable[[float], None] | None], lent: bool
+def refusal(
+    session: Session,
+    group: Sequence[Numbered],
+    report: Callable[[int], Callable[[float], None] | None] = lambda n: None,
+    lent: bool = False,
 ) -> str | None:
+    """Why the call of a group cannot be recorded, None where it can."""
     import drjit as dr
 
     if not session.job.freeze:

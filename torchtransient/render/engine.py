@@ -34,7 +34,7 @@ from torchtransient.render.session import RenderJob, RunLog, Session, own_array,
 
 def primal(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
     """Render every item. Returns (steady, response); a single item is a view of the film's own memory."""
-    _check_values(job, values)
+    check_values(job, values)
     with session_of(job) as session:
         started = time.perf_counter()
         check_items(session.sensors, job.items)
@@ -106,7 +106,8 @@ def check_items(sensors: Sequence[Any], items: Sequence[Item]) -> FilmChoice:
     return next(iter(found.values()))[0]
 
 
-def _check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
+def check_values(job: RenderJob, values: Sequence[torch.Tensor]) -> None:
+    """Raise ``UnitError`` for values that are not finite; say what is unphysical."""
     for key, value in zip(job.keys, values, strict=True):
         low, high = smallest_and_largest(value)
         if not are_finite(low, high):

@@ -1,4 +1,4 @@
-"""The progress bar of a render."""
+"""The progress bar of renders, and of everything else that takes long."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any
 
 
 class Bar:
-    """A progress bar that takes fractions. Made on demand: tqdm is imported only when asked for."""
+    """A progress bar that takes fractions, under a name. Made on demand: tqdm is imported only when asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "render") -> None:
         from tqdm.auto import tqdm
 
         self._bar: Any = tqdm(
-            total=1.0, desc="render", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+            total=1.0, desc=name, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
         )
 
     def __call__(self, fraction: float) -> None:

@@ -96,6 +96,16 @@ class Shard:
         with damage_said(self.path, WHAT):
             return tuple(self._dataset(name).shape[1:])
 
+    def dtype(self, name: str, *, as_stored: bool = False) -> str:
+        """The dtype that an array is read as, NumPy's name; ``as_stored``: that in the file."""
+        with damage_said(self.path, WHAT):
+            found = self._dataset(name).dtype
+            return str(found if as_stored else decoded(np.empty(0, found), self.encoding(name)).dtype)
+
+    def encoding(self, name: str) -> str:
+        """How an array is stored: "exact", "rounded" or "counts"."""
+        return str(self._about["arrays"][name]["encoding"])
+
     def verify(self) -> str | None:
         """What is wrong with the file, None where all of its bytes are those that were written."""
         size = self.path.stat().st_size - SEAL_BYTES
@@ -110,19 +120,20 @@ class Shard:
 
     def _read_about(self) -> None:
         kinds = {"about": "u1", "index": "i8", "seed": "u4", "outside": "f8", "there": "u1"}
-        numbers = {name: read_dataset(self._file, name, WHAT) for name in kinds}
-        for name, array in numbers.items():
-            if not isinstance(array, np.ndarray) or array.dtype.str[1:] != kinds[name]:
+        numbers: dict[str, NDArray[Any]] = {}
+        for name, kind in kinds.items():
+            array = read_dataset(self._file, name, WHAT)
+            if not isinstance(array, np.ndarray) or array.dtype.str[1:] != kind:
                 raise ValueError(f"'{name}' is missing or of another kind")
-        about: dict[str, Any] = json.loads(numbers["about"].tobytes())  # type: ignore[union-attr]
+            numbers[name] = array
+        about: dict[str, Any] = json.loads(numbers["about"].tobytes())
         if about["format"] != FORMAT:
             raise StorageError(
                 f"{WHAT}: '{self.path}' is of format {shown(about['format'])}; this version reads '{FORMAT}'."
             )
         index, self.seeds, self.outside, there = (numbers[name] for name in ("index", "seed", "outside", "there"))
-        assert isinstance(index, np.ndarray) and isinstance(there, np.ndarray)
         self.rows = len(index)
-        shapes = [getattr(numbers[name], "shape", None) for name in ("index", "seed", "outside", "there")]
+        shapes = [array.shape for name, array in numbers.items() if name != "about"]
         if shapes != [(self.rows,), (self.rows,), (self.rows, 2), (self.rows,)]:
             raise ValueError(f"rows disagree: {shapes}")
         _check_about(about, self.rows)
@@ -168,7 +179,7 @@ class Shard:
         # Into memory of its own: h5py would fill what it allocates with zeros first.
         array: NDArray[Any] = np.empty(size, dataset.dtype)
         dataset.read_direct(array, (row, *part))
-        return array if as_stored else decoded(array, self._about["arrays"][name]["encoding"])
+        return array if as_stored else decoded(array, self.encoding(name))
 
     def _check_row(self, row: int) -> None:
         if not (isinstance(row, int | np.integer) and 0 <= row < self.rows):

@@ -160,6 +160,9 @@ class DiffRoughPlastic(mi.BSDF):
         value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
         return bs, value * dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
 
+    def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+        return self.diffuse_reflectance.eval(si, active)
+
     def to_string(self) -> str:
         return (
             f"DiffRoughPlastic[\n  distribution = {'ggx' if self.ggx else 'beckmann'},\n"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 
-def recipe_key(*parts: Any) -> str:
+def content_key(*parts: Any) -> str:
     """Of descriptions, scans, arrays and plain data; files that descriptions name count with what is in them."""
     return hashlib.sha256(_text(parts).encode()).hexdigest()
 

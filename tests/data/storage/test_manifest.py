@@ -1,0 +1,148 @@
+"""The manifest is told by the shards alone; every fault of a shard is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from support.stored_samples import folder, sample, write
+from torchtransient.data.storage.manifest import build_manifest, ranges, ranges_text, verify
+from torchtransient.data.storage.shard_file import Shard
+from torchtransient.errors import StorageError
+
+
+@pytest.fixture
+def data(tmp_path):
+    return folder(tmp_path / "set")
+
+
+def test_a_manifest_of_its_shards(data):
+    manifest = build_manifest(data)
+    assert manifest == json.loads((data / "manifest.json").read_text())
+    assert manifest["samples"] == 10 and manifest["key"] == "abc123" and manifest["about"]["spp"] == 16
+    assert manifest["arrays"]["transient"] == {"shape": [1, 256, 16, 16], "dtype": "float32", "encoding": "exact"}
+    last = manifest["shards"]["shard-000002.h5"]
+    assert last["index"] == [[8, 9]] and last["seeds"] == [8 * 7919, 9 * 7919]
+    assert last["bytes"] == (data / "shard-000002.h5").stat().st_size
+    assert manifest["standard_error"] == {"least": 0.25, "most": 0.25} and manifest["outside"] == [0.01, 4.5]
+
+
+def test_equal_shards_have_equal_manifests(data, tmp_path):
+    build_manifest(data)
+    other = folder(tmp_path / "other")
+    build_manifest(other)
+    assert (data / "manifest.json").read_bytes() == (other / "manifest.json").read_bytes()
+    assert [path.name for path in data.iterdir() if path.suffix == ".part"] == []
+
+
+def test_a_sound_set(data):
+    build_manifest(data)
+    report = verify(data)
+    assert report.complete and report.samples == 10 and report.shards == 3 and report.faults == {}
+    assert str(report) == f"{data}: 10 samples in 3 shards, 0 failed"
+
+
+def test_failures_are_told(data):
+    write(data / "shard-000000.h5", [sample(0), ValueError("dark"), sample(2), sample(3)])
+    assert build_manifest(data)["failed"] == {"1": "dark"}
+    report = verify(data)
+    assert report.complete and report.failed == {1: "dark"} and report.samples == 9
+
+
+@pytest.mark.parametrize("place", [0.1, 0.5, 0.9, 0.99999])
+def test_one_bit(data, place):
+    build_manifest(data)
+    path = data / "shard-000001.h5"
+    raw = bytearray(path.read_bytes())
+    raw[int(place * len(raw))] ^= 4
+    path.write_bytes(raw)
+    report = verify(data)
+    assert report.damaged == ("shard-000001.h5",) and report.missing == (4, 5, 6, 7) and not report.complete
+    assert "manifest.json" in report.faults  # which told of a shard that is not sound
+    assert verify(data).damaged == ("shard-000001.h5",)
+
+
+def test_every_byte_counts(tmp_path):
+    """A change of any byte of a small shard is found."""
+    path = write(tmp_path / "shard-000000.h5", [sample(0, (1, 4, 2, 2))])
+    raw = path.read_bytes()
+    for place in range(0, len(raw), 7):
+        changed = bytearray(raw)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        assert "shard-000000.h5" in verify(tmp_path).faults, place
+
+
+@pytest.mark.parametrize("cut", [1, 40, 5000])
+def test_cut_files(data, cut):
+    path = data / "shard-000001.h5"
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert verify(data).damaged == ("shard-000001.h5",)
+    with pytest.raises(StorageError):
+        build_manifest(data)
+
+
+def test_other_recipes_and_doubled_samples(data):
+    write(data / "shard-000001.h5", [sample(i) for i in range(4, 8)], key="other", shard=1)
+    report = verify(data)
+    assert "another recipe" in report.faults["shard-000001.h5"][0] and report.missing == (4, 5, 6, 7)
+    with pytest.raises(StorageError, match="another recipe"):
+        build_manifest(data)
+    write(data / "shard-000001.h5", [sample(i) for i in range(2, 6)], shard=1)
+    report = verify(data)
+    assert "holds the samples 2 to 3, which shard-000000.h5 holds too" in report.faults["shard-000001.h5"][0]
+    assert report.missing == (4, 5, 6, 7)
+
+
+def test_the_recipe_of_the_folder_decides(data):
+    (data / "recipe.json").write_text(json.dumps({"key": "theirs", "n": 12}))
+    report = verify(data)
+    assert len(report.damaged) == 3 and report.missing == tuple(range(12))
+    (data / "recipe.json").write_text(json.dumps({"key": "abc123", "n": 12}))
+    report = verify(data)
+    assert report.faults == {} and report.missing == (10, 11) and "10 to 11" in str(report)
+
+
+def test_missing_shards_and_other_names(data):
+    (data / "shard-000000.h5").unlink()
+    assert verify(data).missing == (0, 1, 2, 3)
+    shutil.copy(data / "shard-000001.h5", data / "shard-000000.h5")
+    report = verify(data)
+    assert "shard 1 under another name" in report.faults["shard-000000.h5"][0]
+
+
+def test_other_stores_and_manifests(data):
+    write(data / "shard-000001.h5", [sample(i) for i in range(4, 8)], "rounded", shard=1)
+    assert "stored otherwise" in verify(data).faults["shard-000001.h5"][0]
+    (data / "manifest.json").write_text("{}\n")
+    assert "manifest.json" in verify(data).faults
+    assert "manifest.json" not in verify(data).faults
+
+
+def test_folders(tmp_path, capsys):
+    with pytest.raises(StorageError, match="expected the folder"):
+        verify(tmp_path / "none")
+    with pytest.raises(StorageError, match="holds no shard"):
+        build_manifest(tmp_path)
+    assert verify(tmp_path).samples == 0
+    verify(folder(tmp_path / "set", 2), progress=True)
+    assert "verify" in capsys.readouterr().err
+
+
+def test_ranges():
+    assert ranges([3, 1, 2, 7]) == [[1, 3], [7, 7]] and ranges_text([3, 1, 2, 7]) == "1 to 3, 7"
+    assert ranges_text(range(0, 40, 2), 2) == "0, 2 and 18 more ranges"
+
+
+def test_reading_damage_says_so(data):
+    """Chunks carry a checksum of their own: a reader of single samples sees damage too."""
+    path = data / "shard-000001.h5"
+    raw = bytearray(path.read_bytes())
+    with Shard(path) as shard:
+        place = shard._dataset("transient").id.get_chunk_info(0).byte_offset
+    raw[place + 1000] ^= 1
+    path.write_bytes(raw)
+    with Shard(path) as shard, pytest.raises(StorageError, match="damaged"):
+        shard.read("transient", 0)

@@ -1,0 +1,115 @@
+"""What can be wrong with a recipe, said before anything is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchtransient.data.recipes.distribution import POSE
+from torchtransient.data.recipes.maker import Kept, Maker, changed
+from torchtransient.data.recipes.reach import check_reach
+from torchtransient.data.recipes.recipe import Recipe
+from torchtransient.data.recipes.streams import Extreme
+from torchtransient.data.recipes.structures import Structure
+from torchtransient.errors import SceneError, TorchTransientError, UnitError
+from torchtransient.render.physics import is_singular, outside_message, singular_message
+from torchtransient.render.variant import active_variant
+
+# Samples that are drawn, and structures among them that are built, for a look.
+SAMPLES, STRUCTURES = 64, 8
+
+
+def check_recipe(recipe: Recipe, maker: Maker) -> None:
+    """Raise SceneError, ShapeError, UnitError, or another error of this library, for what is wrong."""
+    for structure, indices in structures_of(recipe, range(SAMPLES)):
+        kept = maker.kept(structure)
+        draws = list(_draws(recipe, kept, indices))
+        _check_device(recipe, kept, [drawn for _, drawn in draws])
+        with active_variant(recipe.variant):
+            built = kept.renderer.scene.built(kept.renderer._options)
+            for where, drawn in draws:
+                _check_ranges(built, kept, where, drawn)
+            if kept.scan is None:
+                _check_light(built, kept, [drawn for _, drawn in draws])
+            check_reach(built, kept, draws)
+
+
+def structures_of(recipe: Recipe, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:
+    """The structures of some samples, in the order in which they come, and which samples are theirs; at most
+    ``STRUCTURES`` of them.
+    """
+    found: dict[str, tuple[Structure, list[int]]] = {}
+    for index in indices:
+        structure = recipe.structure(index)
+        if structure.text in found or len(found) < STRUCTURES:
+            found.setdefault(structure.text, (structure, []))[1].append(index)
+    return list(found.values())
+
+
+def _draws(recipe: Recipe, kept: Kept, indices: Iterable[int]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What can come: the ends of every distribution, and the first samples."""
+    for words, upper in (("lower", False), ("upper", True)):
+        yield f"at the {words} end", kept.drawn(dict.fromkeys(recipe.vary, Extreme(upper)))
+    for index in indices:
+        yield f"of sample {index}", kept.draw(index)
+
+
+def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) -> None:
+    from torchtransient.plugins.physical_ranges import physical_range
+
+    for key, place in kept.places.items():
+        value = np.asarray(drawn[key], dtype=np.float32)
+        if not np.isfinite(value).all():
+            raise UnitError(f"recipe: vary: {key!r} {where}: expected finite numbers, got {value.tolist()}.")
+        limits = physical_range(built.params, key)
+        if limits is not None and (limits.above(float(value.max())) or limits.below(float(value.min()))):
+            message = outside_message(key, limits, float(value.min()), float(value.max()))
+            first = message.split(". Keep ")[0].split(": expected ")
+            wanted = f"; expected {first[1]}" if len(first) > 1 else ""
+            raise UnitError(f"recipe: vary: {where}, {first[0]}{wanted}. Choose a smaller range, or cut it off.")
+        if place.kind == POSE and is_singular(value):
+            raise UnitError(f"recipe: vary: {where}: {singular_message(key)}")
+
+
+def _check_device(recipe: Recipe, kept: Kept, draws: Iterable[Mapping[str, Any]]) -> None:
+    if recipe.device is None:
+        return
+    if kept.renderer.axis is None:
+        raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+    for drawn in list(draws)[:4] if kept.device_keys else []:
+        device = recipe.device
+        try:
+            for key in kept.device_keys:
+                device = changed(device, key, drawn[key])
+            device.sensor(kept.renderer.axis)
+        except TorchTransientError as error:
+            raise type(error)(f"recipe: vary: {', '.join(kept.device_keys)}: {error}") from error
+
+
+def _check_light(built: Any, kept: Kept, draws: Sequence[Mapping[str, Any]]) -> None:
+    """Raise SceneError for a scene without an emitter, and where none of them ever shines."""
+    import mitsuba as mi
+
+    from torchtransient.plugins.physical_ranges import LIGHT, described_ranges
+
+    emitters = list(built.scene.emitters())
+    where = f"structure '{kept.structure.text}': " if kept.structure.text else ""
+    if not emitters:
+        raise SceneError(f"recipe: {where}expected a scene with a light, got one without any emitter. Add one.")
+    brightest = {key: float(high) for key, limits, _, high in described_ranges(built.params) if limits == LIGHT}
+    for key in set(brightest) & set(kept.places):
+        brightest[key] = max(float(np.max(drawn[key])) for drawn in draws)
+    # A light that has no such number (a sky, a picture of the surroundings) shines.
+    lights = [_emitter_of(built.params, key, mi.Emitter) for key in brightest]
+    if max(brightest.values(), default=1.0) <= 0 and all(emitter in lights for emitter in emitters):
+        dark = ", ".join(repr(key) for key in brightest)
+        raise SceneError(f"recipe: {where}no light ever shines: {dark} is zero in the scene and in every sample.")
+
+
+def _emitter_of(params: Any, key: str, kind: Any) -> Any:
+    node = params.properties[key][2]
+    while node is not None and not isinstance(node, kind):
+        node = params.hierarchy[node][0]
+    return node

@@ -1,0 +1,97 @@
+"""The contact sheet of samples, of a recipe or of a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.axes import TimeAxis
+from torchtransient.data.recipes.sample import Sample
+from torchtransient.vis.contact_sheet import Cell
+from torchtransient.vis.contact_sheet import contact_sheet as draw
+from torchtransient.vis.tone_mapping import tone_map
+
+# Drawn values that a title has room for, and letters of each.
+_MOST_VALUES, _MOST_LETTERS = 2, 26
+_MEASURED = ("transient", "phasor", "gated")
+
+
+def contact_sheet(recipe: Any, indices: Iterable[int], path: str | Path | None, progress: bool = False) -> Any:
+    """Render some samples of a recipe and draw them; see :meth:`Recipe.preview`."""
+    wanted = list(indices)
+    if progress:
+        from tqdm.auto import tqdm
+
+        wanted = tqdm(wanted, desc="preview", unit="sample")
+    samples = [recipe.sample(index) for index in wanted]
+    return sheet_of(samples, path, recipe._maker.about().get("axis"), repr(recipe))
+
+
+def sheet_of(
+    samples: Iterable[Sample], path: str | Path | None, axis: Mapping[str, Any] | None, title: str = ""
+) -> Any:
+    """A sheet of samples that are there. ``axis``: that of the transients, as its numbers."""
+    times = None if axis is None else TimeAxis(**axis).edges_opl.numpy()
+    return draw([cell_of(sample) for sample in samples], path, times=times, title=title)
+
+
+def cell_of(sample: Sample) -> Cell:
+    """A sample as a picture and a curve."""
+    words = [f"{key.split('.reflectance')[0]}: {_short(value)}" for key, value in sample.values.items() if _fits(value)]
+    names = ", ".join(words[:_MOST_VALUES])
+    images = {"light": _picture(sample.arrays)}
+    images |= {name: image for name, array in sample.arrays.items() if (image := _label(name, array)) is not None}
+    return Cell(f"{sample.index}  {names}", images, _curve(sample.arrays))
+
+
+def _fits(value: Any) -> bool:
+    return isinstance(value, str) or np.size(value) <= 3
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else ", ".join(f"{number:.3g}" for number in np.ravel(value))
+    return text if len(text) <= _MOST_LETTERS else f"...{text[3 - _MOST_LETTERS :]}"
+
+
+def _last(array: NDArray[Any], dimensions: int) -> NDArray[Any]:
+    """The first of several sensors and Stokes components."""
+    while array.ndim > dimensions:
+        array = array[0]
+    return array
+
+
+def _picture(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    if "steady" in arrays:
+        light = _last(arrays["steady"], 3)
+    else:
+        name = next((name for name in (*_MEASURED, "measurement") if name in arrays), None)
+        if name is None:
+            return np.zeros((1, 1, 3))
+        light = np.abs(_last(arrays[name], 4)).sum(1)
+    channels = light if light.shape[0] == 3 else np.repeat(light.mean(0, keepdims=True), 3, 0)
+    shown = tone_map(torch.from_numpy(np.ascontiguousarray(channels, dtype=np.float32)))
+    return np.asarray(shown)
+
+
+def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
+    if name in (*_MEASURED, "steady", "measurement"):
+        return None
+    if name == "normals":
+        return np.clip((np.moveaxis(_last(array, 3), 0, -1) + 1) / 2, 0, 1)
+    if name == "albedo":
+        colour = np.moveaxis(_last(array, 3), 0, -1)
+        return np.clip(np.broadcast_to(colour, (*colour.shape[:2], 3)) if colour.shape[-1] == 1 else colour, 0, 1)
+    if array.ndim < 2 or name in ("position", "uv"):
+        return None
+    numbers: NDArray[Any] = _last(array, 2)
+    return numbers
+
+
+def _curve(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
+    name = next((name for name in ("transient", "measurement") if name in arrays and arrays[name].ndim >= 4), None)
+    return None if name is None else np.asarray(_last(arrays[name], 4).sum((0, 2, 3), dtype=np.float64))

@@ -1,0 +1,151 @@
+"""What a recipe costs, measured on a few of its samples."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchtransient.data.recipes.checks import SAMPLES, structures_of
+from torchtransient.data.recipes.sample import Sample
+from torchtransient.errors import StorageError
+from torchtransient.quantities import count
+
+if TYPE_CHECKING:
+    from torchtransient.data.recipes.maker import Maker
+    from torchtransient.data.recipes.recipe import Recipe
+
+# Structures that are measured, and calls of each before a time counts: the second one is recorded, the third launched.
+_MEASURED, _WARM = 4, 3
+
+
+@dataclass(frozen=True)
+class StructureCost:
+    """Of one structure: ``first_s`` from nothing to its first sample (building, tracing, compiling), ``sample_s`` each
+    sample after that (median), seconds in this process with the threads that it has.
+    """
+
+    text: str
+    first_s: float
+    sample_s: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What :meth:`Recipe.cost` found. ``values``: keys that are only values. ``exchanged``: keys whose every new
+    combination is a new structure; ``seen`` of these came among the first 64 samples. ``structures``: those measured.
+    ``sample_bytes``: before compression; ``stored_bytes``: on disk, by store, None where it could not be measured.
+    ``outside``: mean and largest share of light outside of the window. ``standard_error``: relative, of one sample's
+    numbers. ``n``: samples of the data set, None where the recipe does not say.
+    """
+
+    values: tuple[str, ...]
+    exchanged: tuple[str, ...]
+    seen: int
+    structures: tuple[StructureCost, ...]
+    sample_bytes: int
+    stored_bytes: dict[str, float | None]
+    outside: tuple[float, float]
+    standard_error: float
+    n: int | None
+
+    @property
+    def sample_s(self) -> float:
+        """Seconds a sample in a kept structure, the mean of those measured."""
+        return float(np.mean([one.sample_s for one in self.structures]))
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"only values       {', '.join(self.values) or 'none'}"
+        built = ", ".join(self.exchanged) or "nothing: one structure for all samples"
+        seen = f"; {self.seen} structures in {SAMPLES} samples" if self.exchanged else ""
+        yield f"built when new    {built}{seen}"
+        for one in self.structures:
+            name = f" ({one.text})" if one.text else ""
+            yield f"seconds           {one.first_s:.2f} for the first sample, then {one.sample_s:.4f} each{name}"
+        yield f"bytes a sample    {_bytes(self.sample_bytes)} before compression"
+        for store, size in self.stored_bytes.items():
+            if size is not None:
+                yield f"  store={store!r:<10} {_bytes(size)}, {self.sample_bytes / size:.1f} times smaller"
+        yield f"light outside     {self.outside[0]:.2%} on average, {self.outside[1]:.2%} at most"
+        yield f"standard error    {self.standard_error:.1%} of a sample's numbers (root mean square)"
+        if self.n is not None:
+            sizes = [self.n * (size or self.sample_bytes) for size in self.stored_bytes.values()]
+            hours = self.n * self.sample_s / 3600
+            yield f"{self.n} samples    {hours:.2f} hours of one worker, {_bytes(min(sizes))} to {_bytes(max(sizes))}"
+
+
+
+def _bytes(size: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"
+
+
+def forecast(recipe: Recipe, maker: Maker, samples: int, progress: bool) -> Cost:
+    """See :meth:`Recipe.cost`."""
+    wanted = count("cost: samples", samples)
+    found = structures_of(recipe, range(SAMPLES))
+    bar = None
+    if progress:
+        from tqdm.auto import tqdm
+
+        bar = tqdm(total=len(found[:_MEASURED]) * (wanted + _WARM), desc="cost", unit="sample")
+    costs, rendered = [], []
+    for structure, indices in found[:_MEASURED]:
+        # Beginning with nothing: what check() has built is thrown away.
+        maker.forget(structure)
+        times = []
+        for step in range(_WARM + wanted):
+            index = indices[step % len(indices)]
+            start = time.perf_counter()
+            rendered.append(maker.sample(index))
+            times.append(time.perf_counter() - start)
+            if bar is not None:
+                bar.update()
+        costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
+    if bar is not None:
+        bar.close()
+    outside = [sum(sample.outside) for sample in rendered]
+    return Cost(
+        values=tuple(key for key in recipe.vary if key not in recipe.exchanged),
+        exchanged=tuple(recipe.exchanged),
+        seen=len({recipe.structure(index).text for index in range(SAMPLES)}),
+        structures=tuple(costs),
+        sample_bytes=sum(array.nbytes for array in rendered[0].arrays.values()),
+        stored_bytes=_stored(rendered, maker),
+        outside=(float(np.mean(outside)), max(outside)),
+        standard_error=maker.standard_error(found[0][1][0]),
+        n=recipe.n,
+    )
+
+
+def _stored(samples: list[Sample], maker: Maker) -> dict[str, float | None]:
+    """Bytes of a sample on disk, by store."""
+    from torchtransient.data.storage.encodings import STORES
+    from torchtransient.data.storage.shard_writing import ShardWriter
+
+    several = list({sample.index: sample for sample in samples}.values())
+    found: dict[str, float | None] = {}
+    for store in STORES:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "shard.h5"
+            try:
+                with ShardWriter(path, len(several), {"about": maker.about()}, store=store) as shard:
+                    for row, sample in enumerate(several):
+                        shard.put(row, sample)
+                found[store] = path.stat().st_size / len(several)
+            except StorageError:
+                # What is no counts cannot be stored as such, and a package may be missing.
+                found[store] = None
+    return found
+

@@ -1,0 +1,371 @@
+"""What makes the samples of a recipe: scenes that are built once, and calls that are recorded once."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
+from torchtransient.data.recipes.recipe import DEVICE, NOISE, RENDER, SECOND, Recipe, label_of, samples_of
+from torchtransient.data.recipes.sample import Sample
+from torchtransient.data.recipes.streams import Draw, Stream
+from torchtransient.data.recipes.structures import Structure
+from torchtransient.data.recipes.written import written_frequencies, written_scan, written_shape
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.render.output import RenderOutput
+from torchtransient.render.parameters import unknown_key
+from torchtransient.render.renderer import TransientRenderer
+from torchtransient.render.scene_handle import load
+from torchtransient.sensing import Compose, Device
+
+if TYPE_CHECKING:
+    from torchtransient.capture import Scan
+
+# Structures whose scenes are kept. More take memory, and slow each other's kernels down: Mitsuba compiles a method call
+# for all objects that are alive.
+MOST_KEPT = 8
+# A label that is read off the transient.
+FIRST_RETURN = "first_return"
+
+
+class Maker:
+    """Makes samples of a recipe, and keeps the scenes that it has built. Same recipe, same sample, whatever was made
+    before, on one kind of processor with one thread (``tt.threads(1)``).
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self._kept: OrderedDict[str, Kept] = OrderedDict()
+        self._shapes: dict[str, tuple[Any, ...]] | None = None
+
+    def order(self, indices: Iterable[int]) -> list[int]:
+        """The same samples, those of one structure one after another, in the order in which structures first come."""
+        groups: dict[str, list[int]] = {}
+        for index in samples_of(indices):
+            groups.setdefault(self.recipe.structure(index).text, []).append(index)
+        return [index for group in groups.values() for index in group]
+
+    def kept(self, structure: Structure) -> Kept:
+        """The scene of a structure, built unless it is kept."""
+        found = self._kept.pop(structure.text, None)
+        if found is None:
+            found = Kept(self.recipe, structure)
+            while len(self._kept) >= MOST_KEPT:
+                self._kept.popitem(last=False)
+        self._kept[structure.text] = found
+        return found
+
+    def draw(self, index: int) -> dict[str, Any]:
+        """What a sample draws, by key."""
+        (index,) = samples_of([index])
+        structure = self.recipe.structure(index)
+        varied = self.kept(structure).draw(index) if len(self.recipe.exchanged) < len(self.recipe.vary) else {}
+        drawn = varied | dict(structure.entries)
+        return {key: drawn[key] for key in self.recipe.vary}
+
+    def sample(self, index: int) -> Sample:
+        """Sample ``index``. Raises the errors of the renderer, and UnitError for light that is no number."""
+        (index,) = samples_of([index])
+        structure = self.recipe.structure(index)
+        kept = self.kept(structure)
+        varied = kept.draw(index)
+        seed = Stream(self.recipe.seed, index, RENDER).seed()
+        arrays, outside = kept.arrays(index, varied, seed)
+        self._check(index, arrays)
+        return Sample(index, seed, arrays, self._values(structure, varied), outside, structure.text)
+
+    def standard_error(self, index: int) -> float:
+        """Relative standard error of a sample: root mean square over the cube of the error of a number, by the root
+        mean square of the numbers. Of two renders, the sample's and one more. NaN for a black sample.
+        """
+        (index,) = samples_of([index])
+        kept = self.kept(self.recipe.structure(index))
+        varied = kept.draw(index)
+        one, other = (
+            kept.light(varied, Stream(self.recipe.seed, index, purpose).seed()) for purpose in (RENDER, SECOND)
+        )
+        power = float(np.mean(np.abs(np.asarray((one + other) / 2, np.complex128)) ** 2))
+        noise = float(np.mean(np.abs(np.asarray(one - other, np.complex128)) ** 2)) / 2
+        # Half of the noise's power is in their mean too.
+        return float(np.sqrt(noise / max(power - noise / 2, np.finfo(float).tiny))) if power > 0 else float("nan")
+
+    def about(self) -> dict[str, Any]:
+        """How samples are made, plain data: the same for all structures of a recipe."""
+        return self.kept(self.recipe.structure(0)).about()
+
+    def forget(self, structure: Structure) -> None:
+        """Free the scene of a structure."""
+        self._kept.pop(structure.text, None)
+
+    def close(self) -> None:
+        """Free the scenes."""
+        self._kept.clear()
+
+    def _values(self, structure: Structure, varied: Mapping[str, Any]) -> dict[str, NDArray[Any] | str]:
+        found: dict[str, NDArray[Any] | str] = {}
+        if self.recipe.scenes.names != [""]:
+            found["scene"] = structure.name
+        exchanged = dict(structure.entries)
+        for key in self.recipe.vary:
+            value = exchanged.get(key, varied.get(key))
+            is_number = not isinstance(value, bool) and isinstance(value, int | float | np.ndarray)
+            text = label_of(self.recipe.vary[key], value) if not is_number else ""
+            # As the renderer takes them.
+            found[key] = text if text else np.asarray(value, dtype=np.float32)
+        return found
+
+    def _check(self, index: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Samples of one recipe go into one array."""
+        shapes = {name: (array.shape, array.dtype.str) for name, array in arrays.items() if name != "measurement"}
+        if self._shapes is None:
+            self._shapes = shapes
+        elif shapes != self._shapes:
+            name = next(name for name in {**shapes, **self._shapes} if shapes.get(name) != self._shapes.get(name))
+            mine, others = shapes.get(name), self._shapes.get(name)
+            raise ShapeError(
+                f"recipe: sample {index} has {name} of {mine}, others have {others}. Scenes of one recipe need films "
+                "of one size; give time_axis= for bins of one size."
+            )
+        for name in ("transient", "phasor", "gated", "steady"):
+            if name in arrays and not np.isfinite(arrays[name]).all():
+                raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What a render of either kind brings: its tensors by name, and shares of the light outside of the window."""
+
+    tensors: dict[str, torch.Tensor]
+    outside: tuple[float, float]
+
+
+class Kept:
+    """A structure's scene, its renderer, and the places of what varies in it. Raises SceneError for keys that it does
+    not have.
+    """
+
+    def __init__(self, recipe: Recipe, structure: Structure) -> None:
+        self.recipe, self.structure = recipe, structure
+        self.keys = [key for key in recipe.vary if key not in recipe.exchanged and key.split(".")[0] != DEVICE]
+        self.device_keys = [key for key in recipe.vary if key.split(".")[0] == DEVICE]
+        self.scan: Scan | None = None
+        try:
+            self.renderer, self._capture = self._make()
+        except TorchTransientError as error:
+            raise _named(error, structure) from error
+        self._settle_filter()
+        self.places = self._places()
+        self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
+
+    # ------------------------------------------------------------------------------------------------------ making
+
+    def _make(self) -> tuple[TransientRenderer, Any]:
+        settings, (given, self.scan) = self.recipe.settings, self.recipe.scenes.build(self.structure)
+        common: dict[str, Any] = {
+            "time_axis": settings.time_axis, "frequencies": settings.frequencies, "spp": settings.spp,
+            "temporal_filter": settings.temporal_filter, "pulse": settings.pulse, "irf": settings.irf,
+            "physics": settings.physics,
+        }  # fmt: skip
+        if self.scan is None:
+            scene = load(given)
+            self._check_keys(list(scene.parameters().differentiable()), scene.parameters())
+            own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}
+            own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
+            return TransientRenderer(scene, parameters=self.keys, **common, **own), None
+        # Imported where it is used: captures read files of this room.
+        from torchtransient.nlos.renderer import CaptureRenderer
+        from torchtransient.nlos.scene import capture_scene
+
+        bounces, energy = settings.bounces, settings.energy
+        table = load(capture_scene(given, self.scan, bounces, energy), variant=self.recipe.variant).parameters()
+        self._check_keys(table.differentiable(), table)
+        common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant}
+        capture = CaptureRenderer(given, self.scan, parameters=self.keys, **common)
+        return capture.renderer, capture
+
+    def _check_keys(self, differentiable: list[str], table: Mapping[str, Any]) -> None:
+        for key in self.keys:
+            if key not in table:
+                hint = unknown_key(key, list(table))
+                raise SceneError(
+                    f"recipe: vary: {hint} Entries of a scene dictionary ('box.filename') and $names of an XML file "
+                    "are keys too, where the scene has them."
+                )
+            if key not in differentiable:
+                raise SceneError(
+                    f"recipe: vary: {key!r} cannot vary as a value: {table[key].reason}. Where a scene dictionary has "
+                    "an entry for it, name that."
+                )
+
+    def _settle_filter(self) -> None:
+        """Not another filter because a pose varies: nobody asks for derivatives here."""
+        renderer = self.renderer
+        if renderer.film.has_filter and renderer.temporal_filter == "auto":
+            renderer.temporal_filter = renderer._scene_filter
+
+    def _places(self) -> dict[str, Place]:
+        found = {}
+        for key in self.keys:
+            described = self.renderer.values[key].detach().cpu().numpy().astype(np.float64)
+            is_pose = described.shape == (4, 4) and self.renderer._infos[key].kind.endswith("transform")
+            found[key] = Place(key, POSE if is_pose else NUMBERS, described.shape, described)
+        return found
+
+    # ----------------------------------------------------------------------------------------------------- samples
+
+    def draw(self, index: int) -> dict[str, Any]:
+        """What a sample draws of parameters and of the device."""
+        return self.drawn({key: Stream(self.recipe.seed, index, key) for key in self.recipe.vary})
+
+    def drawn(self, streams: Mapping[str, Draw]) -> dict[str, Any]:
+        """What comes of some random numbers, by key."""
+        found: dict[str, Any] = {}
+        for key in (*self.keys, *self.device_keys):
+            place = self.places.get(key, Place(key, ANYTHING))
+            try:
+                found[key] = self.recipe.vary[key].draw(streams[key], place)
+            except TorchTransientError as error:
+                raise type(error)(f"recipe: vary: {error}") from error
+        return found
+
+    def arrays(self, index: int, drawn: Mapping[str, Any], seed: int) -> tuple[dict[str, NDArray[Any]], Any]:
+        """What is stored of a sample, and the shares of light outside of the window."""
+        values = self.values(drawn)
+        found = self._render(values, seed)
+        tensors = dict(found.tensors)
+        labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
+        if labels:
+            from torchtransient.render.labels import scene_labels
+
+            tensors |= scene_labels(self.renderer, values, labels)
+        if FIRST_RETURN in self.recipe.settings.labels:
+            tensors[FIRST_RETURN] = self._first_return(tensors)
+        if self.recipe.device is not None:
+            tensors["measurement"] = self._measured(index, drawn, tensors)
+        return {name: np.ascontiguousarray(tensor.cpu().numpy()) for name, tensor in tensors.items()}, found.outside
+
+    def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
+        """What the film measures of a sample."""
+        return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
+
+    def values(self, drawn: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+        """What is drawn as the renderer takes it."""
+        return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
+
+    def _render(self, values: Mapping[str, torch.Tensor], seed: int) -> _Measured:
+        measures = self.renderer.film.measures
+        with torch.no_grad():
+            if self._capture is not None:
+                capture = self._capture(values, seed=seed)
+                tensors = {measures: getattr(capture, measures)}
+                if capture.steady is not None:
+                    tensors["steady"] = capture.steady
+                return _Measured(tensors, (0.0, 0.0))
+            out = self.renderer(values, seed=seed)
+        tensors = {measures: out.others[measures] if measures in out.others else getattr(out, measures)}
+        return _Measured({**tensors, "steady": out.steady}, _outside(out))
+
+    def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        if self.renderer.axis is None or "transient" not in tensors:
+            raise SceneError(f"recipe: labels: {FIRST_RETURN!r} is read off a transient; give time_axis=.")
+        from torchtransient.render.labels import first_return
+
+        found: torch.Tensor = first_return(tensors["transient"], self.renderer.axis)
+        return found
+
+    # ------------------------------------------------------------------------------------------------- measurements
+
+    def _measured(self, index: int, drawn: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        device = self.recipe.device
+        assert device is not None
+        chain = self._chain
+        if chain is None:
+            for key in self.device_keys:
+                device = changed(device, key, drawn[key])
+            chain = self._chain_of(device)
+        transient = tensors.get("transient")
+        if transient is None:
+            raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        generator = torch.Generator().manual_seed(Stream(self.recipe.seed, index, NOISE).seed())
+        return chain.sample(transient, generator)
+
+    def _chain_of(self, device: Device) -> Compose:
+        axis = self.renderer.axis
+        if axis is None:
+            raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        return device.sensor(axis)
+
+    # ------------------------------------------------------------------------------------------------------- about
+
+    def about(self) -> dict[str, Any]:
+        """Plain data; nothing in it depends on the structure but what its film says."""
+        renderer, settings = self.renderer, self.recipe.settings
+        film = renderer.film
+        found: dict[str, Any] = {
+            "measures": film.measures,
+            "axis": None if renderer.axis is None else asdict(renderer.axis),
+            "frequencies": written_frequencies(renderer.frequencies),
+            "gates": None if renderer.gates is None else [written_shape(gate) for gate in renderer.gates],
+            "channels": list(renderer._channels),
+            "spp": renderer.spp or renderer._scene_spp,
+            "variant": self.recipe.variant,
+            "temporal_filter": renderer.effective_filter,
+            "plan": [film.describe(renderer.effective_filter), f"variant: {self.recipe.variant}"],
+            "versions": versions(),
+        }
+        if "shape" in settings.labels:
+            from torchtransient.render.labels import label_names
+
+            found["shapes"] = list(label_names(renderer))
+        if self.scan is not None:
+            found["scan"] = written_scan(self.scan)
+        return found
+
+
+def described_parameters(recipe: Recipe) -> frozenset[str]:
+    """Keys that have a derivative in the scene as it is described."""
+    given, scan = recipe.scenes.build(Structure(recipe.scenes.names[0], ""))
+    if scan is not None:
+        from torchtransient.nlos.scene import capture_scene
+
+        given = load(capture_scene(given, scan, recipe.settings.bounces, recipe.settings.energy), recipe.variant)
+    return frozenset(given.parameters().differentiable())
+
+
+def changed(device: Device, key: str, value: Any) -> Device:
+    """A device with another argument of a stage: "device.PhotonBudget.cycles", "device.0.cycles"."""
+    parts = key.split(".")
+    if len(parts) < 3:
+        raise SceneError(f"recipe: vary: expected 'device.STAGE.ARGUMENT', got {key!r}.")
+    stage, argument = parts[1], ".".join(parts[2:])
+    plain = value.tolist() if isinstance(value, np.ndarray) else value
+    return device.changed(int(stage) if stage.isdigit() else stage, **{argument: plain})
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that decide about the numbers."""
+    return {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
+
+
+def _outside(out: RenderOutput) -> tuple[float, float]:
+    """Shares of the light before and after the window, over all sensors."""
+    stats, channels = out.stats, out.steady.shape[-3]
+    before, after = sum(stats.energy_before), sum(stats.energy_after)
+    if before + after <= 0:
+        return 0.0, 0.0
+    # Of polarized light the first Stokes component.
+    steady = out.steady[..., 0, :, :, :] if out.polarized else out.steady
+    total = float(steady.sum(dtype=torch.float64)) / channels
+    return (before / total, after / total) if total > 0 else (0.0, 0.0)
+
+
+def _named(error: TorchTransientError, structure: Structure) -> TorchTransientError:
+    where = f"structure '{structure.text}': " if structure.text else ""
+    return type(error)(f"{where}{error}")

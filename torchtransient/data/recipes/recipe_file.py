@@ -1,0 +1,295 @@
+"""Recipes in files: YAML, JSON and plain data, and the text that stands for one.
+
+A file has the arguments of :class:`~torchtransient.data.Recipe` as entries. ``scene`` is the name of an XML file, a
+scene dictionary, ``{builtin: cornell_box, resolution: 32}`` for a function of ``tt.scenes``, or ``{one_of: {a: ..., b:
+...}, weights: [...]}``. A capture has ``hidden`` instead, with ``wall`` and ``scan`` as in the YAML files of captures
+(:mod:`torchtransient.nlos.description`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchtransient.axes import TimeAxis
+from torchtransient.data.content_key import contents_of
+from torchtransient.data.recipes.recipe import Recipe
+from torchtransient.data.recipes.structures import OneOf
+from torchtransient.data.recipes.written import (
+    read,
+    read_distribution,
+    read_frequencies,
+    read_gate,
+    read_pulse,
+    read_scan,
+    written,
+    written_axis,
+    written_frequencies,
+    written_scan,
+    written_shape,
+)
+from torchtransient.data.yaml_files import Section, read_yaml
+from torchtransient.errors import SceneError, StorageError
+from torchtransient.quantities import shown
+from torchtransient.render.description import DictDescription, XmlDescription, describe_dict
+from torchtransient.render.scene_handle import Scene
+
+FORMAT = "torchtransient recipe 1"
+# Entries that are the constructor's arguments as they are.
+_PLAIN = (
+    "labels", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant", "seed", "n",
+)  # fmt: skip
+_ENTRIES = (
+    "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
+    "irf", "device", *_PLAIN,
+)  # fmt: skip
+# What a recipe's samples do not depend on.
+_NO_NUMBERS = ("n", "format")
+
+
+# ------------------------------------------------------------------------------------------------------------ written
+
+
+def to_dict(recipe: Recipe) -> dict[str, Any]:
+    """See :meth:`Recipe.to_dict`."""
+    settings = recipe.settings
+    found: dict[str, Any] = {"format": FORMAT, "scene": _written_scenes(recipe)}
+    if recipe.scan is not None:
+        found["scan"] = written_scan(recipe.scan)
+        found |= {"bounces": written(settings.bounces), "energy": written(settings.energy)}
+    found |= {
+        "vary": {key: written(one) for key, one in recipe.vary.items()},
+        "labels": list(settings.labels),
+        "time_axis": written_axis(settings.time_axis),
+        "frequencies": written_frequencies(settings.frequencies),
+        "gates": None if settings.gates is None else [written_shape(gate) for gate in settings.gates],
+        "temporal_filter": settings.temporal_filter,
+        "spp": settings.spp,
+        "max_depth": settings.max_depth,
+        "sensors": written(settings.sensors),
+        "pulse": written_shape(settings.pulse),
+        "irf": written_shape(settings.irf),
+        "device": None if recipe.device is None else recipe.device.to_dict(),
+        "physics": settings.physics,
+        "variant": recipe.variant,
+        "seed": recipe.seed,
+        "n": recipe.n,
+    }
+    # Of JSON: no tuples, and nothing that is not plain.
+    plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
+    return plain
+
+
+def _written_scenes(recipe: Recipe) -> Any:
+    scenes = recipe.scenes
+    described = {name: _written_scene(one) for name, one in scenes.descriptions.items()}
+    if list(described) == [""]:
+        return described[""]
+    return {"one_of": described} | ({} if scenes.weights is None else {"weights": scenes.weights})
+
+
+def _written_scene(description: Any) -> dict[str, Any]:
+    if isinstance(description, XmlDescription):
+        text = hashlib.sha256(description.text.encode()).hexdigest()
+        return {"xml": description.path, "parameters": dict(description.parameters), "sha256": text}
+    return {"tree": written(description.tree), "folder": description.folder}
+
+
+def to_yaml(recipe: Recipe, path: str | Path | None) -> str:
+    """See :meth:`Recipe.to_yaml`."""
+    try:
+        import yaml
+    except ImportError as error:
+        raise StorageError(
+            "recipe: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]', or write "
+            "json.dumps(recipe.to_dict())."
+        ) from error
+    text: str = yaml.safe_dump(to_dict(recipe), sort_keys=False, width=120)
+    if path is not None:
+        try:
+            Path(path).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise StorageError(f"recipe: '{path}' cannot be written: {error}.") from error
+    return text
+
+
+def key_of(recipe: Recipe) -> str:
+    """See :meth:`Recipe.key`."""
+    plain = {name: entry for name, entry in to_dict(recipe).items() if name not in _NO_NUMBERS}
+    files: dict[str, str] = {}
+    for name, description in recipe.scenes.descriptions.items():
+        folder = Path(description.path).parent if isinstance(description, XmlDescription) else Path(description.folder)
+        content = description.text if isinstance(description, XmlDescription) else description.tree
+        # The scene's place is no part of what it is.
+        files |= {f"{name}/{file}": sha for file, sha in _files_of(content, folder).items()}
+    for key in recipe.exchanged:
+        files |= {f"{key}/{file}": sha for file, sha in _files_of(written(recipe.vary[key]), Path.cwd()).items()}
+    text = json.dumps([_without_places(plain), files], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _without_places(plain: dict[str, Any]) -> dict[str, Any]:
+    def placeless(scene: Any) -> Any:
+        if not isinstance(scene, dict):
+            return scene
+        if "one_of" in scene:
+            return {**scene, "one_of": {name: placeless(one) for name, one in scene["one_of"].items()}}
+        return {name: entry for name, entry in scene.items() if name not in ("folder", "xml")}
+
+    return {**plain, "scene": placeless(plain["scene"])}
+
+
+def _files_of(content: Any, folder: Path) -> dict[str, str]:
+    """Hashes of the files that a description names, by their names."""
+    found: dict[str, str] = {}
+    if isinstance(content, Mapping):
+        for entry in content.values():
+            found |= _files_of(entry, folder)
+    elif isinstance(content, list):
+        for entry in content:
+            found |= _files_of(entry, folder)
+    elif isinstance(content, str):
+        # Of an XML text every quoted word, of a dictionary every text.
+        for word in set(content.split('"')[1::2]) if "<" in content else {content}:
+            if 0 < len(word) < 1024 and (sha := contents_of(folder / word)):
+                found[word] = sha
+    return found
+
+
+# --------------------------------------------------------------------------------------------------------------- read
+
+
+def read_recipe(source: str | Path) -> Recipe:
+    """See :meth:`Recipe.read`."""
+    is_text = isinstance(source, str) and "\n" in source
+    if not is_text and Path(source).suffix.lower() == ".json":
+        try:
+            data = json.loads(Path(source).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise StorageError(f"recipe: '{source}' cannot be read: {error}.") from error
+        return from_dict(data, Path(source).resolve().parent)
+    data, folder = read_yaml(source, "recipe")
+    return from_dict(data, folder)
+
+
+def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> Recipe:
+    """See :meth:`Recipe.from_dict`."""
+    section = Section(data, "recipe", _ENTRIES)
+    if section.text("format", FORMAT) != FORMAT:
+        raise SceneError(f"recipe: expected the format {FORMAT!r}, got {shown(data['format'])}.")
+    place = Path.cwd() if folder is None else Path(folder)
+    arguments: dict[str, Any] = {name: read(section.get(name)) for name in _PLAIN if name in section}
+    vary = section.get("vary", {})
+    if not isinstance(vary, Mapping):
+        raise SceneError(f"recipe: vary: expected distributions by key, got {shown(vary)}.")
+    arguments["vary"] = {str(key): read_distribution(f"recipe: vary: {key}", one) for key, one in vary.items()}
+    arguments["time_axis"] = _axis(section)
+    arguments["frequencies"] = read_frequencies(section.get("frequencies", None))
+    arguments["pulse"], arguments["irf"] = (read_pulse(section.get(name, None)) for name in ("pulse", "irf"))
+    gates = section.get("gates", None)
+    arguments["gates"] = None if gates is None else [read_gate(gate) for gate in gates]
+    arguments["device"] = _device(section.get("device", None), place)
+    if ("hidden" in section) == ("scene" in section):
+        raise SceneError("recipe: expected an entry 'scene', or 'hidden' for a capture around a corner; one of them.")
+    if "hidden" in section:
+        return _capture(section, place, arguments)
+    if "scan" in section:
+        arguments["scan"] = read_scan(section.get("scan"))
+        return Recipe(_hidden(section.get("scene")), **arguments)
+    if "parameters" in section:
+        arguments["parameters"] = section.get("parameters")
+    return Recipe(_scene(section.get("scene"), place), **arguments)
+
+
+def _axis(section: Section) -> TimeAxis | None:
+    given = section.get("time_axis", None)
+    if given is None or isinstance(given, TimeAxis):
+        return given
+    seconds = isinstance(given, Mapping) and any(str(name).endswith("_s") for name in given)
+    names = ("start_s", "bin_width_s", "num_bins") if seconds else ("start_opl", "bin_width_opl", "num_bins")
+    part = Section(given, "recipe: time_axis", names)
+    numbers = part.number(names[0]), part.number(names[1]), part.whole("num_bins")
+    return TimeAxis.from_seconds(*numbers) if seconds else TimeAxis(*numbers)
+
+
+def _device(given: Any, folder: Path) -> Any:
+    if isinstance(given, str) and (folder / given).is_file():
+        return folder / given
+    return given
+
+
+def _scene(given: Any, folder: Path) -> Any:
+    if isinstance(given, str):
+        path = folder / given
+        return path if path.is_file() else given
+    if not isinstance(given, Mapping):
+        raise SceneError(f"recipe: scene: expected a file, a scene dictionary or a builtin, got {shown(given)}.")
+    if "one_of" in given:
+        several = given["one_of"]
+        scenes = (
+            {name: _scene(one, folder) for name, one in several.items()}
+            if isinstance(several, Mapping)
+            else [_scene(one, folder) for one in several]
+        )
+        return OneOf(scenes, given.get("weights"))
+    if "builtin" in given:
+        return _builtin(given)
+    if "xml" in given:
+        return _xml(given, folder)
+    if "tree" in given:
+        return Scene(_of_tree(given), None)
+    description = describe_dict(read(given))
+    return Scene(DictDescription(description.tree, str(folder)), None)
+
+
+def _of_tree(given: Mapping[str, Any]) -> DictDescription:
+    tree = describe_dict(read(given["tree"])).tree
+    return DictDescription(tree, str(given.get("folder", os.getcwd())))
+
+
+def _hidden(given: Any) -> Any:
+    """What :func:`to_dict` has written of hidden things."""
+    if isinstance(given, Mapping) and "one_of" in given:
+        return OneOf({name: _hidden(one) for name, one in given["one_of"].items()}, given.get("weights"))
+    return dict(_of_tree(given).tree)
+
+
+def _xml(given: Mapping[str, Any], folder: Path) -> Any:
+    from torchtransient.render.scene_handle import load
+
+    path = Path(given["xml"])
+    path = path if path.is_absolute() else folder / path
+    scene = load(path, **given.get("parameters", {}))
+    found = hashlib.sha256(scene._description.text.encode()).hexdigest()  # type: ignore[union-attr]
+    if given.get("sha256", found) != found:
+        raise SceneError(f"recipe: scene: '{path}' has changed since the recipe was written; it is another recipe now.")
+    return scene
+
+
+def _builtin(given: Mapping[str, Any]) -> Any:
+    import torchtransient.scenes as scenes
+
+    name = given["builtin"]
+    known = [made for made in dir(scenes) if inspect.isfunction(getattr(scenes, made))]
+    if name not in known:
+        raise SceneError(f"recipe: scene: unknown builtin {name!r}. Known ones are {', '.join(known)}.")
+    arguments = {key: read(value) for key, value in given.items() if key != "builtin"}
+    try:
+        return getattr(scenes, name)(**arguments)
+    except TypeError as error:
+        raise SceneError(f"recipe: scene: {name}: {error}.") from error
+
+
+def _capture(section: Section, folder: Path, arguments: dict[str, Any]) -> Recipe:
+    from torchtransient.nlos.described_shapes import described_shapes
+    from torchtransient.nlos.description import scan_of, wall_of
+
+    hidden = described_shapes(section.get("hidden"), folder)
+    arguments["scan"] = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
+    return Recipe(dict(hidden), **arguments)
+

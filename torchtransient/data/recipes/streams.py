@@ -1,0 +1,51 @@
+"""Random numbers of one purpose of one sample: sample i of a recipe can be made alone, on any machine, in any order.
+
+Each is a counter-based generator (Philox 4x64) of its own, whose key is a hash of the recipe's seed, the sample's
+number and the purpose: a distribution that is added to a recipe leaves what the others draw as it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Seeds of renders, as Mitsuba takes them.
+_SEEDS = 2**32
+
+
+class Draw(Protocol):
+    """What distributions draw from."""
+
+    def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+        """Numbers in [0, 1), independent of each other."""
+        ...
+
+
+class Stream:
+    """The numbers of ``purpose`` (the key that varies, for instance) of sample ``index`` under ``seed``."""
+
+    def __init__(self, seed: int, index: int, purpose: str) -> None:
+        digest = hashlib.blake2b(f"{seed}/{index}/{purpose}".encode(), digest_size=16).digest()
+        self._generator = np.random.Generator(np.random.Philox(key=np.frombuffer(digest, "<u8").astype(np.uint64)))
+
+    def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+        """Numbers in [0, 1), independent of each other."""
+        return np.asarray(self._generator.random(shape), dtype=np.float64)
+
+    def seed(self) -> int:
+        """A seed of a render, or of torch."""
+        return int(self._generator.integers(_SEEDS))
+
+
+class Extreme:
+    """Instead of a stream: all numbers at the lower or the upper end, for what a distribution can reach."""
+
+    def __init__(self, upper: bool) -> None:
+        self._number = np.nextafter(1.0, 0.0) if upper else 0.0
+
+    def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+        """The same number throughout."""
+        return np.full(shape, self._number)

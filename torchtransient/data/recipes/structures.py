@@ -1,0 +1,142 @@
+"""The scenes of a recipe: what it starts from, and the entries of it that are exchanged.
+
+A *structure* is a scene with its exchanged entries: it is built once and kept, while parameters vary in it. Entries are
+named by where they stand in the scene dictionary: ``box.filename``, ``box.bsdf``, ``lamp``; of an XML scene by their
+``$name``.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torchtransient.capture import Scan
+from torchtransient.data.recipes.distributions import checked_choices
+from torchtransient.errors import SceneError
+from torchtransient.quantities import shown
+from torchtransient.render.description import Description, DictDescription, XmlDescription, describe_dict
+from torchtransient.render.scene_handle import Scene, load
+
+# The key that stands for the scan of a capture.
+SCAN = "scan"
+
+
+class OneOf:
+    """Several scenes, one of which each sample takes: a list, or a mapping from names. ``weights``: how often each
+    comes, None for evenly. Raises SceneError for no scene, UnitError for weights that are none.
+    """
+
+    def __init__(self, scenes: Sequence[Any] | Mapping[str, Any], weights: Sequence[float] | None = None) -> None:
+        names: list[str] = []
+        values: Any = scenes
+        if isinstance(scenes, Mapping):
+            if "type" in scenes:
+                raise SceneError("OneOf: expected several scenes by name, got one. Give it to the recipe itself.")
+            names, values = [str(name) for name in scenes], list(scenes.values())
+        plain, self.weights = checked_choices("OneOf", values, weights)
+        names = names or [str(number) for number in range(len(plain))]
+        self.scenes = dict(zip(names, plain, strict=True))
+
+
+@dataclass(frozen=True)
+class Structure:
+    """``name``: of its scene. ``text``: stands for the structure. ``entries``: what is exchanged."""
+
+    name: str
+    text: str
+    entries: tuple[tuple[str, Any], ...] = ()
+
+
+class Scenes:
+    """What a recipe starts from: scenes by name (one, "", unless ``OneOf`` is given), or with ``scan`` hidden things.
+
+    Raises SceneError for what cannot be described.
+    """
+
+    def __init__(self, given: Any, variant: str, scan: Scan | None, parameters: Mapping[str, Any] | None) -> None:
+        several = given if isinstance(given, OneOf) else OneOf({"": given})
+        self.weights, self.variant, self.scan = several.weights, variant, scan
+        self.given = dict(several.scenes)
+        self.descriptions = {
+            name: _description(scene, scan, parameters or {}) for name, scene in several.scenes.items()
+        }
+
+    @property
+    def names(self) -> list[str]:
+        """Of the scenes."""
+        return list(self.descriptions)
+
+    def has_entry(self, key: str) -> bool:
+        """Whether a key stands for an entry of the description of every scene."""
+        return all(_has(description, key, self.scan) for description in self.descriptions.values())
+
+    def build(self, structure: Structure) -> tuple[Any, Scan | None]:
+        """The scene of a structure as ``tt.load`` takes it (hidden shapes for a capture), and its scan."""
+        description, scan = self.descriptions[structure.name], self.scan
+        for key, value in structure.entries:
+            if key == SCAN and self.scan is not None:
+                scan = _checked_scan(value)
+            else:
+                description = _exchanged(description, key, value)
+        if scan is not None:
+            assert isinstance(description, DictDescription)
+            return {name: node for name, node in description.tree.items() if name != "type"}, scan
+        return Scene(description, self.variant), None
+
+
+def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -> Description:
+    if scan is None:
+        scene = load(given, **parameters) if isinstance(given, str | os.PathLike) else load(given)
+        return scene._description
+    if parameters:
+        raise SceneError("recipe: parameters fill the $names of XML files; a capture has none. Leave them out.")
+    # Imported where it is used: captures read files of this room.
+    from torchtransient.nlos.scene import shapes_of
+
+    return describe_dict({"type": "scene", **shapes_of(given)})
+
+
+def _has(description: Description, key: str, scan: Scan | None) -> bool:
+    if key == SCAN:
+        return scan is not None
+    if isinstance(description, XmlDescription):
+        return key.startswith("$")
+    node: Any = description.tree
+    *above, last = key.split(".")
+    for name in above:
+        node = node.get(name) if isinstance(node, dict) else None
+    return isinstance(node, dict) and last in node and key != "type"
+
+
+def _exchanged(description: Description, key: str, value: Any) -> Description:
+    if isinstance(description, XmlDescription):
+        parameters = dict(description.parameters) | {key.removeprefix("$"): str(_plain(value))}
+        return replace(description, parameters=tuple(sorted(parameters.items())))
+    # Through the checks of a description of its own.
+    fresh = describe_dict({"type": "scene", "entry": {"type": "entry", "value": value}}).tree["entry"]["value"]
+    tree = copy.deepcopy(description.tree)
+    *above, last = key.split(".")
+    node = tree
+    for name in above:
+        node = node[name]
+    node[last] = fresh
+    return replace(description, tree=tree)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if hasattr(value, "item"):
+        return value.item()
+    if not isinstance(value, str | int | float):
+        raise SceneError(f"recipe: $names of XML files take texts and numbers, got {shown(value)}.")
+    return value
+
+
+def _checked_scan(value: Any) -> Scan:
+    if not isinstance(value, Scan):
+        raise SceneError(f"recipe: expected tt.nlos.Scan as choices of 'scan', got {shown(value)}.")
+    return value

@@ -1,0 +1,279 @@
+"""What a data set consists of, told by its shards alone, and whether they are as they were written.
+
+``manifest.json`` is a table of contents: equal shards give equal bytes, and it can be made again at any time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchtransient.data.array_file import path_of
+from torchtransient.data.storage.part_files import sweep_parts as sweep_parts
+from torchtransient.data.storage.part_files import whole_file, writing_said
+from torchtransient.data.storage.shard_file import Shard, stored_checksum
+from torchtransient.errors import StorageError
+from torchtransient.quantities import shown
+from torchtransient.render.progress import Bar
+
+FORMAT = "torchtransient manifest 1"
+MANIFEST, RECIPE = "manifest.json", "recipe.json"
+_PATTERN = "shard-*.h5"
+_WHAT = "data set"
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What :func:`verify` found.
+
+    ``faults``: what is wrong, by the name of the file, "manifest.json" among them. ``missing``: samples of the recipe
+    that stand in no sound shard, whose shards are still to be made. ``failed``: samples that could not be made, with
+    their reasons. ``samples``: how many there are.
+    """
+
+    folder: Path
+    samples: int
+    shards: int
+    faults: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    missing: tuple[int, ...] = ()
+    failed: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def damaged(self) -> tuple[str, ...]:
+        """Names of the shards with faults, which have to be made again."""
+        return tuple(name for name in self.faults if name != MANIFEST)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is wrong and nothing is missing. Samples that failed are not missing."""
+        return not self.faults and not self.missing
+
+    def __str__(self) -> str:
+        lines = [f"{self.folder}: {self.samples} samples in {self.shards} shards, {len(self.failed)} failed"]
+        lines += [f"{name}: {fault}" for name, faults in self.faults.items() for fault in faults]
+        if self.missing:
+            lines.append(f"missing: {len(self.missing)} samples, {ranges_text(self.missing)}")
+        return "\n".join(lines)
+
+
+def shards_of(folder: str | Path) -> list[Path]:
+    """The shards of a folder by name. Raises StorageError where there is no such folder."""
+    place = path_of(folder, _WHAT)
+    if not place.is_dir():
+        raise StorageError(f"{_WHAT}: expected the folder of a data set, got '{place}'.")
+    return sorted(path for path in place.glob(_PATTERN) if path.is_file())
+
+
+def build_manifest(folder: str | Path) -> dict[str, Any]:
+    """Write ``manifest.json`` from the shards of a folder, and return it.
+
+    Checksums are those that the shards carry, not compared with their bytes: :func:`verify` does. Raises StorageError
+    for damaged shards, doubled samples, shards of several recipes, and for no shard at all.
+    """
+    paths = shards_of(folder)
+    if not paths:
+        raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({_PATTERN}).")
+    entries = [_Entry.read(path) for path in paths]
+    faults = _faults_between(entries, None)
+    if faults:
+        name, said = next(iter(faults.items()))
+        raise StorageError(f"{_WHAT}: '{folder}': {name}: {said[0]}. Use verify, which tells of every shard.")
+    return _write(Path(folder), entries)
+
+
+def verify(folder: str | Path, progress: bool = False) -> Verified:
+    """Read every byte of a data set and compare it with its checksums; make the manifest of the sound shards again.
+
+    Found are shards that are damaged, that stand under the name of another one, of another recipe or doubled samples,
+    a manifest that differs from the shards, and samples that are missing: of those that ``recipe.json`` counts, without
+    it of those between the first and the last one. ``progress``: a bar. Raises StorageError for what is no folder.
+    """
+    paths = shards_of(folder)
+    expected = _expected(Path(folder))
+    faults: dict[str, list[str]] = {}
+    entries = []
+    for path in _with_bar(paths, "verify", progress):
+        try:
+            entry = _Entry.read(path, whole=True)
+        except StorageError as error:
+            faults[path.name] = [str(error)]
+            continue
+        entries.append(entry)
+    between = _faults_between(entries, expected.get("key"))
+    sound = [entry for entry in entries if entry.name not in between]
+    faults |= between
+    before = _text_of(Path(folder) / MANIFEST)
+    if sound:
+        _write(Path(folder), sound)
+        if before is not None and before != _text_of(Path(folder) / MANIFEST):
+            faults[MANIFEST] = ["did not tell what the shards hold; it was made again"]
+    have = {number for entry in sound for number in (*entry.index, *entry.failed)}
+    n = expected.get("n")
+    missing = sorted(set(range(n if isinstance(n, int) else max(have, default=-1) + 1)) - have)
+    return Verified(
+        Path(folder), sum(len(entry.index) for entry in sound), len(paths), dict(sorted(faults.items())),
+        tuple(missing), {number: entry.failed[number] for entry in sound for number in entry.failed},
+    )  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------- the shards
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """What a manifest tells of one shard."""
+
+    name: str
+    size: int
+    checksum: str
+    header: dict[str, Any]
+    index: list[int]
+    failed: dict[int, str]
+    seeds: list[int]
+    outside: list[float]
+    about: dict[str, Any]
+
+    @classmethod
+    def read(cls, path: Path, whole: bool = False) -> _Entry:
+        """Raises StorageError for a shard that is damaged; ``whole``: all of its bytes are read."""
+        with Shard(path) as shard:
+            fault = shard.verify() if whole else None
+            if fault:
+                raise StorageError(f"shard: '{path}': {fault}. Make the shard again.")
+            rows = list(shard.index.values())
+            about = {
+                "store": shard.store, "compression": shard.compression,
+                "arrays": {name: _kind(shard, name) for name in shard.names}, "values": list(shard.keys),
+            }  # fmt: skip
+            seeds = sorted(int(shard.seeds[row]) for row in rows)
+            outside = [float(shard.outside[rows, side].max()) for side in (0, 1)] if rows else []
+            return cls(
+                path.name, path.stat().st_size, stored_checksum(path), shard.header, sorted(shard.index), shard.failed,
+                seeds[:: max(1, len(seeds) - 1)], outside, about,
+            )  # fmt: skip
+
+    @property
+    def key(self) -> Any:
+        return self.header.get("key")
+
+
+def _kind(shard: Shard, name: str) -> dict[str, Any]:
+    return {"shape": list(shard.shape(name)), "dtype": shard.dtype(name), "encoding": shard.encoding(name)}
+
+
+def _faults_between(entries: Sequence[_Entry], key: Any) -> dict[str, list[str]]:
+    """What is wrong with shards beside each other, by name: of another recipe than `key`, or than most of them."""
+    faults: dict[str, list[str]] = {}
+    if key is None and entries:
+        key = Counter(json.dumps(entry.key) for entry in entries).most_common(1)[0][0]
+        key = json.loads(key)
+    kind: dict[str, Any] | None = None
+    owners: dict[int, str] = {}
+    for entry in entries:
+        said = []
+        if entry.key != key:
+            said.append(f"belongs to another recipe (key {shown(entry.key)}, expected {shown(key)})")
+        number = entry.header.get("shard")
+        if isinstance(number, int) and entry.name != f"shard-{number:06d}.h5":
+            said.append(f"is shard {number} under another name")
+        if not said:
+            same = {k: v for k, v in entry.about.items() if k in ("store", "compression")}
+            kind = kind or same
+            if kind != same:
+                said.append(f"is stored otherwise than the shards before: {same}, they {kind}")
+            doubled = [i for i in (*entry.index, *entry.failed) if owners.setdefault(i, entry.name) != entry.name]
+            if doubled:
+                said.append(f"holds the samples {ranges_text(doubled)}, which {owners[doubled[0]]} holds too")
+        if said:
+            faults[entry.name] = said
+    return faults
+
+
+def _expected(folder: Path) -> dict[str, Any]:
+    """What ``recipe.json`` says, nothing where it is missing or no such file."""
+    text = _text_of(folder / RECIPE)
+    try:
+        found = json.loads(text) if text is not None else {}
+    except ValueError:
+        raise StorageError(f"{_WHAT}: '{folder / RECIPE}' is no JSON: it was cut or changed.") from None
+    return found if isinstance(found, dict) else {}
+
+
+# --------------------------------------------------------------------------------------------------------- the manifest
+
+
+def _write(folder: Path, entries: Sequence[_Entry]) -> dict[str, Any]:
+    manifest = _manifest(entries)
+    text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+    target = folder / MANIFEST
+    if text != _text_of(target):
+        with whole_file(target, _WHAT) as unfinished, writing_said(target, _WHAT):
+            unfinished.write_text(text, encoding="utf-8")
+    return manifest
+
+
+def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
+    first = next((entry for entry in entries if entry.index), entries[0])
+    errors = sorted(e.header["standard_error"] for e in entries if _is_number(e.header.get("standard_error")))
+    return {
+        "format": FORMAT,
+        **{name: first.header.get(name) for name in ("recipe", "key", "about")},
+        **first.about,
+        "samples": sum(len(entry.index) for entry in entries),
+        "failed": {str(number): entry.failed[number] for entry in entries for number in sorted(entry.failed)},
+        "standard_error": {"least": errors[0], "most": errors[-1]} if errors else None,
+        "outside": [max(e.outside[side] for e in entries if e.outside) for side in (0, 1)] if first.outside else None,
+        "shards": {
+            entry.name: {
+                "sha256": entry.checksum, "bytes": entry.size, "index": ranges(entry.index), "seeds": entry.seeds,
+                "failed": sorted(entry.failed), "standard_error": entry.header.get("standard_error"),
+            }
+            for entry in entries
+        },
+    }  # fmt: skip
+
+
+def ranges(numbers: Iterable[int]) -> list[list[int]]:
+    """Whole numbers as ranges [first, last]."""
+    found: list[list[int]] = []
+    for number in sorted(numbers):
+        if found and number == found[-1][1] + 1:
+            found[-1][1] = number
+        else:
+            found.append([number, number])
+    return found
+
+
+def ranges_text(numbers: Iterable[int], most: int = 8) -> str:
+    """Whole numbers as text, "0 to 3, 7"."""
+    parts = [str(a) if a == b else f"{a} to {b}" for a, b in ranges(numbers)]
+    return ", ".join(parts[:most]) + (f" and {len(parts) - most} more ranges" if len(parts) > most else "")
+
+
+def _text_of(path: Path) -> str | None:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{_WHAT}: '{path}' cannot be read: {error}.") from error
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _with_bar(paths: Sequence[Path], name: str, progress: bool) -> Iterator[Path]:
+    bar = Bar(name) if progress else None
+    try:
+        for done, path in enumerate(paths):
+            yield path
+            if bar is not None:
+                bar((done + 1) / len(paths))
+    finally:
+        if bar is not None:
+            bar.close()
