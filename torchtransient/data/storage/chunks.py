@@ -25,7 +25,7 @@ _BINS = 64
 _SMALL_BYTES = 2**18
 _LEAST_BYTES = 2**16
 _MOST_BYTES = 2**22
-_TIME, _HEIGHT = -3, -2
+_HEIGHT = -2
 # Numbers of HDF5's filters: deflate, shuffle, Fletcher's checksum; Blosc2.
 _KNOWN_FILTERS = {1, 2, 3, 32026}
 _BLOSC2 = 32026
@@ -52,9 +52,10 @@ def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
 
     if size() <= _SMALL_BYTES or not shape:
         return tuple(cut)
-    if len(shape) >= -_TIME:
-        bin_bytes = size() // shape[_TIME]
-        cut[_TIME] = min(shape[_TIME], max(_BINS, -(-_LEAST_BYTES // bin_bytes)))
+    time = time_axis(shape)
+    if time is not None:
+        bin_bytes = size() // shape[time]
+        cut[time] = min(shape[time], max(_BINS, -(-_LEAST_BYTES // bin_bytes)))
     # Rows first, then what stands before the bins, from the left; what is left are bins and columns.
     axes = [len(shape) + _HEIGHT] if len(shape) > 1 else []
     axes += [axis for axis in range(len(shape)) if axis not in axes]
@@ -62,6 +63,14 @@ def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
         if size() > _MOST_BYTES:
             cut[axis] = max(1, cut[axis] * _MOST_BYTES // size())
     return tuple(cut)
+
+
+def time_axis(shape: tuple[int, ...]) -> int | None:
+    """Where the bins of a shape probably are: (C, T, H, W), (C, T, N) and (C, T, Ly, Lx, Sy, Sx) have them second,
+    polarized images (4, C, T, H, W) third; None for what has fewer axes. Images of several components are thus cut
+    into rows.
+    """
+    return None if len(shape) < 3 else 2 if len(shape) == 5 else 1
 
 
 class Compressor:

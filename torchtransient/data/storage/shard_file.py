@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torchtransient.data.array_file import check_source, damage_said
 from torchtransient.data.hdf5_limits import check_memory, dataset_of, read_dataset
 from torchtransient.data.hdf5_writing import hdf5_package
-from torchtransient.data.storage.chunks import check_chunks
+from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded
 from torchtransient.data.storage.shard_writing import (
     FORMAT,
@@ -70,9 +70,8 @@ class Shard:
         self, name: str, row: int, window: slice | None = None, pixels: tuple[slice, slice] | None = None,
         *, as_stored: bool = False,
     ) -> NDArray[Any]:  # fmt: skip
-        """One array of a row. ``window``: a slice of the bins, the third axis from the end, of which alone what is
-        asked for is read. ``pixels``: slices of rows and columns of the image. Counts are float32, unless
-        ``as_stored``.
+        """One array of a row. ``window``: a slice of the bins, of which alone what is asked for is read. ``pixels``:
+        slices of rows and columns of the image. Counts are float32, unless ``as_stored``.
         """
         with damage_said(self.path, WHAT):
             return self._read(name, row, window, pixels, as_stored)
@@ -95,6 +94,24 @@ class Shard:
         """The shape of an array of one sample."""
         with damage_said(self.path, WHAT):
             return tuple(self._dataset(name).shape[1:])
+
+    def time_axis(self, name: str) -> int | None:
+        """Which axis of an array the bins are, None where it has none."""
+        with damage_said(self.path, WHAT):
+            return self._time_axis(name)
+
+    def _time_axis(self, name: str) -> int | None:
+        """Second, behind channels; third, behind the Stokes components, in polarized variants."""
+        shape = tuple(self._dataset(name).shape[1:])
+        about = self.header.get("about")
+        about = about if isinstance(about, dict) else {}
+        axis = about.get("axis")
+        bins = axis.get("num_bins") if isinstance(axis, dict) else None
+        if bins is None:
+            return time_axis(shape)
+        polarized = "polarized" in str(about.get("variant", "")) or len(shape) == 5
+        places = (2, 1) if polarized else (1,)
+        return next((place for place in places if len(shape) > place + 1 and shape[place] == bins), None)
 
     def dtype(self, name: str, *, as_stored: bool = False) -> str:
         """The dtype that an array is read as, NumPy's name; ``as_stored``: that in the file."""
@@ -168,10 +185,13 @@ class Shard:
         shape = dataset.shape[1:]
         part = [slice(0, n) for n in shape]
         if window is not None:
-            _check_axes(shape, 3, name)
-            part[-3] = _slice(window, shape[-3], "window")
+            time = self._time_axis(name)
+            if time is None:
+                raise StorageError(f"{WHAT}: '{name}' {shape} has no time axis; read all of it.")
+            part[time] = _slice(window, shape[time], "window")
         if pixels is not None:
-            _check_axes(shape, 2, name)
+            if len(shape) < 2:
+                raise StorageError(f"{WHAT}: '{name}' {shape} has no rows and columns; read all of it.")
             rows, columns = pixels
             part[-2], part[-1] = _slice(rows, shape[-2], "pixels"), _slice(columns, shape[-1], "pixels")
         size = tuple(cut.stop - cut.start for cut in part)
@@ -210,12 +230,6 @@ def _check_about(about: Mapping[str, Any], rows: int) -> None:
     right &= all(isinstance(text, str) for one in lists for text in one)
     if not right:
         raise ValueError("'about' does not tell what is stored")
-
-
-def _check_axes(shape: tuple[int, ...], from_end: int, name: str) -> None:
-    if len(shape) < from_end:
-        what = "time axis" if from_end == 3 else "rows and columns"
-        raise StorageError(f"{WHAT}: '{name}' {shape} has no {what}; read all of it.")
 
 
 def _slice(given: Any, size: int, name: str) -> slice:

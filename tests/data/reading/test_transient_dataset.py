@@ -1,0 +1,219 @@
+"""Samples by number: what was stored, windows and pixels of it, transforms, workers."""
+
+from __future__ import annotations
+
+import pickle
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import torchtransient as tt
+from support.stored_samples import AXIS, cube, folder, header, sample, write
+from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.errors import StorageError
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return folder(tmp_path_factory.mktemp("data") / "set")
+
+
+def doubled(transient):
+    return 2 * transient
+
+
+def test_samples(data):
+    found = TransientDataset(data)
+    assert len(found) == 10 and found.axis == tt.TimeAxis(**AXIS) and found.about["spp"] == 16
+    for i in (0, 5, 9):
+        item, made = found[i], sample(i)
+        assert item["index"] == i and set(item) == {*made.arrays, "values", "index"}
+        for name, array in made.arrays.items():
+            assert item[name].dtype == torch.from_numpy(array).dtype and np.array_equal(item[name].numpy(), array)
+        assert item["values"]["box.filename"] == f"größe_{i}.ply" and int(item["values"]["count"]) == i
+    assert found[-1]["index"] == 9 and found.index.tolist() == list(range(10))
+    for number in (10, -11, slice(2)):
+        with pytest.raises(IndexError):
+            found[number]
+    assert len(list(found)) == 10  # the old way of iterating, which ends with an IndexError
+
+
+def test_where(data, tmp_path):
+    names = sorted(map(str, data.glob("shard*")))
+    for where in (str(data), str(data / "shard-*.h5"), names, [data], str(data.parent / "s*"), [names[0], *names[1:]]):
+        assert len(TransientDataset(where)) == 10
+    assert len(TransientDataset(names[2])) == 2 and TransientDataset(names[2])[0]["index"] == 8
+    for where, message in (
+        (tmp_path, "there is none"), (str(tmp_path / "x-*.h5"), "there is none"), ([], "a list of them"), (3, "a list"),
+        ([names[0], names[0]], "twice"),
+    ):  # fmt: skip
+        with pytest.raises(StorageError, match=message):
+            TransientDataset(where)
+
+
+def test_failed_samples_are_left_out(tmp_path):
+    write(tmp_path / "shard-000000.h5", [ValueError("dark"), sample(1), ValueError("dark")])
+    write(tmp_path / "shard-000001.h5", [ValueError("x")])
+    found = TransientDataset(tmp_path)
+    assert len(found) == 1 and found[0]["index"] == 1 and found.failed == {0: "x", 2: "dark"}
+    with pytest.raises(StorageError, match="all of them failed"):
+        TransientDataset(tmp_path / "shard-000001.h5")
+
+
+@pytest.mark.parametrize(
+    ("window", "bins"),
+    [
+        (slice(64, 128), slice(64, 128)), (slice(-10, None), slice(246, 256)), ((3.5, 3.7), slice(0, 10)),
+        ((4.0, 5.0), slice(25, 75)), ((4.005, 4.995), slice(25, 75)), ((4.001, 4.002), slice(25, 26)),
+        ((None, 4.0), slice(0, 25)), ([8.0, None], slice(225, 256)), (None, slice(0, 256)),
+    ],
+)  # fmt: skip
+def test_windows(data, window, bins):
+    found = TransientDataset(data, window=window)
+    x = found[3]
+    assert np.array_equal(x["transient"].numpy(), cube(3)[:, bins]) and x["steady"].shape == (1, 16, 16)
+    edges = tt.TimeAxis(**AXIS).edges_opl[bins.start : bins.stop + 1]
+    assert found.axis.num_bins == bins.stop - bins.start
+    assert torch.allclose(found.axis.edges_opl, edges, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("window", [(3.0, 4.0), (4.0, 9.0), (5, 4), (4, 4), "all", (1, 2, 3), slice(9, 9), ("a", 4)])
+def test_windows_that_are_none(data, window):
+    with pytest.raises(StorageError, match="window"):
+        TransientDataset(data, window=window)
+
+
+def test_a_window_reads_its_slabs_alone(tmp_path):
+    """Chunks outside the window are damaged, and nobody looks at them."""
+    about = {"axis": {**AXIS, "num_bins": 1024}}
+    path = write(tmp_path / "shard-000000.h5", [sample(0, (1, 1024, 16, 16))], about=about)
+    with h5py.File(path) as file:
+        infos = [file["arrays/transient"].id.get_chunk_info(k) for k in range(16)]
+    raw = bytearray(path.read_bytes())
+    for info in infos:
+        if info.chunk_offset[2] not in (128, 192):
+            raw[info.byte_offset + 50] ^= 255
+    path.write_bytes(raw)
+    x = cube(0, (1, 1024, 16, 16))
+    assert np.array_equal(TransientDataset(path, ["transient"], slice(130, 194))[0]["transient"], x[:, 130:194])
+    with pytest.raises(StorageError, match="damaged"):
+        TransientDataset(path)[0]
+
+
+def test_pixels(data):
+    item = TransientDataset(data, pixels=(slice(2, 6), slice(8, None)))[0]
+    made = sample(0).arrays
+    assert item["transient"].shape == (1, 256, 4, 8) and item["normals"].shape == (3, 4, 8)
+    for name, array in made.items():
+        assert np.array_equal(item[name].numpy(), array[..., 2:6, 8:])
+    for pixels in (3, (slice(2), 3), (slice(16, 20), slice(None)), (slice(0, 9, 2), slice(None))):
+        with pytest.raises(StorageError, match="pixels"):
+            TransientDataset(data, pixels=pixels)
+
+
+def test_fields(data):
+    assert set(TransientDataset(data, ["depth"])[0]) == {"depth", "index"}
+    assert set(TransientDataset(data, ["depth", "values", "index"])[0]) == {"depth", "values", "index"}
+    with pytest.raises(StorageError, match="expected fields among"):
+        TransientDataset(data, ["albedo"])
+
+
+def test_transforms(data):
+    found = TransientDataset(data, ["depth"], window=slice(0, 64), transform=doubled)
+    assert set(found[2]) == {"depth", "measurement", "index"} == {*found.fields, "index"}
+    assert np.array_equal(found[2]["measurement"].numpy(), 2 * cube(2)[:, :64])
+    chain = tt.sensing.Compose([tt.sensing.ShotNoise()])
+    noisy = [TransientDataset(data, transform=chain, seed=seed)[4]["measurement"] for seed in (1, 1, 2)]
+    assert torch.equal(noisy[0], noisy[1]) and not torch.equal(noisy[0], noisy[2])
+    one = TransientDataset(data, transform=chain, seed=1)
+    assert not torch.equal(one.sample(4, 0)["measurement"], one.sample(4, 1)["measurement"])
+    module = torch.nn.Conv3d(1, 1, 1)
+    assert not TransientDataset(data, transform=module)[0]["measurement"].requires_grad
+    with pytest.raises(StorageError, match="takes generator="):
+        TransientDataset(data, transform=doubled, seed=3)
+
+
+def test_counts(tmp_path):
+    folder(tmp_path, 3, store="rounded")
+    samples = [sample(i, counts=True) for i in range(3)]
+    samples[1].arrays["measurement"][0, 0, 0, 0] = 300
+    path = write(tmp_path / "a.h5", samples, "counts")
+    found, stored = TransientDataset(path), TransientDataset(path, as_stored=True)
+    for i in range(3):
+        assert found[i]["measurement"].dtype == torch.float32 and stored[i]["measurement"].dtype == torch.uint16
+        assert np.array_equal(found[i]["measurement"].numpy(), samples[i].arrays["measurement"])
+        assert np.array_equal(stored[i]["measurement"].numpy(), samples[i].arrays["measurement"])
+        assert np.array_equal(found[i]["depth"].numpy(), samples[i].arrays["depth"])
+    assert TransientDataset(path, window=slice(3, 9))[0]["measurement"].shape == (1, 6, 16, 16)
+
+
+def test_measurements_on_other_axes_are_left_whole(tmp_path):
+    made = sample(0)
+    made.arrays["measurement"] = np.ones((1, 7, 8, 8), np.float32)
+    path = write(tmp_path / "a.h5", [made])
+    item = TransientDataset(path, window=slice(0, 9), pixels=(slice(0, 2), slice(0, 2)))[0]
+    assert item["measurement"].shape == (1, 7, 8, 8) and item["transient"].shape == (1, 9, 2, 2)
+
+
+def test_polarized_and_scanned_samples(tmp_path):
+    made = sample(0, (4, 1, 32, 6, 5))
+    path = write(tmp_path / "a.h5", [made], about={"axis": {**AXIS, "num_bins": 32}, "variant": "llvm_mono_polarized"})
+    assert TransientDataset(path, window=slice(0, 9))[0]["transient"].shape == (4, 1, 9, 6, 5)
+    made = sample(0)
+    made.arrays.pop("normals")
+    made.arrays.update({"transient": np.ones((1, 32, 2, 3, 4, 5), np.float32), "steady": np.ones((1, 2, 3, 4, 5))})
+    path = write(tmp_path / "b.h5", [made], about={"axis": {**AXIS, "num_bins": 32}})
+    assert TransientDataset(path, window=slice(0, 9))[0]["transient"].shape == (1, 9, 2, 3, 4, 5)
+
+
+def test_no_axis(tmp_path):
+    path = write(tmp_path / "a.h5", [sample(0)], about={"axis": {"frequencies": [1.0, 2.0]}})
+    assert TransientDataset(path).axis is None
+    with pytest.raises(StorageError, match="no time axis"):
+        TransientDataset(path, window=slice(0, 3))
+
+
+def test_shards_that_do_not_belong_together(data, tmp_path):
+    write(tmp_path / "a.h5", [sample(0, (1, 256, 8, 8))])
+    with pytest.raises(StorageError, match="the same arrays in all shards"):
+        TransientDataset([data, tmp_path / "a.h5"])
+    write(tmp_path / "a.h5", [sample(0)], about={**header()["about"], "axis": {**AXIS, "start_opl": 9.0}})
+    with pytest.raises(StorageError, match="the same axis in all shards"):
+        TransientDataset([data, tmp_path / "a.h5"])
+
+
+@pytest.mark.parametrize("workers", [0, ("fork", 2), ("spawn", 2)])
+def test_loaders(data, workers):
+    found = TransientDataset(data, window=slice(0, 64), transform=doubled)
+    assert found[7]["index"] == 7  # files are open here
+    options = {} if not workers else {"num_workers": workers[1], "multiprocessing_context": workers[0]}
+    batches = list(DataLoader(found, batch_size=4, **options))
+    assert [b["index"].tolist() for b in batches] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert batches[0]["transient"].shape == (4, 1, 64, 16, 16)
+    assert batches[0]["values"]["red.reflectance.value"].shape == (4, 3)
+    assert batches[2]["values"]["box.filename"] == ["größe_8.ply", "größe_9.ply"]
+    for batch in batches:
+        for k, i in enumerate(batch["index"].tolist()):
+            assert np.array_equal(batch["measurement"][k].numpy(), 2 * cube(i)[:, :64])
+
+
+def test_pickles_without_files(data):
+    found = TransientDataset(data)
+    first = found[0]
+    twin = pickle.loads(pickle.dumps(found))
+    assert len(pickle.dumps(found)) < 20_000 and torch.equal(twin[0]["transient"], first["transient"])
+    found.close()
+    assert torch.equal(found[0]["transient"], first["transient"])
+
+
+def test_not_more_than_some_files_are_open(data, monkeypatch):
+    from torchtransient.data.reading import shard_table
+
+    monkeypatch.setattr(shard_table, "_OPEN", 2)
+    found = TransientDataset(data, ["depth"])
+    for i in (0, 4, 8, 0, 9, 5):
+        assert found[i]["index"] == i
+        assert len(found._table._open) <= 2

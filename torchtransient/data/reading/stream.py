@@ -1,0 +1,153 @@
+"""Shards as an iterable data set: whole files in a shuffled order, divided over ranks and workers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import IterableDataset, get_worker_info
+
+from torchtransient.axes import TimeAxis
+from torchtransient.data.reading.shard_table import WHAT
+from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.errors import StorageError
+from torchtransient.quantities import count, flag
+
+
+class TransientStream(IterableDataset[dict[str, Any]]):
+    """The samples of shards, each of them once in an epoch, over all ranks and workers together.
+
+    Files come in a shuffled order, and so do the samples of a file; ``buffer`` samples that follow each other are
+    shuffled once more. Only their places are kept, so that a large buffer takes no memory, and a reader goes back and
+    forth between as many files as it spans. The order depends on ``seed``, the epoch (:meth:`set_epoch`; without it,
+    every epoch is the first one), and the number of ranks and workers. ``shuffle=False``: files and rows in order.
+
+    ``rank``, ``world_size``: which share of the samples this process reads; those of torch.distributed by default, or
+    of RANK and WORLD_SIZE. Shares differ by one sample where the samples cannot be divided evenly; with ``even=True``
+    the last samples of an epoch's order are left out, so that no rank waits for another one. ``workers`` of a
+    DataLoader divide the share of their rank among them.
+
+    Samples, and all other arguments, are those of :class:`TransientDataset`; with its ``seed`` given as ``noise_seed``,
+    the noise of an epoch is its own. Raises StorageError as it does.
+    """
+
+    def __init__(
+        self, where: Any, *, shuffle: bool = True, seed: int = 0, buffer: int = 1024, rank: int | None = None,
+        world_size: int | None = None, even: bool = False, noise_seed: int | None = None, **reading: Any,
+    ) -> None:  # fmt: skip
+        self.dataset = TransientDataset(where, **reading, seed=noise_seed)
+        self.shuffle, self.even = flag(f"{WHAT}: shuffle", shuffle), flag(f"{WHAT}: even", even)
+        self.seed, self.buffer = count(f"{WHAT}: seed", seed, 0), count(f"{WHAT}: buffer", buffer)
+        if (rank is None) != (world_size is None):
+            raise StorageError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
+        self._rank = None if rank is None or world_size is None else _checked_rank(rank, world_size)
+        # In shared memory: workers that stay for several epochs are told.
+        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+
+    @property
+    def axis(self) -> TimeAxis | None:
+        """The time axis of what is returned."""
+        return self.dataset.axis
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the shards say about the render."""
+        return self.dataset.about
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that is read next."""
+        return int(self._epoch.item())
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the order of the next iteration, in all workers. Call it before the loader is iterated over."""
+        self._epoch.fill_(count(f"{WHAT}: epoch", epoch, 0))
+
+    @property
+    def num_samples(self) -> int:
+        """How many samples this rank reads in an epoch."""
+        start, stop = _share(self._used(), *self._ranks())
+        return stop - start
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        epoch = self.epoch
+        for number in self.order(epoch):
+            yield self.dataset.sample(int(number), epoch)
+
+    def order(self, epoch: int) -> NDArray[np.int64]:
+        """(n,) int64: the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch."""
+        rank, ranks = self._ranks()
+        worker = get_worker_info()
+        start, stop = _share(self._used(), rank, ranks)
+        part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        first, last = _share(stop - start, part, parts)
+        found = self._everything(epoch)[start + first : start + last]
+        if not self.shuffle:
+            return found
+        return _buffered(found, self.buffer, np.random.default_rng([self.seed, epoch, 1, rank, part]))
+
+    def _everything(self, epoch: int) -> NDArray[np.int64]:
+        """All samples, file by file: the same order in all ranks and workers."""
+        files = self.dataset.shards.numpy()
+        numbers = np.arange(len(files), dtype=np.int64)
+        if not self.shuffle:
+            return numbers
+        rng = np.random.default_rng([self.seed, epoch, 0])
+        place = rng.permutation(int(files.max()) + 1)
+        mixed = rng.permutation(numbers)
+        return mixed[np.argsort(place[files[mixed]], kind="stable")]
+
+    def _used(self) -> int:
+        """How many samples all ranks read together."""
+        ranks = self._ranks()[1]
+        return len(self.dataset) // ranks * ranks if self.even else len(self.dataset)
+
+    def _ranks(self) -> tuple[int, int]:
+        return self._rank if self._rank is not None else _found_rank()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Spawned workers do not know torch.distributed.
+        return {**self.__dict__, "_rank": self._ranks()}
+
+
+def _share(size: int, part: int, parts: int) -> tuple[int, int]:
+    return size * part // parts, size * (part + 1) // parts
+
+
+def _buffered(numbers: NDArray[np.int64], size: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """What a shuffle buffer makes of a sequence: each is drawn from the ``size`` next ones that are left."""
+    found = numbers.copy()
+    held = list(numbers[:size])
+    for place in range(len(numbers)):
+        drawn = int(rng.integers(len(held)))
+        found[place] = held[drawn]
+        if place + size < len(numbers):
+            held[drawn] = numbers[place + size]
+        else:
+            held[drawn] = held[-1]
+            held.pop()
+    return found
+
+
+def _found_rank() -> tuple[int, int]:
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
+        try:
+            rank, size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+        except ValueError:
+            raise StorageError(f"{WHAT}: expected RANK and WORLD_SIZE as whole numbers, give rank= instead.") from None
+        return _checked_rank(rank, size)
+    return 0, 1
+
+
+def _checked_rank(rank: int, world_size: int) -> tuple[int, int]:
+    size = count(f"{WHAT}: world_size", world_size)
+    if count(f"{WHAT}: rank", rank, 0) >= size:
+        raise StorageError(f"{WHAT}: expected rank below world_size = {size}, got {rank}.")
+    return int(rank), size
