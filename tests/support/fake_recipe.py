@@ -27,7 +27,7 @@ class FakeSample:
 
 @dataclass(frozen=True)
 class FakeRecipe:
-    """``shape`` of the transient; ``seconds`` a sample takes. ``raising``, ``hanging``, ``crashing``, ``dying``: samples
+    """``shape`` of the transient; ``seconds`` for a sample. ``raising``, ``hanging``, ``crashing``, ``dying``: samples
     at which it raises, hangs, has a segmentation fault, is killed; ``once``: a folder, in which what went wrong is
     noted and goes well from then on. ``late``: samples with light outside. ``unbuilt``: the maker cannot be made.
     """

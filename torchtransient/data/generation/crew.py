@@ -132,9 +132,8 @@ class Crew(ABC, Generic[Worker]):
             if away > 0:
                 worker.heard += away
             silent = now - worker.heard
-            if worker.shard is not None and silent > self._limit(worker):
-                self.bury(worker, f"by no sign of life for {silent:.0f} s", own_fault=True)
-            elif not worker.ready and silent > self.patience_to_start():
+            limit = self._limit(worker) if worker.ready else self.patience_to_start()
+            if (worker.shard is not None or not worker.ready) and silent > limit:
                 self.bury(worker, f"by no sign of life for {silent:.0f} s", own_fault=True)
 
     def patience_to_start(self) -> float:

@@ -67,7 +67,7 @@ class Generated:
 def generate(
     recipe: Any,
     folder: str | Path,
-    n: int,
+    n: int | None = None,
     workers: int = 2,
     *,
     store: str = "exact",
@@ -82,8 +82,8 @@ def generate(
     progress: bool = True,
     address: str | None = None,
 ) -> Generated:
-    """Render samples 0 to ``n`` - 1 of a recipe into shard files in ``folder``. Call it again to go on after whatever
-    ended it: finished shards are kept.
+    """Render samples 0 to ``n`` - 1 of a recipe into shard files in ``folder``; None takes the recipe's own ``n``. Call
+    it again to go on after whatever ended it: finished shards are kept.
 
     Files of a recipe have the same bytes in whatever order, by however many workers and on whichever engine they are
     made, on one kind of processor with the same packages; every worker computes with one thread. A sample that raises
@@ -109,6 +109,9 @@ def generate(
     """
     start = time.monotonic()
     _check_process()
+    n = getattr(recipe, "n", None) if n is None else n
+    if n is None:
+        raise UnitError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
     _check_numbers(n, workers, shard, per_shard, timeout_s, retries, max_outside)
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
@@ -224,10 +227,7 @@ def _check_made(place: Path, made: list[int], engine: str) -> None:
 
 def _write_manifest(place: Path) -> None:
     """Again where another run on this folder has finished shards meanwhile: the last one to look has seen all."""
-    try:
-        from torchtransient.data.storage.manifest import build_manifest
-    except ImportError:  # TEMP
-        return
+    from torchtransient.data.storage.manifest import build_manifest
 
     seen: set[str] | None = None
     while (now := {path.name for path in place.glob("shard-*.h5")}) != seen:

@@ -44,21 +44,12 @@ class LatestPicture:
 
 
 def picture_of(sample: Any) -> NDArray[np.uint8]:
-    """The light of a sample summed over time, (H, W, 3); the brightest percent is white."""
-    name = next((n for n in ("transient", "gated", "phasor", "steady") if n in sample.arrays), None)
-    if name is None:
-        raise ValueError("no light in the sample")
-    array = sample.arrays[name]
-    over_time = np.abs(array) if np.iscomplexobj(array) else array
-    image = over_time if name == "steady" else over_time.sum(axis=-3, dtype=np.float32)
-    image = image[0] if image.ndim == 4 else image
-    image = image if image.shape[0] in (1, 3) else image.mean(axis=0, keepdims=True)
-    white = float(np.quantile(image.max(axis=0), 0.99)) or 1.0
-    shown = np.clip(np.nan_to_num(image / white), 0, 1) ** (1 / 2.2)
-    rgb = np.broadcast_to(np.moveaxis(shown, 0, -1), (*shown.shape[1:], 3))
-    factor = max(1, SIDE // max(rgb.shape[:2]))
-    pixels = (rgb * 255 + 0.5).astype(np.uint8)
-    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
+    """The light of a sample, (H, W, 3)."""
+    from torchtransient.data.recipes.contact_sheet import cell_of
+    from torchtransient.vis.files import enlarge, to_bytes
+
+    pixels = to_bytes(cell_of(sample).images["light"])
+    return enlarge(pixels, max(1, SIDE // max(pixels.shape[:2])))
 
 
 def _save(pixels: NDArray[np.uint8], path: Path) -> None:

@@ -72,7 +72,12 @@ class ShardMaker:
             kept.close()
 
     def measure(self, indices: range, told: Told) -> Measured:
-        """Make samples until one can be made. Raises SceneError where none of them can."""
+        """Check the recipe, and make samples until one can be made. Raises what is wrong with the recipe, SceneError
+        where none of the samples can be made.
+        """
+        check = getattr(self.settings.recipe, "check", None)
+        if check is not None:
+            check()
         reason: str | None = None
         for index in indices:
             reason = told.begin(-1, index)
