@@ -12,7 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtransient.data import hdf5_writing
 from torchtransient.errors import SceneError
+
+
+TROUBLES = ("raising", "hanging", "crashing", "dying")
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class FakeRecipe:
     """``shape`` of the transient; ``seconds`` for a sample. ``raising``, ``hanging``, ``crashing``, ``dying``: samples
     at which it raises, hangs, has a segmentation fault, is killed; ``once``: a folder, in which what went wrong is
     noted and goes well from then on. ``late``: samples with light outside. ``unbuilt``: the maker cannot be made.
+    ``slow_disk``: seconds that each write to a shard takes.
     """
 
     shape: tuple = (1, 8, 4, 4)
@@ -42,16 +47,21 @@ class FakeRecipe:
     late: tuple = ()
     once: str | None = None
     unbuilt: str = ""
+    slow_disk: float = 0.0
     versions: dict = field(default_factory=lambda: {"fake": "1"})
 
     def to_dict(self):
-        return json.loads(json.dumps(asdict(self)))
+        """What decides about the bytes: not what passes."""
+        passing = {"seconds", "once", "versions", "slow_disk"}
+        found = asdict(self) | dict.fromkeys(TROUBLES if self.once else (), ())
+        return json.loads(json.dumps({k: v for k, v in found.items() if k not in passing}))
 
     def key(self):
-        deciding = {k: v for k, v in self.to_dict().items() if k not in ("seconds", "once", "versions")}
-        return hashlib.sha256(json.dumps(deciding, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
     def maker(self):
+        if self.slow_disk:
+            _slow_down(self.slow_disk)
         if self.unbuilt:
             raise SceneError(self.unbuilt)
         return FakeMaker(self)
@@ -80,7 +90,7 @@ class FakeMaker:
         if self.closed:
             raise RuntimeError("the maker is closed")
         time.sleep(recipe.seconds)
-        for kind in ("raising", "hanging", "crashing", "dying"):
+        for kind in TROUBLES:
             if index in getattr(recipe, kind) and not self._was(kind, index):
                 getattr(self, f"_{kind}")(index)
         drawn = np.random.Generator(np.random.Philox(key=[recipe.seed, index]))
@@ -111,3 +121,16 @@ class FakeMaker:
 
     def _dying(self, index):
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _slow_down(seconds):
+    """Writing HDF5 takes time from now on, in this process."""
+    class Slow(_FAST):
+        def write(self, data):
+            time.sleep(seconds)
+            return super().write(data)
+
+    hdf5_writing._Sink = Slow
+
+
+_FAST = hdf5_writing._Sink
