@@ -27,6 +27,7 @@ COMMANDS = {
     "nlos": "Simulate a capture around a corner, going on where it was stopped.",
     "reconstruct": "Find what a capture around a corner has seen, and draw it.",
     "cost": "Measure what accuracy costs in time on a scene.",
+    "dataset": "Make a data set of a recipe, going on where it was stopped; check it, show it.",
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }
 

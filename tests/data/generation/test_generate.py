@@ -1,0 +1,263 @@
+"""Data sets of a recipe that renders nothing: equal bytes however they are made, and what is not made says why."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from support.fake_recipe import FakeRecipe
+from support.generation_runs import data_files, environment, finish, leftovers, start
+from torchtransient.data.generation.generate import generate
+from torchtransient.data.generation.latest_picture import LatestPicture
+from torchtransient.data.generation.ledger import DIED
+from torchtransient.data.storage.manifest import verify
+from torchtransient.data.storage.shard_file import Shard
+from torchtransient.errors import SceneError, StorageError, UnitError
+
+RECIPE = FakeRecipe()
+QUICK = {"n": 23, "per_shard": 4, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory):
+    """The data set as one worker makes it that nobody disturbs."""
+    folder = tmp_path_factory.mktemp("calm") / "set"
+    done = generate(RECIPE, folder, workers=1, **QUICK)
+    assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (23, 0, 0, 0, 6)
+    assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5"))
+    assert "23 samples in 6 shards" in str(done)
+    return folder
+
+
+def events(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def failures(folder):
+    found = {}
+    for path in folder.glob("shard-*.h5"):
+        with Shard(path) as shard:
+            found |= shard.failed
+    return found
+
+
+def test_what_is_there(calm):
+    assert leftovers(calm) == []
+    assert verify(calm).complete and verify(calm).samples == 23
+    maker = RECIPE.maker()
+    with Shard(calm / "shard-000002.h5") as shard:
+        assert shard.header["samples"] == [8, 12] and shard.header["key"] == RECIPE.key()
+        for index in range(8, 12):
+            np.testing.assert_array_equal(
+                shard.read("transient", shard.index[index]), maker.sample(index).arrays["transient"]
+            )
+    assert (calm / "latest.png").read_bytes().startswith(b"\x89PNG")
+    log = events(calm)
+    assert [e["event"] for e in log] == ["begin", *["shard"] * 6, "end"]
+    assert json.loads((calm / "recipe.json").read_text())["standard_error"] == 0.25
+
+
+def test_equal_bytes_of_many_workers_and_of_shares(calm, tmp_path):
+    generate(RECIPE, tmp_path / "many", workers=3, **QUICK)
+    assert data_files(tmp_path / "many") == data_files(calm)
+    first = generate(RECIPE, tmp_path / "shares", shard=(1, 2), **QUICK)
+    assert (first.samples, first.shards) == (11, 3)
+    second = generate(RECIPE, tmp_path / "shares", shard=(0, 2), **QUICK)
+    assert second.samples == 12 and data_files(tmp_path / "shares") == data_files(calm)
+
+
+def test_going_on(calm, tmp_path):
+    folder = tmp_path / "set"
+    generate(RECIPE, folder, workers=1, **QUICK)
+    before = data_files(folder)
+    stamp = (folder / "shard-000003.h5").stat().st_mtime_ns
+    (folder / "shard-000001.h5").unlink()
+    os.truncate(folder / "shard-000002.h5", 3000)
+    (folder / ".shard-000004.h5.12345678.part").write_bytes(b"half")
+    with (folder / "log.jsonl").open("a") as log:
+        log.write('{"half')
+    done = generate(RECIPE, folder, workers=1, n=23, progress=False)
+    assert (done.samples, done.kept) == (8, 15)
+    assert data_files(folder) == before == data_files(calm)
+    assert (folder / "shard-000003.h5").stat().st_mtime_ns == stamp and leftovers(folder) == []
+    lines = (folder / "log.jsonl").read_text().splitlines()
+    assert [line for line in lines if not line.endswith("}")] == ['{"half']
+    assert "damaged" in [json.loads(line)["event"] for line in lines if line.endswith("}")]
+    again = generate(RECIPE, folder, workers=1, n=23, progress=False)
+    assert (again.samples, again.kept) == (0, 23)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "changes", "words"),
+    [
+        (FakeRecipe(seed=1), {}, "recipe is another one .seed is 0 there and 1 here"),
+        (RECIPE, {"n": 24}, "n is 23 there and 24 here"),
+        (RECIPE, {"per_shard": 5}, "per_shard is 4 there and 5 here"),
+        (RECIPE, {"store": "rounded"}, "store is 'exact' there"),
+        (RECIPE, {"compression": "gzip"}, "compression is 'blosc2' there"),
+        (RECIPE, {"max_outside": 0.5}, "max_outside is 0.01 there"),
+        (RECIPE, {"resume": False}, "resume=False"),
+    ],
+)
+def test_the_folder_of_another_data_set(calm, recipe, changes, words):
+    before = data_files(calm)
+    with pytest.raises(StorageError, match=words):
+        generate(recipe, calm, **QUICK | changes)
+    assert data_files(calm) == before
+
+
+def test_shards_without_their_recipe(calm, tmp_path):
+    """What the shards say counts where recipe.json was lost."""
+    folder = tmp_path / "set"
+    folder.mkdir()
+    name = "shard-000001.h5"
+    (folder / name).write_bytes((calm / name).read_bytes())
+    with pytest.raises(StorageError, match=r"shard-000001\.h5' belongs to another data set: its recipe"):
+        generate(FakeRecipe(seed=1), folder, **QUICK)
+    done = generate(RECIPE, folder, workers=1, **QUICK)
+    assert done.kept == 4 and data_files(folder) == data_files(calm)
+    # One that lies under the name of another.
+    (folder / name).write_bytes((calm / "shard-000002.h5").read_bytes())
+    with pytest.raises(StorageError, match="differs in 'samples'"):
+        generate(RECIPE, folder, **QUICK)
+
+
+def test_other_versions_of_packages(calm, tmp_path):
+    folder = tmp_path / "set"
+    generate(RECIPE, folder, workers=1, **QUICK)
+    (folder / "shard-000001.h5").unlink()
+    with pytest.raises(StorageError, match="versions is .'fake': '1'. there and .'fake': '2'. here"):
+        generate(replace(RECIPE, versions={"fake": "2"}), folder, workers=1, **QUICK)
+    assert not (folder / "shard-000001.h5").exists()
+
+
+# ------------------------------------------------------------------------------------------------- samples that fail
+
+
+def test_what_fails_is_named(tmp_path, calm):
+    """Every kind of failure in one run; all other samples are there."""
+    recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,), late=(21,))
+    done = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
+    assert (done.samples, done.failed) == (18, 5) and done.restarts == 4
+    assert failures(tmp_path) == {
+        3: "SceneError: sample 3 cannot be made by <object at 0x...>",
+        7: DIED, 12: DIED, 18: DIED,
+        21: "0 of its light lies before the window and 0.5 after it, more than max_outside=0.01",
+    }  # fmt: skip
+    assert verify(tmp_path).complete and len(verify(tmp_path).failed) == 5
+    with Shard(tmp_path / "shard-000001.h5") as found, Shard(calm / "shard-000001.h5") as expected:
+        assert sorted(found.index) == [4, 5, 6]
+        for index, row in found.index.items():
+            np.testing.assert_array_equal(
+                found.read("transient", row), expected.read("transient", expected.index[index])
+            )
+    ways = {(e["sample"], e["how"].split(" for")[0]) for e in events(tmp_path) if e["event"] == "death"}
+    assert ways == {(7, "by SIGSEGV"), (12, "by SIGKILL"), (18, "by no sign of life")}
+    again = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
+    assert (again.kept, again.samples, again.failed) == (18, 0, 0)
+
+
+def test_what_passes_leaves_no_trace(tmp_path, calm):
+    """What goes wrong once is tried again: the bytes are those of an undisturbed run."""
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    recipe = FakeRecipe(raising=(1, 3), crashing=(7,), dying=(12,), hanging=(18,), once=str(notes))
+    done = generate(recipe, tmp_path / "set", timeout_s=1.5, **QUICK)
+    assert (done.samples, done.failed, done.restarts) == (23, 0, 3) and len(list(notes.iterdir())) == 5
+    assert data_files(tmp_path / "set") == data_files(calm)
+
+
+def test_the_first_samples_fail(tmp_path):
+    done = generate(FakeRecipe(raising=(0,), crashing=(1,)), tmp_path, retries=0, workers=1, **QUICK)
+    assert (done.samples, done.failed) == (21, 2)
+
+
+def test_no_sample_can_be_made(tmp_path):
+    with pytest.raises(SceneError, match=r"none of the samples 0 to 15 .* The last one: SceneError: sample 15"):
+        generate(FakeRecipe(raising=tuple(range(23))), tmp_path, **QUICK)
+    with pytest.raises(SceneError, match="no light in it"):
+        generate(FakeRecipe(unbuilt="no light in it"), tmp_path, **QUICK)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log.jsonl"]
+    assert [e["event"] for e in events(tmp_path)].count("stopped") == 2
+
+
+# --------------------------------------------------------------------------------------------------------- arguments
+
+
+@dataclass(frozen=True)
+class Unpicklable(FakeRecipe):
+    def __reduce__(self):
+        raise TypeError("never")
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"n": 0}, UnitError, "n to be"), ({"n": 2.5}, UnitError, "n to be"), ({"n": None}, UnitError, "how many"),
+        ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
+        ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
+        ({"shard": "0/2"}, UnitError, "shard"), ({"timeout_s": 0}, UnitError, "timeout_s"),
+        ({"max_outside": -0.1}, UnitError, "max_outside"), ({"max_outside": float("nan")}, UnitError, "max_outside"),
+        ({"engine": "dask"}, UnitError, "engine"), ({"address": "auto"}, UnitError, "ray"),
+        ({"store": "half"}, StorageError, "store"), ({"compression": "lzma"}, StorageError, "compression"),
+        ({"recipe": {}}, SceneError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
+        ({"folder": 3}, StorageError, "folder|name of a file"),
+    ],
+)  # fmt: skip
+def test_arguments(tmp_path, changes, error, words):
+    given = {"recipe": RECIPE, "folder": tmp_path / "a", **QUICK, **changes}
+    with pytest.raises(error, match=words):
+        generate(given.pop("recipe"), given.pop("folder"), **given)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_folder_that_is_a_file(tmp_path):
+    (tmp_path / "a").write_text("")
+    with pytest.raises(StorageError, match="cannot be made"):
+        generate(RECIPE, tmp_path / "a", **QUICK)
+
+
+def test_a_script_without_a_guard(tmp_path):
+    """Its workers import it; they may not begin runs of their own without end."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
+        "from torchtransient.data.generation.generate import generate\n"
+        f"generate(FakeRecipe(), {str(tmp_path / 'set')!r}, 4, progress=False)\n"
+    )
+    found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
+    assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
+
+
+# ------------------------------------------------------------------------------------------------------- full disks
+
+
+def test_a_full_disk(tmp_path):
+    """A typed error, finished shards whole, nothing half-written, no worker left; the same call goes on."""
+    recipe = FakeRecipe(shape=(1, 64, 16, 16))
+    asked = {"n": 7, "per_shard": 5, "workers": 1}
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))"
+    status, out, err = finish(start(recipe, tmp_path / "a", before=limit, **asked))
+    assert status == 1 and out == ""
+    assert "StorageError" in err and "File too large" in err and "the same call goes on" in err
+    assert list((tmp_path / "a").glob("shard-*.h5")) == [] and leftovers(tmp_path / "a") == []
+    generate(recipe, tmp_path / "a", progress=False, **asked)
+    generate(recipe, tmp_path / "b", progress=False, **asked)
+    assert data_files(tmp_path / "a") == data_files(tmp_path / "b")
+    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
+
+
+def test_a_picture_is_no_reason_to_fail(tmp_path):
+    sample = RECIPE.maker().sample(0)
+    LatestPicture(tmp_path / "nowhere")(sample)
+    LatestPicture(tmp_path)(replace(sample, arrays={"transient": np.zeros(3)}))
+    assert list(tmp_path.iterdir()) == []
+    LatestPicture(tmp_path)(sample)
+    assert [path.name for path in tmp_path.iterdir()] == ["latest.png"]

@@ -1,0 +1,176 @@
+"""Workers and supervisors that are killed at any moment: the bytes are those of an undisturbed run."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+from collections import Counter
+
+import pytest
+
+from support.fake_recipe import FakeRecipe
+from support.generation_runs import (
+    alive,
+    data_files,
+    finish,
+    kill,
+    leftovers,
+    start,
+    wait_until,
+    workers_of,
+)
+from torchtransient.data.generation.generate import generate
+from torchtransient.data.storage.manifest import verify
+
+# Samples take a little, and so does every write to a shard.
+RECIPE = FakeRecipe(shape=(1, 16, 8, 8), seconds=0.02, slow_disk=0.004)
+ASKED = {"n": 48, "per_shard": 6, "workers": 2}
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("calm") / "set"
+    generate(FakeRecipe(shape=RECIPE.shape), folder, progress=False, **ASKED | {"workers": 1})
+    assert verify(folder).complete
+    return data_files(folder)
+
+
+def half_written(folder):
+    """Shards between their first and their last byte."""
+    found = []
+    for path in folder.glob(".shard-*.part"):
+        try:
+            found += [path] * (path.stat().st_size > 0)
+        except FileNotFoundError:
+            continue
+    return found
+
+
+def test_a_killed_worker_is_replaced(tmp_path, calm):
+    """One while it makes samples, one while it writes."""
+    child = start(RECIPE, tmp_path, **ASKED)
+    try:
+        wait_until(lambda: list(tmp_path.glob("shard-*.h5")))
+        assert kill(workers_of(child.pid)[0])
+        wait_until(lambda: half_written(tmp_path))
+        assert kill(workers_of(child.pid)[-1])
+        status, out, err = finish(child)
+    finally:
+        child.kill()
+    assert status == 0, err
+    assert "2 workers replaced" in out and data_files(tmp_path) == calm and leftovers(tmp_path) == []
+
+
+def test_a_killed_supervisor(tmp_path, calm):
+    """Its workers end by themselves, and the next run goes on."""
+    child = start(RECIPE, tmp_path, **ASKED)
+    wait_until(lambda: len(list(tmp_path.glob("shard-*.h5"))) >= 2)
+    workers = workers_of(child.pid)
+    assert len(workers) == 2
+    kill(child.pid)
+    child.communicate()
+    wait_until(lambda: not any(map(alive, workers)), 15)
+    assert leftovers(tmp_path) == []
+    kept = len(list(tmp_path.glob("shard-*.h5")))
+    assert 2 <= kept < 8
+    done = generate(RECIPE, tmp_path, progress=False, **ASKED)
+    assert done.kept == 6 * kept and data_files(tmp_path) == calm
+
+
+def test_a_killed_supervisor_of_a_worker_that_hangs(tmp_path):
+    child = start(FakeRecipe(hanging=(0,)), tmp_path, **ASKED)
+    (worker,) = wait_until(lambda: workers_of(child.pid)[:1])
+    wait_until(lambda: (tmp_path / "log.jsonl").exists())
+    time.sleep(2)
+    kill(child.pid)
+    child.communicate()
+    wait_until(lambda: not alive(worker), 15)
+
+
+@pytest.mark.parametrize("group", [False, True])
+def test_ctrl_c(tmp_path, calm, group):
+    """At a terminal it reaches the workers too."""
+    child = start(RECIPE, tmp_path, **ASKED)
+    wait_until(lambda: list(tmp_path.glob("shard-*.h5")))
+    workers = workers_of(child.pid)
+    os.killpg(child.pid, signal.SIGINT) if group else os.kill(child.pid, signal.SIGINT)
+    status, _, err = finish(child, 15)
+    assert status == -signal.SIGINT and err.count("Traceback") == 1 and "KeyboardInterrupt" in err
+    assert not any(map(alive, workers)) and leftovers(tmp_path) == []
+    generate(RECIPE, tmp_path, progress=False, **ASKED)
+    assert data_files(tmp_path) == calm
+
+
+def test_a_supervisor_that_was_stopped_for_a_while(tmp_path, calm):
+    """Its workers are not taken for hung ones when it comes back."""
+    child = start(RECIPE, tmp_path, timeout_s=1.0, **ASKED)
+    wait_until(lambda: list(tmp_path.glob("shard-*.h5")))
+    os.killpg(child.pid, signal.SIGSTOP)
+    time.sleep(3)
+    os.killpg(child.pid, signal.SIGCONT)
+    status, out, err = finish(child)
+    assert status == 0 and "replaced" not in out, (out, err)
+    assert data_files(tmp_path) == calm
+
+
+def test_two_runs_at_once(tmp_path, calm):
+    """On one folder, from its beginning on: both end, and nothing is lost or doubled."""
+    both = [start(RECIPE, tmp_path, **ASKED) for _ in range(2)]
+    for child in both:
+        status, _, err = finish(child)
+        assert status == 0, err
+    assert data_files(tmp_path) == calm and verify(tmp_path).complete and leftovers(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_a_hundred_kills(tmp_path, calm):
+    """Of workers and of supervisors, starting, rendering and between the first and the last byte of a shard."""
+    chance = random.Random(7)
+    hits: Counter = Counter()
+    rounds = 0
+    while hits.total() < 100 or hits["writing"] < 20:
+        folder = tmp_path / f"{rounds}"
+        folder.mkdir()
+        while not _life(folder, chance, hits):
+            pass
+        assert data_files(folder) == calm, (rounds, hits)
+        found = verify(folder)
+        assert found.complete and found.failed == {} and leftovers(folder) == []
+        rounds += 1
+        assert rounds < 100
+    print(f"kills: {dict(hits)}, data sets: {rounds}")
+    assert hits["supervisor"] >= 10
+
+
+def _life(folder, chance, hits):
+    """A run that is disturbed until its supervisor is killed; True where it came to its end."""
+    child = start(RECIPE, folder, **ASKED)
+    try:
+        for _ in range(chance.randrange(1, 6)):
+            way = chance.choice(("any", "writing", "writing"))
+            until = time.monotonic() + chance.uniform(0, 6)
+            while child.poll() is None and time.monotonic() < until and not (way == "writing" and half_written(folder)):
+                time.sleep(0.001)
+            time.sleep(chance.uniform(0, 0.05) if way == "writing" else 0)
+            if child.poll() is not None:
+                break
+            workers = workers_of(child.pid)
+            before = set(half_written(folder))
+            victim = chance.choice([child.pid, *workers, *workers])
+            if kill(victim):
+                place = "supervisor" if victim == child.pid else "worker"
+                hits[place] += 1
+                if victim == child.pid:
+                    child.communicate()
+                    # They see it at once, and take a moment to leave.
+                    wait_until(lambda: not any(map(alive, workers)), 15)  # noqa: B023
+                    return False
+                hits["writing"] += bool(before & set(half_written(folder)))
+        status, _, err = finish(child, 120)
+        assert status == 0, err
+        return True
+    finally:
+        child.kill()
+        child.wait()

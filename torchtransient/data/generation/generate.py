@@ -1,0 +1,331 @@
+"""``generate``: a data set of a recipe on disk, by workers that may die."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import multiprocessing
+import os
+import pickle
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchtransient.data.generation.ledger import Ledger, facts
+from torchtransient.data.generation.plan import Plan, samples_per_shard
+from torchtransient.data.generation.run_log import RunLog, SampleBar
+from torchtransient.data.generation.settings import (
+    RECIPE_FILE,
+    Settings,
+    check_same,
+    description,
+    plain,
+    read_description,
+    shard_header,
+    write_description,
+)
+from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
+from torchtransient.quantities import shown
+
+ENGINES = ("local", "ray")
+# Samples that are tried until one tells how large all are.
+MEASURED = 16
+_WHAT = "generate"
+
+
+@dataclass(frozen=True)
+class Generated:
+    """What a run has done. ``samples``, ``failed``, ``bytes`` of the ``shards`` that it made; ``kept`` samples stood in
+    shards that were there; ``restarts`` of workers; ``seconds`` from the call to the end.
+    """
+
+    folder: Path
+    samples: int
+    failed: int
+    kept: int
+    shards: int
+    bytes: int
+    seconds: float
+    restarts: int
+
+    @property
+    def samples_per_second(self) -> float:
+        """Of this run, starting the workers included."""
+        return self.samples / self.seconds if self.seconds > 0 else math.nan
+
+    def __str__(self) -> str:
+        told = [f"{self.samples} samples in {self.shards} shards, {_size(self.bytes)}"]
+        told += [f"{self.failed} failed"] if self.failed else []
+        told += [f"{self.kept} were there"] if self.kept else []
+        told += [f"{self.restarts} worker{'s' * (self.restarts != 1)} replaced"] if self.restarts else []
+        rate = f", {self.samples_per_second:.3g} samples a second" if self.samples else ""
+        told += [f"{self.seconds:.1f} s{rate}"]
+        return f"{self.folder}: {'; '.join(told)}"
+
+
+def generate(
+    recipe: Any,
+    folder: str | Path,
+    n: int | None = None,
+    workers: int = 2,
+    *,
+    store: str = "exact",
+    compression: str = "blosc2",
+    max_outside: float | None = 0.01,
+    resume: bool = True,
+    engine: str = "local",
+    shard: tuple[int, int] | None = None,
+    per_shard: int | None = None,
+    timeout_s: float | None = None,
+    retries: int = 2,
+    progress: bool = True,
+    address: str | None = None,
+) -> Generated:
+    """Render samples 0 to ``n`` - 1 of a recipe into shard files in ``folder``; None takes the recipe's own ``n``. Call
+    it again to go on after whatever ended it: finished shards are kept.
+
+    Files of a recipe have the same bytes in whatever order, by however many workers and on whichever engine they are
+    made, on one kind of processor with the same packages; every worker computes with one thread. A sample that raises
+    is tried again ``retries`` times with new scenes; then it stands in its shard as failed, with the reason, and so do
+    samples with more than ``max_outside`` of their light outside the window (None: any), and those over which worker
+    after worker dies or says nothing for ``timeout_s``. To try failed samples again, delete their shard.
+
+    ``workers``: processes of one thread each, replaced when they die. ``shard``: (i, k) makes every k-th shard from the
+    i-th on, so that k machines that see one folder divide the work. ``per_shard``: samples in a file; by default 64 to
+    256 MB before compression, and 64 files at least. ``store``, ``compression``: see ``ShardWriter``. ``timeout_s``:
+    seconds for one sample, the compilation of a new scene included; by default 30 times the slowest so far, at least
+    120. ``max_outside``: in [0, 1].
+    ``engine="ray"``: actors on the cluster at ``address``, or a running or new local one; all machines have to see
+    ``folder``. ``resume=False``: an error where the folder has a data set.
+
+    The folder holds ``recipe.json``, ``shard-*.h5``, ``manifest.json`` (made of the shards), ``log.jsonl`` (times,
+    deaths, failures) and ``latest.png``.
+
+    Raises ``StorageError`` for a full disk (finished shards stay whole; the same call goes on) and for a folder that
+    belongs to another recipe or other settings, ``UnitError`` for arguments out of range, ``SceneError`` where no
+    sample can be made, ``TorchTransientError`` where workers die without end. ``KeyboardInterrupt`` passes, with
+    workers stopped. Scripts that call it need ``if __name__ == "__main__"``: workers import them.
+    """
+    start = time.monotonic()
+    _check_process()
+    n = getattr(recipe, "n", None) if n is None else n
+    if n is None:
+        raise UnitError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
+    _check_numbers(n, workers, shard, per_shard, timeout_s, retries, max_outside)
+    _check_choices(store, compression, engine, address, recipe)
+    place = _folder(folder)
+    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries)
+    wanted = description(settings, per_shard or 0, {}, None)
+    if per_shard is None:
+        del wanted["per_shard"]
+    found = _there(place, wanted, resume)
+    log = RunLog(place)
+    _sweep(place)
+    ledger = Ledger(retries, log, SampleBar(0, 0, shown=False))
+    log("begin", n=n, workers=workers, engine=engine, shard=shard, host=os.uname().nodename)
+    kept = 0
+    try:
+        with _engine(engine, settings, workers, ledger, timeout_s, address) as crew:
+            if found is None:
+                found = _begin(crew, settings, per_shard, wanted)
+            plan = Plan(n, found["per_shard"])
+            share = plan.share(*(shard or (0, 1)))
+            left, kept = _survey(place, settings, found, share, log)
+            total = sum(len(plan.indices(k)) for k in share)
+            ledger.bar = SampleBar(total, total - sum(len(plan.indices(k)) for k in left), shown=progress)
+            crew.make(left, found)
+        _check_made(place, left, engine)
+        _write_manifest(place)
+    except BaseException as error:
+        log("stopped", error=f"{type(error).__name__}: {error}")
+        raise
+    else:
+        log("end", seconds=round(time.monotonic() - start, 3), **facts(ledger))
+    finally:
+        ledger.bar.close()
+        log.close()
+        _sweep(place)
+    done = facts(ledger)
+    return Generated(place, kept=kept, seconds=time.monotonic() - start, **done)
+
+
+def _begin(crew: Any, settings: Settings, per_shard: int | None, wanted: dict[str, Any]) -> dict[str, Any]:
+    """The first run of a folder."""
+    measured = crew.measure(range(min(settings.n, MEASURED)))
+    size = per_shard or samples_per_shard(settings.n, measured.sample_bytes)
+    described = description(settings, size, measured.about, measured.standard_error)
+    place = Path(settings.folder)
+    # Another run may have been first.
+    found = write_description(place, described)
+    check_same(found, wanted, place / RECIPE_FILE)
+    return found
+
+
+def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] | None:
+    """What the folder says that it is; checked."""
+    from torchtransient.data.storage.shard_file import Shard
+
+    found = read_description(place)
+    first = next(iter(sorted(place.glob("shard-*.h5"))), None)
+    if not resume and (found is not None or first is not None):
+        raise StorageError(
+            f"{_WHAT}: '{place}' has a data set, and resume=False was asked for. Choose another folder, or delete it."
+        )
+    if found is not None:
+        check_same(found, wanted, place / RECIPE_FILE)
+    elif first is not None:
+        # One that is damaged says nothing, and is made again.
+        header: dict[str, Any] = {}
+        with contextlib.suppress(StorageError), Shard(first) as there:
+            header = there.header
+        check_same(header, wanted, first)
+    return found
+
+
+def _survey(
+    place: Path, settings: Settings, described: dict[str, Any], share: range, log: RunLog
+) -> tuple[list[int], int]:
+    """Shards that are missing, and how many samples stand in the others. Raises StorageError for those of another data
+    set.
+    """
+    from torchtransient.data.storage.shard_file import Shard
+
+    left, kept = [], 0
+    for number in share:
+        path = place / Plan.name(number)
+        if not path.exists():
+            left.append(number)
+            continue
+        try:
+            with Shard(path) as there:
+                header, samples = there.header, len(there.index)
+        except StorageError as error:
+            # A disk that lost what it had promised to keep.
+            log("damaged", shard=number, error=str(error))
+            left.append(number)
+            continue
+        expected = plain(shard_header(settings, described, number))
+        check_same(header, expected, path)
+        if header != expected:
+            name = next(k for k in sorted({*header, *expected}) if header.get(k) != expected.get(k))
+            raise StorageError(
+                f"{_WHAT}: '{path}' is of this recipe and differs in {name!r}, as when other versions of packages made "
+                "it. Choose another folder."
+            )
+        kept += samples
+    return left, kept
+
+
+def _check_made(place: Path, made: list[int], engine: str) -> None:
+    missing = next((k for k in made if not (place / Plan.name(k)).exists()), None)
+    if missing is not None:
+        more = " All machines of the cluster have to see this folder under this name." if engine == "ray" else ""
+        path = place / Plan.name(missing)
+        raise StorageError(f"{_WHAT}: shard {missing} was written, and '{path}' is not there.{more}")
+
+
+def _write_manifest(place: Path) -> None:
+    """Again where another run on this folder has finished shards meanwhile: the last one to look has seen all."""
+    from torchtransient.data.storage.manifest import build_manifest
+
+    seen: set[str] | None = None
+    while (now := {path.name for path in place.glob("shard-*.h5")}) != seen:
+        seen = now
+        build_manifest(place)
+
+
+def _engine(
+    name: str, settings: Settings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
+) -> Any:
+    if name == "ray":
+        from torchtransient.data.generation.ray_engine import RayCrew
+
+        return RayCrew(settings, workers, ledger, timeout_s, address)
+    from torchtransient.data.generation.supervisor import Supervisor
+
+    return Supervisor(settings, workers, ledger, timeout_s)
+
+
+def _sweep(place: Path) -> None:
+    from torchtransient.data.storage.part_files import sweep_parts
+
+    with contextlib.suppress(OSError):
+        sweep_parts(place)
+
+
+# ---------------------------------------------------------------------------------------------------------- arguments
+
+
+def _check_process() -> None:
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise TorchTransientError(
+            f"{_WHAT}: called while a worker imports this script. Put the call under if __name__ == '__main__'."
+        )
+
+
+def _check_numbers(
+    n: Any, workers: Any, shard: Any, per_shard: Any, timeout_s: Any, retries: Any, max_outside: Any
+) -> None:
+    _check_whole(n, "n", 1)
+    _check_whole(workers, "workers", 1)
+    _check_whole(retries, "retries", 0)
+    if per_shard is not None:
+        _check_whole(per_shard, "per_shard", 1)
+    if shard is not None:
+        pair: Any = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
+        if not all(isinstance(k, int) and not isinstance(k, bool) for k in pair) or not 0 <= pair[0] < pair[1]:
+            raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
+    limits: tuple[tuple[str, Any, float], ...] = (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0))
+    for name, value, most in limits:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value <= most and (value > 0 or name == "max_outside")):
+            wanted = "in [0, 1]" if name == "max_outside" else "above 0"
+            raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
+
+
+def _check_whole(value: Any, name: str, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise UnitError(f"{_WHAT}: expected {name} to be a whole number of at least {least}, got {shown(value)}.")
+
+
+def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
+    from torchtransient.data.hdf5_writing import hdf5_package
+    from torchtransient.data.storage.chunks import check_compression
+    from torchtransient.data.storage.encodings import check_store
+
+    hdf5_package(_WHAT)
+    check_store(store, _WHAT)
+    check_compression(compression, _WHAT)
+    if engine not in ENGINES:
+        raise UnitError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
+    if address is not None and engine != "ray":
+        raise UnitError(f"{_WHAT}: address={shown(address)} is for engine='ray', got engine={engine!r}.")
+    lacking = [name for name in ("maker", "key", "to_dict") if not callable(getattr(recipe, name, None))]
+    if lacking:
+        raise SceneError(f"{_WHAT}: expected a recipe, with {lacking[0]}(), got {shown(recipe)}.")
+    try:
+        pickle.dumps(recipe)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise SceneError(f"{_WHAT}: expected a recipe that pickles, since workers get it: {error}.") from error
+
+
+def _folder(folder: Any) -> Path:
+    from torchtransient.data.array_file import path_of
+
+    place = path_of(folder, _WHAT).absolute()
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{_WHAT}: the folder '{place}' cannot be made: {error}.") from error
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise StorageError(f"{_WHAT}: no permission to write into '{place}'. Choose another folder.")
+    return place
+
+
+def _size(count: int) -> str:
+    for unit in ("bytes", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000  # type: ignore[assignment]
+    return f"{count:.4g} GB"

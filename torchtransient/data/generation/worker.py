@@ -1,0 +1,107 @@
+"""What a process of the local engine does: it takes shards from its supervisor one at a time, and ends with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+from torchtransient.data.generation.settings import Settings
+from torchtransient.data.generation.shard_making import ShardMaker, fatal
+
+# A render that is under way is waited for so long when the supervisor is gone.
+LAST_SECONDS = 10.0
+_GONE = 3
+
+
+def work(link: Connection, settings: Settings) -> None:
+    """The whole life of a worker. Messages: see the functions of :class:`Telling`."""
+    # Ctrl-C reaches the whole group; the supervisor has the last word.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGTERM, _end)
+    _end_with_supervisor()
+    telling = Telling(link)
+    try:
+        maker = ShardMaker(settings)
+        telling.say("ready")
+        while True:
+            task = link.recv()
+            if task[0] == "stop":
+                maker.close()
+                return
+            _carry_out(task, maker, telling)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        sys.exit(_GONE)
+    except Exception as error:  # noqa: BLE001  told, and raised by the supervisor
+        with contextlib.suppress(OSError):
+            telling.say("fatal", *fatal(error))
+        sys.exit(1)
+
+
+def _carry_out(task: tuple[Any, ...], maker: ShardMaker, telling: Telling) -> None:
+    kind, *rest = task
+    if kind == "measure":
+        indices, telling.skip = rest
+        telling.say("measured", maker.measure(indices, telling))
+    else:
+        shard, described, telling.skip, first = rest
+        telling.say("wrote", shard, *maker.make(shard, described, telling, first))
+
+
+class Telling:
+    """Says to the supervisor what becomes of samples."""
+
+    def __init__(self, link: Connection) -> None:
+        self._link = link
+        self.skip: dict[int, str] = {}
+
+    def say(self, *message: Any) -> None:
+        """One message."""
+        self._link.send(message)
+
+    def begin(self, shard: int, index: int) -> str | None:
+        """See :class:`Told`."""
+        if index in self.skip:
+            return self.skip[index]
+        self.say("begin", shard, index)
+        return None
+
+    def end(self, shard: int, index: int, failed: str | None) -> None:
+        """See :class:`Told`."""
+        self.say("end", shard, index, failed)
+
+    def retry(self, shard: int, index: int, reason: str) -> None:
+        """See :class:`Told`."""
+        self.say("retry", shard, index, reason)
+
+    def closing(self, shard: int) -> None:
+        """See :class:`Told`."""
+        self.say("closing", shard)
+
+
+def _end(*_: Any) -> NoReturn:
+    # An exception, so that the shard that is being written leaves nothing behind.
+    sys.exit(_GONE)
+
+
+def _end_with_supervisor() -> None:
+    """A thread that waits for the supervisor's end, however it comes: a render takes no notice of a closed pipe."""
+    from multiprocessing import connection, parent_process
+
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def wait() -> None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(LAST_SECONDS)
+        os._exit(_GONE)
+
+    threading.Thread(target=wait, daemon=True).start()
