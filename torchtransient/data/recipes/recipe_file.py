@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.axes import TimeAxis
-from torchtransient.data.content_key import contents_of
+from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
 from torchtransient.data.recipes.written import (
@@ -33,8 +33,9 @@ from torchtransient.data.recipes.written import (
     written_scan,
     written_shape,
 )
-from torchtransient.data.yaml_files import Section, read_yaml
 from torchtransient.errors import SceneError, StorageError
+from torchtransient.files.content_key import contents_of
+from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.quantities import shown
 from torchtransient.render.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.render.scene_handle import Scene
@@ -129,19 +130,8 @@ def key_of(recipe: Specification) -> str:
         files |= {f"{name}/{file}": sha for file, sha in _files_of(content, folder).items()}
     for key in recipe.exchanged:
         files |= {f"{key}/{file}": sha for file, sha in _files_of(written(recipe.vary[key]), Path.cwd()).items()}
-    text = json.dumps([_without_places(plain), files], sort_keys=True, separators=(",", ":"))
+    text = json.dumps([without_places(plain), files], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _without_places(plain: dict[str, Any]) -> dict[str, Any]:
-    def placeless(scene: Any) -> Any:
-        if not isinstance(scene, dict):
-            return scene
-        if "one_of" in scene:
-            return {**scene, "one_of": {name: placeless(one) for name, one in scene["one_of"].items()}}
-        return {name: entry for name, entry in scene.items() if name not in ("folder", "xml")}
-
-    return {**plain, "scene": placeless(plain["scene"])}
 
 
 def _files_of(content: Any, folder: Path) -> dict[str, str]:

@@ -21,9 +21,9 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import grids, holdable, made
-from torchtransient.data import hdf5_limits
-from torchtransient.data.captures.formats import LAYOUTS
 from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.files import hdf5_limits
+from torchtransient.files.captures.formats import LAYOUTS
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 ONE_OF_EACH = {layout: capture for layout, _, capture in holdable()}

@@ -12,9 +12,9 @@ import torch
 import torchtransient as tt
 from support.capture_files import AXIS, FROM_ZERO, SQUARE, WALL, grids, holdable, listed, made
 from torchtransient.capture import Capture, files
-from torchtransient.data.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
-from torchtransient.data.captures.mat_file import write_mat
 from torchtransient.errors import StorageError
+from torchtransient.files.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
+from torchtransient.files.captures.mat_file import write_mat
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 HOLDABLE = {f"{layout}-{name}": (layout, capture) for layout, name, capture in holdable()}

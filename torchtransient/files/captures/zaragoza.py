@@ -16,9 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, replacing
-from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import (
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of, replacing
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
@@ -28,9 +29,8 @@ from torchtransient.data.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.data.captures.mat_file import write_parts
-from torchtransient.data.hdf5_writing import new_hdf5
-from torchtransient.errors import StorageError
+from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.hdf5_writing import new_hdf5
 from torchtransient.quantities import shown
 
 NAME = "zaragoza"

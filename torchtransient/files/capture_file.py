@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
-from torchtransient.data.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
-from torchtransient.data.plain_data import plain, restored
 from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
+from torchtransient.files.plain_data import plain, restored
 
 FORMAT = "torchtransient capture 1"
 _WHAT = "capture file"

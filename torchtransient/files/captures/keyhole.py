@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from torchtransient.capture import Capture
-from torchtransient.data.captures.contents import Contents
-from torchtransient.data.captures.gaps import Gaps, flat_scan, tensor_of, time_axis
+from torchtransient.files.captures.contents import Contents
+from torchtransient.files.captures.gaps import Gaps, flat_scan, tensor_of, time_axis
 
 NAME = "keyhole"
 BIN_WIDTH_S = 16e-12

@@ -23,9 +23,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.data.hdf5_limits import check_size, read_attributes, read_dataset
-from torchtransient.data.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.files.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
 from torchtransient.quantities import shown
 
 HDF5 = (".h5", ".hdf5")

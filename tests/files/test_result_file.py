@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.data import array_file
-from torchtransient.data.result_file import check_target, read_result, write_result
 from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.result_file import check_target, read_result, write_result
 from torchtransient.render.output import RenderOutput, RenderStats
 
 AXIS = TimeAxis(3.5, 0.02, 5)

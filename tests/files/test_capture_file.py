@@ -12,9 +12,9 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.data import array_file
-from torchtransient.data.capture_file import read_capture, write_capture
 from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.capture_file import read_capture, write_capture
 
 ENDINGS = ("h5", "hdf5", "npz")
 AXIS = TimeAxis(1.1, 0.003, 7)

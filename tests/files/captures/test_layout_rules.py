@@ -12,10 +12,10 @@ import torch
 from support.capture_files import FROM_ZERO, ORIGINS, SQUARE, UP, grids, listed, made
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.captures.contents import MatContents
-from torchtransient.data.captures.formats import FORMATS, LAYOUTS
-from torchtransient.data.captures.mat_file import write_mat
 from torchtransient.errors import StorageError
+from torchtransient.files.captures.contents import MatContents
+from torchtransient.files.captures.formats import FORMATS, LAYOUTS
+from torchtransient.files.captures.mat_file import write_mat
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 WRITTEN = ["torchtransient", *(layout.name for layout in LAYOUTS if layout.write is not None)]
@@ -305,7 +305,7 @@ def test_counts_of_few_photons(tmp_path):
 def test_structures_count_for_memory_too(tmp_path, monkeypatch):
     import scipy.io
 
-    from torchtransient.data import hdf5_limits
+    from torchtransient.files import hdf5_limits
 
     for compressed in (False, True):
         scipy.io.savemat(tmp_path / "a.mat", {"dataset": {"data": np.ones((50, 50))}}, do_compression=compressed)

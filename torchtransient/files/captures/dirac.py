@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of, replacing
-from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import Gaps, cannot, hidden_side, only_transient, scan_of, tensor_of, time_axis
-from torchtransient.data.captures.mat_file import write_parts
-from torchtransient.data.hdf5_writing import new_hdf5
+from torchtransient.files.array_file import array_of, replacing
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import Gaps, cannot, hidden_side, only_transient, scan_of, tensor_of, time_axis
+from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.hdf5_writing import new_hdf5
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}

@@ -22,9 +22,9 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
-from torchtransient.data import array_file
-from torchtransient.data.array_file import array_of, damage_said, read_arrays, write_arrays
 from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.array_file import array_of, damage_said, read_arrays, write_arrays
 from torchtransient.gates import Gate
 from torchtransient.render.films.choices import of_entries, of_output
 from torchtransient.render.output import RenderOutput, named_fields

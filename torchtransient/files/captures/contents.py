@@ -14,11 +14,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import check_source, damage_said
-from torchtransient.data.captures.mat5 import HEADER_BYTES, Mat5File, Other
-from torchtransient.data.hdf5_limits import read_attributes, read_dataset
-from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import check_source, damage_said
+from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.hdf5_limits import read_attributes, read_dataset
+from torchtransient.files.hdf5_writing import hdf5_package
 
 WHAT = "capture file"
 

@@ -6,9 +6,9 @@ import pytest
 
 from support.capture_files import holdable, read_only
 from torchtransient.capture import Capture
-from torchtransient.data.captures.formats import LAYOUTS
-from torchtransient.data.captures.mat_file import write_mat
 from torchtransient.errors import StorageError
+from torchtransient.files.captures.formats import LAYOUTS
+from torchtransient.files.captures.mat_file import write_mat
 
 FILES = [(layout, f"{layout}-{name}", capture) for layout, name, capture in holdable() if layout != "torchtransient"]
 FILES += [(layout, f"{layout}-{number}", arrays) for number, (layout, arrays) in enumerate(read_only())]

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import array_of
-from torchtransient.data.captures.contents import WHAT
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of
+from torchtransient.files.captures.contents import WHAT
 from torchtransient.quantities import finite, positive, real_array, shown
 from torchtransient.units import seconds_to_opl
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.data.captures.formats import read_capture
 from torchtransient.errors import StorageError
+from torchtransient.files.captures.formats import read_capture
 from torchtransient.units import SPEED_OF_LIGHT
 
 MEASURED = Path(__file__).with_name("measured")

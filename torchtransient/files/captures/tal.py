@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import array_of, replacing
-from torchtransient.data.captures import tal_scene_info
-from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import (
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of, replacing
+from torchtransient.files.captures import tal_scene_info
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import (
     Gaps,
     assumed_in,
     cannot,
@@ -33,9 +34,8 @@ from torchtransient.data.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.data.captures.mat_file import write_parts
-from torchtransient.data.hdf5_writing import hdf5_package, new_hdf5
-from torchtransient.errors import StorageError
+from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
 
 NAME = "tal"
 _STOKES = 4

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of
-from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import (
+from torchtransient.files.array_file import array_of
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
@@ -27,7 +27,7 @@ from torchtransient.data.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.data.captures.mat_file import write_mat
+from torchtransient.files.captures.mat_file import write_mat
 
 NAME = "phasor_field"
 _VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}

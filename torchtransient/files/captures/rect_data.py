@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
-from torchtransient.data.array_file import array_of
-from torchtransient.data.captures.contents import WHAT, Contents
-from torchtransient.data.captures.gaps import (
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     flat_scan,
@@ -29,8 +30,7 @@ from torchtransient.data.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.data.captures.mat_file import write_mat
-from torchtransient.errors import StorageError
+from torchtransient.files.captures.mat_file import write_mat
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"

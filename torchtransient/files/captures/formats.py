@@ -12,14 +12,14 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.files import register_files
-from torchtransient.data import capture_file
-from torchtransient.data.array_file import HDF5, check_folder, damage_said, path_of
-from torchtransient.data.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
-from torchtransient.data.captures.contents import WHAT, Contents, opened
-from torchtransient.data.captures.gaps import Gaps
-from torchtransient.data.hdf5_limits import read_attributes
-from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
+from torchtransient.files import capture_file
+from torchtransient.files.array_file import HDF5, check_folder, damage_said, path_of
+from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
+from torchtransient.files.captures.contents import WHAT, Contents, opened
+from torchtransient.files.captures.gaps import Gaps
+from torchtransient.files.hdf5_limits import read_attributes
+from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 OWN = "torchtransient"
