@@ -67,7 +67,7 @@ def full_disks(folder):
 
 def test_full_disks(tmp_path):
     """A typed error, the old file, nothing beside it, and a process that lives."""
-    code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; from data.test_disks import full_disks; "
+    code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; from files.test_disks import full_disks; "
     code += f"from pathlib import Path; full_disks(Path({str(tmp_path)!r})); print('alive')"
     tests = Path(__file__).parents[1]
     environment = {**os.environ, "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
