@@ -7,6 +7,7 @@ import random
 import signal
 import time
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -45,6 +46,19 @@ def half_written(folder):
             found += [path] * (path.stat().st_size > 0)
         except FileNotFoundError:
             continue
+    return found
+
+
+def written_by(pid):
+    """Shards that a process has begun to write to."""
+    found = []
+    try:
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            place = Path(os.readlink(link))
+            if place.name.startswith(".shard-") and place.stat().st_size > 0:
+                found.append(place)
+    except OSError:
+        pass
     return found
 
 
@@ -105,10 +119,10 @@ def test_ctrl_c(tmp_path, calm, group):
 
 def test_a_supervisor_that_was_stopped_for_a_while(tmp_path, calm):
     """Its workers are not taken for hung ones when it comes back."""
-    child = start(RECIPE, tmp_path, timeout_s=1.0, **ASKED)
+    child = start(RECIPE, tmp_path, timeout_s=2.5, **ASKED)
     wait_until(lambda: list(tmp_path.glob("shard-*.h5")))
     os.killpg(child.pid, signal.SIGSTOP)
-    time.sleep(3)
+    time.sleep(4)
     os.killpg(child.pid, signal.SIGCONT)
     status, out, err = finish(child)
     assert status == 0 and "replaced" not in out, (out, err)
@@ -130,7 +144,7 @@ def test_a_hundred_kills(tmp_path, calm):
     chance = random.Random(7)
     hits: Counter = Counter()
     rounds = 0
-    while hits.total() < 100 or hits["writing"] < 20:
+    while hits["worker"] + hits["supervisor"] < 100 or hits["writing"] < 20:
         folder = tmp_path / f"{rounds}"
         folder.mkdir()
         while not _life(folder, chance, hits):
@@ -157,8 +171,9 @@ def _life(folder, chance, hits):
             if child.poll() is not None:
                 break
             workers = workers_of(child.pid)
-            before = set(half_written(folder))
-            victim = chance.choice([child.pid, *workers, *workers])
+            writers = [pid for pid in workers if written_by(pid)]
+            victim = chance.choice(writers if way == "writing" and writers else [child.pid, *workers, *workers])
+            begun = written_by(victim)
             if kill(victim):
                 place = "supervisor" if victim == child.pid else "worker"
                 hits[place] += 1
@@ -167,7 +182,8 @@ def _life(folder, chance, hits):
                     # They see it at once, and take a moment to leave.
                     wait_until(lambda: not any(map(alive, workers)), 15)  # noqa: B023
                     return False
-                hits["writing"] += bool(before & set(half_written(folder)))
+                wait_until(lambda: not alive(victim), 15)  # noqa: B023
+                hits["writing"] += any(path.exists() for path in begun)
         status, _, err = finish(child, 120)
         assert status == 0, err
         return True

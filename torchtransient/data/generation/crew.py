@@ -126,11 +126,11 @@ class Crew(ABC, Generic[Worker]):
     def _end_hung(self) -> None:
         now = time.monotonic()
         # Where this process was stopped for a while, workers had no ear to talk to.
-        away = now - self._looked - 2 * LOOK_S
+        away = now - self._looked > 4 * LOOK_S
         self._looked = now
         for worker in list(self.workers):
-            if away > 0:
-                worker.heard += away
+            if away:
+                worker.heard = now
             silent = now - worker.heard
             limit = self._limit(worker) if worker.ready else self.patience_to_start()
             if (worker.shard is not None or not worker.ready) and silent > limit:

@@ -121,11 +121,12 @@ class ShardMaker:
                         reason = found
                     else:
                         writer.put(index - indices.start, found)
-                        self._picture(found)
                 if reason is not None:
                     writer.fail(index - indices.start, index, reason)
                     failed += 1
                 told.end(shard, index, reason)
+                if reason is None:
+                    self._picture(found)
             told.closing(shard)
         return len(indices), failed, path.stat().st_size
 
