@@ -17,9 +17,10 @@ import torchtransient as tt
 from support.capture_files import grids, made
 from support.stored_samples import AXIS, cube, folder, header, sample, write
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.storage.tal_export import export_tal, scan_data, scan_of
+from torchtransient.data.storage.tal_export import export_tal
 from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
 from torchtransient.errors import StorageError
+from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.tensor_record import same
 
 
@@ -178,10 +179,10 @@ def test_scans_as_plain_data():
     wall = tt.nlos.Wall.of({"type": "rectangle"})
     for kind in ("single", "confocal", "exhaustive"):
         scan = tt.nlos.Scan.grid(wall, (3, 2), kind=kind)
-        assert scan_of(json.loads(json.dumps(scan_data(scan)))) == scan
+        assert scan_from_data(json.loads(json.dumps(scan_data(scan)))) == scan
     for data in ({"kind": "confocal"}, {"what": 3}, {**scan_data(scan), "kind": "other"}):
         with pytest.raises(StorageError):
-            scan_of(data)
+            scan_from_data(data)
 
 
 def test_what_is_no_capture(data, tmp_path):

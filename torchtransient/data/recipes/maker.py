@@ -25,8 +25,9 @@ from torchtransient.data.recipes.specification import (
 )
 from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
-from torchtransient.data.recipes.written import written_frequencies, written_scan, written_shape
+from torchtransient.data.recipes.written import written_frequencies, written_shape
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.files.scan_data import scan_data
 from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import unknown_key
@@ -335,7 +336,7 @@ class Kept:
         if "shape" in settings.labels:
             found["shapes"] = list(label_names(renderer))
         if self.scan is not None:
-            found["scan"] = written_scan(self.scan)
+            found["scan"] = scan_data(self.scan)
         return found
 
 

@@ -26,15 +26,14 @@ from torchtransient.data.recipes.written import (
     read_frequencies,
     read_gate,
     read_pulse,
-    read_scan,
     written,
     written_axis,
     written_frequencies,
-    written_scan,
     written_shape,
 )
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.files.content_key import contents_of
+from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.quantities import shown
 from torchtransient.render.description import DictDescription, XmlDescription, describe_dict
@@ -61,7 +60,7 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
     settings = recipe.settings
     found: dict[str, Any] = {"format": FORMAT, "scene": _written_scenes(recipe)}
     if recipe.scan is not None:
-        found["scan"] = written_scan(recipe.scan)
+        found["scan"] = scan_data(recipe.scan)
         found |= {"bounces": written(settings.bounces), "energy": written(settings.energy)}
     found |= {
         "vary": {key: written(one) for key, one in recipe.vary.items()},
@@ -188,7 +187,7 @@ def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> tuple[Any, 
     if "hidden" in section:
         return _capture(section, place, arguments)
     if "scan" in section:
-        arguments["scan"] = read_scan(section.get("scan"))
+        arguments["scan"] = scan_from_data(section.get("scan"))
         return _hidden(section.get("scene")), arguments
     if "parameters" in section:
         arguments["parameters"] = section.get("parameters")

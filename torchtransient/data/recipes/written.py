@@ -20,6 +20,7 @@ from torchtransient.data.recipes.distributions import Choice, LogUniform, Normal
 from torchtransient.data.recipes.poses import Compose, LookAt, Offset, Turn
 from torchtransient.errors import SceneError
 from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
@@ -31,7 +32,6 @@ DISTRIBUTIONS: dict[str, type[Distribution]] = {
 _MOST_LISTED = 64
 # Keys of mappings that stand for what JSON does not have.
 _PIXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__scan__", "__distribution__"
-_POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
 
 
 def written(value: Any) -> Any:
@@ -47,7 +47,7 @@ def written(value: Any) -> Any:
     if isinstance(value, Pixels):
         return {_PIXELS: plain(value.values, None, "pixels"), "srgb_gamma": value.srgb_gamma}
     if isinstance(value, Scan):
-        return {_SCAN: written_scan(value)}
+        return {_SCAN: scan_data(value)}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, list | tuple | range):
@@ -68,7 +68,7 @@ def read(value: Any, folder: Any = None) -> Any:
         if _PIXELS in value:
             return Pixels(restored(dict(value[_PIXELS]), {}), bool(value.get("srgb_gamma", False)))
         if set(value) == {_SCAN}:
-            return read_scan(value[_SCAN])
+            return scan_from_data(value[_SCAN])
         if set(value) == {"__numbers__", "dtype", "shape"}:
             return restored(dict(value), {})
         return {name: read(entry, folder) for name, entry in value.items()}
@@ -116,26 +116,6 @@ def _nested(where: str, entry: str, content: Any) -> Any:
     if entry in ("origin", "target") and isinstance(content, Mapping):
         return read_distribution(where, content)
     return read(content)
-
-
-def written_scan(scan: Scan) -> dict[str, Any]:
-    """A scan with all its points, as plain data."""
-    points = {name: getattr(scan, name) for name in _POINTS}
-    return {
-        "kind": scan.kind,
-        "first_and_last_leg": scan.first_and_last_leg,
-        "wall": plain(scan.wall, None, "wall"),
-        **{name: plain(tensor, None, name) for name, tensor in points.items() if tensor is not None},
-    }
-
-
-def read_scan(data: Mapping[str, Any]) -> Scan:
-    """What :func:`written_scan` made."""
-    found = {name: restored(data[name], {}) for name in data}
-    points = {name: torch.from_numpy(np.asarray(found[name])) for name in _POINTS if name in found}
-    return Scan(
-        str(found["kind"]), **points, first_and_last_leg=bool(found["first_and_last_leg"]), wall=found.get("wall")
-    )
 
 
 def written_axis(axis: TimeAxis | None) -> dict[str, Any] | None:

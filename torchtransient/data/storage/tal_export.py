@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import torch
 
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
@@ -16,30 +12,11 @@ from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import damage_said, path_of
 from torchtransient.files.captures import tal
-from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.scan_data import scan_from_data
 from torchtransient.render.progress import with_bar
 
 _WHAT = "TAL export"
 _MEASURED = ("transient", "phasor", "measurement")
-
-
-def scan_data(scan: Scan) -> dict[str, Any]:
-    """A scan as plain data that JSON can hold, for ``about["scan"]`` of a shard's header. Gradients are not kept."""
-    found: dict[str, Any] = plain({f.name: getattr(scan, f.name) for f in fields(scan)}, None, "scan")
-    return found
-
-
-def scan_of(data: Mapping[str, Any]) -> Scan:
-    """The scan that :func:`scan_data` made plain data of. Raises StorageError for other data."""
-    with damage_said(Path("scan"), _WHAT, "the plain data of a scan"):
-        found = restored(dict(data), {})
-        unknown = set(found) - {f.name for f in fields(Scan)}
-        if unknown:
-            raise StorageError(f"{_WHAT}: expected the data of a scan, got {sorted(unknown)} beside it.")
-        entries: dict[str, Any] = {
-            name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value for name, value in found.items()
-        }
-        return Scan(**entries)
 
 
 def export_tal(where: Any, folder: str | Path, *, field: str | None = None, progress: bool = True) -> list[Path]:
@@ -62,7 +39,7 @@ def export_tal(where: Any, folder: str | Path, *, field: str | None = None, prog
     name = have[0] if field is None and have else field
     if name not in have:
         raise StorageError(f"{_WHAT}: expected field as one of {', '.join(have) or 'none'}, got {field!r}.")
-    made_scan = scan_of(scan)
+    made_scan = scan_from_data(scan)
     written = []
     for number in with_bar(range(len(data)), "export", progress):
         sample = data[number]
