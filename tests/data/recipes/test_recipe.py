@@ -14,7 +14,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import PhysicsError, SceneError, ShapeError, TorchTransientError, UnitError
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -215,6 +215,17 @@ def test_captures_around_a_corner():
     same(recipe.sample(2), sample)
     same(again.sample(2), sample)
     assert recipe._maker.about()["scan"]["kind"] == "confocal"
+    over_time = sample.arrays["transient"].sum((0, 2, 3)).cumsum()
+    half = tt.TimeAxis(0, 0.02, int(np.searchsorted(over_time, over_time[-1] / 2)))
+    short = D.Recipe(hidden, vary, scan=scan, variant=VARIANT, time_axis=half, spp=64)
+    share = 1 - short.sample(2).arrays["transient"].sum() / sample.arrays["transient"].sum()
+    assert sum(short.sample(2).outside) == pytest.approx(share, abs=1e-3) and 0.05 < share < 0.95
+    in_the_way = D.Recipe(
+        hidden, {"letter.to_world": D.Offset([0, 0, -0.95], [0, 0, -0.95])}, scan=scan, variant=VARIANT, spp=4,
+        time_axis=tt.TimeAxis(0, 0.02, 200),
+    )  # fmt: skip
+    with pytest.raises(PhysicsError):
+        in_the_way.sample(0)
 
 
 # ------------------------------------------------------------------------------------------------------ what is wrong

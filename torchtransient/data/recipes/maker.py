@@ -33,7 +33,7 @@ from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import unknown_key
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import load
-from torchtransient.render.variant import stokes_components
+from torchtransient.render.variant import active_variant, stokes_components
 from torchtransient.sensing import Compose, Device
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ class Kept:
         self.device_keys = [key for key in recipe.vary if key.split(".")[0] == DEVICE]
         self.scan: Scan | None = None
         try:
-            self.renderer, self._capture = self._make()
+            self.renderer = self._make()
         except TorchTransientError as error:
             raise _named(error, structure) from error
         self._settle_filter()
@@ -178,7 +178,7 @@ class Kept:
 
     # ------------------------------------------------------------------------------------------------------ making
 
-    def _make(self) -> tuple[TransientRenderer, Any]:
+    def _make(self) -> TransientRenderer:
         settings, (given, self.scan) = self.recipe.settings, self.recipe.scenes.build(self.structure)
         common: dict[str, Any] = {
             "time_axis": settings.time_axis, "frequencies": settings.frequencies, "spp": settings.spp,
@@ -190,7 +190,7 @@ class Kept:
             self._check_keys(list(scene.parameters().differentiable()), scene.parameters())
             own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}
             own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
-            return TransientRenderer(scene, parameters=self.keys, **common, **own), None
+            return TransientRenderer(scene, parameters=self.keys, **common, **own)
         # Imported where it is used: captures read files of this room.
         from torchtransient.nlos.renderer import CaptureRenderer
         from torchtransient.nlos.scene import capture_scene
@@ -198,9 +198,13 @@ class Kept:
         bounces, energy = settings.bounces, settings.energy
         table = load(capture_scene(given, self.scan, bounces, energy), variant=self.recipe.variant).parameters()
         self._check_keys(table.differentiable(), table)
-        common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant}
-        capture = CaptureRenderer(given, self.scan, parameters=self.keys, **common)
-        return capture.renderer, capture
+        # What stands in the way of laser or sensor is no capture.
+        common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant, "physics": "error"}
+        renderer = CaptureRenderer(given, self.scan, parameters=self.keys, **common).renderer
+        if settings.physics == "ignore":
+            # Of light outside of the window the share is told.
+            renderer._watch.window_name = ""
+        return renderer
 
     def _check_keys(self, differentiable: list[str], table: Mapping[str, Any]) -> None:
         for key in self.keys:
@@ -277,15 +281,10 @@ class Kept:
     def _render(self, values: Mapping[str, torch.Tensor], seed: int) -> _Measured:
         measures = self.renderer.film.measures
         with torch.no_grad():
-            if self._capture is not None:
-                capture = self._capture(values, seed=seed)
-                tensors = {measures: getattr(capture, measures)}
-                if capture.steady is not None:
-                    tensors["steady"] = capture.steady
-                return _Measured(tensors, (0.0, 0.0))
             out = self.renderer(values, seed=seed)
-        tensors = {measures: out.others[measures] if measures in out.others else getattr(out, measures)}
-        return _Measured({**tensors, "steady": out.steady}, _outside(out))
+        light = out.others[measures] if measures in out.others else getattr(out, measures)
+        tensors = {measures: light, "steady": out.steady}
+        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
 
     def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
         if self.renderer.axis is None or "transient" not in tensors:
@@ -317,6 +316,12 @@ class Kept:
 
     # ------------------------------------------------------------------------------------------------------- about
 
+    def _integrator(self) -> str:
+        with active_variant(self.recipe.variant):
+            built = self.renderer.scene.built(self.renderer._options)
+            depth = getattr(built.scene.integrator(), "max_depth", None)
+        return built.integrator + ("" if depth is None else f", max_depth {'unbounded' if depth > 2**31 else depth}")
+
     def about(self) -> dict[str, Any]:
         """Plain data; nothing in it depends on the structure but what its film says."""
         renderer, settings = self.renderer, self.recipe.settings
@@ -330,9 +335,12 @@ class Kept:
             "spp": renderer.spp or renderer._scene_spp,
             "variant": self.recipe.variant,
             "temporal_filter": renderer.effective_filter,
-            "plan": [film.describe(renderer.effective_filter), f"variant: {self.recipe.variant}"],
+            "plan": [
+                f"film: {film.describe(renderer.effective_filter)}", f"variant: {self.recipe.variant}",
+                f"integrator: {self._integrator()}",
+            ],
             "versions": versions(),
-        }
+        }  # fmt: skip
         if "shape" in settings.labels:
             found["shapes"] = list(label_names(renderer))
         if self.scan is not None:
@@ -372,6 +380,16 @@ def _outside(out: RenderOutput) -> tuple[float, float]:
     steady = out.steady[..., 0, :, :, :] if out.polarized else out.steady
     total = float(steady.sum(dtype=torch.float64)) / channels
     return (before / total, after / total) if total > 0 else (0.0, 0.0)
+
+
+def _of_scan(tensors: Mapping[str, torch.Tensor], scan: Scan) -> dict[str, torch.Tensor]:
+    """Pixels of a film as points of a scan. The steady image of an exhaustive one sums over the laser's places."""
+    from torchtransient.nlos.renderer import in_scan_shape, steady_in_scan_shape
+
+    found = {name: in_scan_shape(tensor, scan) for name, tensor in tensors.items() if name != "steady"}
+    if scan.kind != "exhaustive":
+        found["steady"] = steady_in_scan_shape(tensors["steady"], scan)
+    return found
 
 
 def _named(error: TorchTransientError, structure: Structure) -> TorchTransientError:
