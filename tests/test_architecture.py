@@ -47,7 +47,7 @@ FORBIDDEN = {
     "interfaces": {"torch", *MITSUBA},
     **dict.fromkeys(TORCH_PILLAR, MITSUBA),
 }
-HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich"}
+HEAVY = {"matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin", "zstandard", "webdataset"}
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES = {"file": 400, "function": 160}
 

@@ -50,3 +50,12 @@ def test_recordings_stay_what_they_are(tmp_path):
 def test_threads_and_processes(tmp_path):
     report, _ = run("thread_cost.py", tmp_path)
     assert len(report["cases"]) == 6 and len(report["ratios"]) == 4
+
+
+def test_ways_to_store(tmp_path):
+    report, printed = run("dataset_storage.py", tmp_path)
+    assert list(report["data"]) == ["16 spp", "1024 spp"] and "| exact, gzip |" in printed
+    for data in report["data"].values():
+        rows = {row["way"]: row for row in data["rows"]}
+        assert {"exact", "rounded", "counts", "WebDataset"} < set(rows) and 0 < data["not_zero"] < 1
+        assert rows["counts"]["smaller"] > rows["rounded"]["smaller"] > rows["exact"]["smaller"] > 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import os
 import signal
@@ -160,6 +162,17 @@ def test_parts_of_the_dead_are_swept_and_those_of_the_living_stay(tmp_path):
     finally:
         process.kill()
         process.wait()
+
+
+def test_disks_without_locks(tmp_path, monkeypatch):
+    def flock(descriptor, operation):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    left = tmp_path / ".shard-000001.h5.abc.part"
+    left.write_bytes(b"x")
+    path = write(tmp_path / "a.h5", [sample(0)])
+    assert sweep_parts(tmp_path) == [] and sorted(tmp_path.iterdir()) == [left, path]
 
 
 def test_a_shard_that_is_there_is_replaced_at_the_end(tmp_path):

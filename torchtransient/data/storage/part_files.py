@@ -4,6 +4,7 @@ it, so that what a killed one left can be told from what another one is writing.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -13,6 +14,8 @@ from pathlib import Path
 from torchtransient.errors import StorageError
 
 _SUFFIX = ".part"
+# What file systems without locks answer.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
@@ -49,10 +52,8 @@ def sweep_parts(folder: str | Path) -> list[Path]:
     """Remove what writers that are gone left unfinished in a folder. Returns what was removed.
 
     Files whose writer lives are locked and stay; those of writers on other machines too, where the file system carries
-    locks between machines (NFS from version 4 on does).
+    locks between machines (NFS from version 4 on does). Where it has no locks at all, everything stays.
     """
-    import fcntl
-
     removed = []
     for path in sorted(Path(folder).glob(f".*{_SUFFIX}")):
         try:
@@ -60,30 +61,37 @@ def sweep_parts(folder: str | Path) -> list[Path]:
         except FileNotFoundError:
             continue
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink(missing_ok=True)
-            removed.append(path)
-        except BlockingIOError:
-            pass
+            if _lock(descriptor) == "ours":
+                path.unlink(missing_ok=True)
+                removed.append(path)
         finally:
             os.close(descriptor)
     return removed
 
 
 def _locked(target: Path) -> tuple[Path, int]:
-    import fcntl
-
     while True:
         path = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{_SUFFIX}")
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists():
-                return path, descriptor
-        except BlockingIOError:
-            pass
-        # Somebody swept it before it was locked.
+        # Somebody may sweep it before it is locked. Without locks nobody sweeps.
+        if _lock(descriptor) != "theirs" and path.exists():
+            return path, descriptor
         os.close(descriptor)
+
+
+def _lock(descriptor: int) -> str:
+    """Lock an open file; whose it is then: "ours", "theirs", or "nobody's" where there are no locks."""
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return "theirs"
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            return "nobody's"
+        raise
+    return "ours"
 
 
 def _sync_folder(folder: Path) -> None:
