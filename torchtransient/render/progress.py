@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+_T = TypeVar("_T")
 
 
 class Bar:
@@ -21,3 +24,16 @@ class Bar:
     def close(self) -> None:
         """End it."""
         self._bar.close()
+
+
+def with_bar(things: Sequence[_T], name: str, progress: bool) -> Iterator[_T]:
+    """Things one by one, with a bar where one was asked for."""
+    bar = Bar(name) if progress else None
+    try:
+        for done, thing in enumerate(things):
+            yield thing
+            if bar is not None:
+                bar((done + 1) / len(things))
+    finally:
+        if bar is not None:
+            bar.close()

@@ -124,7 +124,7 @@ def test_ranks_of_torch(data, tmp_path):
 
 def test_noise_of_epochs(data):
     chain = tt.sensing.ShotNoise()
-    stream = TransientStream(data, fields=["values"], transform=chain, noise_seed=1, shuffle=False)
+    stream = TransientStream(data, fields=["values"], transform=chain.sample, noise_seed=1, shuffle=False)
     first = [item["measurement"] for item in stream]
     again = [item["measurement"] for item in stream]
     stream.set_epoch(1)

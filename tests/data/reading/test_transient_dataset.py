@@ -126,9 +126,11 @@ def test_transforms(data):
     assert set(found[2]) == {"depth", "measurement", "index"} == {*found.fields, "index"}
     assert np.array_equal(found[2]["measurement"].numpy(), 2 * cube(2)[:, :64])
     chain = tt.sensing.Compose([tt.sensing.ShotNoise()])
-    noisy = [TransientDataset(data, transform=chain, seed=seed)[4]["measurement"] for seed in (1, 1, 2)]
+    noisy = [TransientDataset(data, transform=chain.sample, seed=seed)[4]["measurement"] for seed in (1, 1, 2)]
+    mean = TransientDataset(data, transform=chain, seed=1)[4]  # under its policy, "expected"
+    assert torch.equal(mean["measurement"], mean["transient"])
     assert torch.equal(noisy[0], noisy[1]) and not torch.equal(noisy[0], noisy[2])
-    one = TransientDataset(data, transform=chain, seed=1)
+    one = TransientDataset(data, transform=chain.set_grad("straight_through"), seed=1)
     assert not torch.equal(one.sample(4, 0)["measurement"], one.sample(4, 1)["measurement"])
     module = torch.nn.Conv3d(1, 1, 1)
     assert not TransientDataset(data, transform=module)[0]["measurement"].requires_grad

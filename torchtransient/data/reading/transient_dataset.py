@@ -36,7 +36,8 @@ class TransientDataset(Dataset[dict[str, Any]]):
     a slice of bins: only the slabs that hold them are read, of the transient, and of a measurement with as many bins.
     ``axis`` is the time axis of what is returned. ``pixels``: slices (rows, columns) of everything that is an image of
     the film's size. ``transform``: a sensor, or any function of the transient, without gradients; its result stands
-    under ``measurement``, in place of one that was stored. ``seed``: each sample has a generator of its own for the
+    under ``measurement``, in place of one that was stored. A sensor answers under its policy, the mean with "expected";
+    ``transform=sensor.sample`` draws in any case. ``seed``: each sample has a generator of its own for the
     transform (its argument ``generator``), so that it has the same noise whoever reads it; None draws from torch's.
     ``as_stored``: counts in the type that they are stored in, not as float32.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
-from torchtransient.render.progress import Bar
+from torchtransient.render.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
 MANIFEST, RECIPE = "manifest.json", "recipe.json"
@@ -96,7 +96,7 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
     expected = _expected(Path(folder))
     faults: dict[str, list[str]] = {}
     entries = []
-    for path in _with_bar(paths, "verify", progress):
+    for path in with_bar(paths, "verify", progress):
         try:
             entry = _Entry.read(path, whole=True)
         except StorageError as error:
@@ -265,15 +265,3 @@ def _text_of(path: Path) -> str | None:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _with_bar(paths: Sequence[Path], name: str, progress: bool) -> Iterator[Path]:
-    bar = Bar(name) if progress else None
-    try:
-        for done, path in enumerate(paths):
-            yield path
-            if bar is not None:
-                bar((done + 1) / len(paths))
-    finally:
-        if bar is not None:
-            bar.close()

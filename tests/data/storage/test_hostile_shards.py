@@ -1,0 +1,209 @@
+"""Shards that are damaged or made to harm give StorageError, in little memory, and read nothing else."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from support.hostile_captures import bytes_changed, structure_changed
+from support.stored_samples import header, sample, write
+from torchtransient.data.storage.chunks import COMPRESSIONS
+from torchtransient.data.storage.manifest import verify
+from torchtransient.data.storage.shard_file import Shard, ShardWriter
+from torchtransient.errors import StorageError
+
+
+def sources(folder):
+    samples = [sample(0, (1, 1100, 8, 8)), ValueError("dark"), sample(2, (1, 1100, 8, 8))]
+    return [write(folder / f"{name}.h5", samples, compression=name) for name in COMPRESSIONS]
+
+
+def read_all(path):
+    """What comes of a file: True for a shard, False for a StorageError. Everything else is raised."""
+    try:
+        with Shard(path) as shard:
+            for row in shard.index.values():
+                shard.values(row)
+                for name in shard.names:
+                    shard.read(name, row)
+                    shard.dtype(name)
+            shard.verify()
+    except StorageError:
+        return False
+    return True
+
+
+def read_mutants(folder, seeds):
+    """How many of the mutants of these seeds are still read, and by how many bytes the process has grown."""
+    folder = Path(folder)
+    found, good = sources(folder), 0
+    read_all(found[0])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for seed in seeds:
+        rng = random.Random(seed)
+        source, target = rng.choice(found), folder / "mutant.h5"
+        (structure_changed if seed % 2 == 0 else bytes_changed)(source, target, rng)
+        good += read_all(target)
+        target.unlink()
+    return good, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+
+
+def test_mutated_files(tmp_path):
+    """In a process of its own, which survives."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        good, grown = pool.apply_async(read_mutants, (str(tmp_path), range(300))).get(timeout=300)
+    assert good < 150 and grown < 100e6
+
+
+def changed(tmp_path, change):
+    path = write(tmp_path / "a.h5", [sample(0), sample(1)])
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+def replaced(name, **settings):
+    def change(file):
+        del file[name]
+        file.create_dataset(name, **settings)
+
+    return change
+
+
+def about_changed(**entries):
+    def change(file):
+        about = {**json.loads(file["about"][:].tobytes()), **entries}
+        del file["about"]
+        file["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+    return change
+
+
+def linked(name, link):
+    def change(file):
+        del file[name]
+        file[name] = link
+
+    return change
+
+
+CHUNKS = {"chunks": (1, 1, 256, 16, 16), "fletcher32": True}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (replaced("arrays/transient", shape=(2, 1, 2**30, 2**10, 64), dtype="f4", chunks=(1, 1, 64, 256, 64)), "store"),
+        (replaced("arrays/transient", shape=(2, 1, 256, 16, 16), dtype="f4", **CHUNKS), "expected 2 chunks"),
+        (replaced("arrays/transient", shape=(2, 1, 256, 16, 16), dtype="f4"), "expected chunks of"),
+        (replaced("arrays/transient", data=np.zeros((2, 1, 256, 16, 16)), **CHUNKS, compression="lzf"), "filters"),
+        (replaced("arrays/transient", data=np.zeros((3, 1, 256, 16, 16)), **CHUNKS), "missing or of another kind"),
+        (replaced("arrays/transient", shape=(2, 4), dtype="u1", external=[("/etc/passwd", 0, 8)]), "in other files"),
+        (linked("arrays/transient", h5py.ExternalLink("/etc/passwd", "/a")), "a link to elsewhere"),
+        (linked("arrays/transient", h5py.SoftLink("/about")), "a link to elsewhere"),
+        (linked("values/count", h5py.ExternalLink("other.h5", "/a")), "a link to elsewhere"),
+        (linked("arrays", h5py.ExternalLink("other.h5", "/a")), "a link to elsewhere"),
+        (replaced("about", shape=(2**40,), dtype="u1", chunks=(2**20,)), "declares"),
+        (replaced("values/count", shape=(2, 2**40), dtype="f4", chunks=(1, 2**20)), "declares"),
+        (replaced("index", data=np.zeros(2)), "missing or of another kind"),
+        (replaced("index", data=np.zeros(2, np.int64)), "doubled or missing"),
+        (replaced("there", data=np.zeros(5, np.uint8)), "rows disagree"),
+        (about_changed(format="other 3"), "of format 'other 3'"),
+        (about_changed(arrays={"transient": {"dtype": "f4"}}), "encoding"),
+        (about_changed(arrays=[]), "damaged"),
+        (about_changed(failed=[[0, 5, "x"]]), "doubled or missing"),
+        (about_changed(failed=3), "not iterable"),
+        (about_changed(texts={"a": ["x"]}), "does not tell"),
+        (about_changed(values=["../../about"]), "expected a row of"),
+        (about_changed(header="x"), "does not tell"),
+    ],
+)
+def test_what_is_not_believed(tmp_path, change, message):
+    path = changed(tmp_path, change)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    def read():
+        with Shard(path) as shard:
+            shard.values(0)
+            shard.read("transient", 0)
+
+    with pytest.raises(StorageError, match=message):
+        read()
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 < 100e6
+    assert not verify(tmp_path).samples  # under a name of no shard
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 100, b"\x89HDF\r\n\x1a\n" + bytes(200)])
+def test_what_is_no_shard(tmp_path, content):
+    path = tmp_path / "shard-000000.h5"
+    path.write_bytes(content)
+    with pytest.raises(StorageError, match="damaged"):
+        Shard(path)
+    assert verify(tmp_path).damaged == (path.name,)
+    with h5py.File(path, "w") as file:
+        file["x"] = 3
+    with pytest.raises(StorageError, match="'about' is missing"):
+        Shard(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(StorageError, match="is a folder"):
+        Shard(path)
+
+
+def test_deep_headers(tmp_path):
+    def change(file):
+        del file["about"]
+        file["about"] = np.frombuffer(b"[" * 100_000, np.uint8)
+
+    with pytest.raises(StorageError, match="damaged"):
+        Shard(changed(tmp_path, change))
+
+
+def full_disks(folder):
+    """Against limits of every size, over a shard that is there. In a process of its own."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    path = write(folder / "a.h5", [sample(0), sample(1)])
+    before, size = path.read_bytes(), path.stat().st_size
+    for limit in (1, 600, 4096, 20_000, size // 2, size - 100, size - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            with pytest.raises(StorageError, match="could not be written"):
+                write(path, [sample(0), sample(1)])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        assert path.read_bytes() == before and list(folder.iterdir()) == [path]
+
+
+def test_full_disks(tmp_path):
+    """A typed error, the old shard, nothing beside it, and a process that lives."""
+    code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; "
+    code += "from data.storage.test_hostile_shards import full_disks; from pathlib import Path; "
+    code += f"full_disks(Path({str(tmp_path)!r})); print('alive')"
+    tests = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, cwd=tests)
+    assert (found.returncode, found.stdout) == (0, "alive\n"), found.stderr
+
+
+@pytest.mark.parametrize(("package", "message"), [("hdf5plugin", "gzip"), ("h5py", "torchtransient")])
+def test_without_packages(tmp_path, monkeypatch, package, message):
+    path = write(tmp_path / "a.h5", [sample(0)])
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(StorageError, match=f"package {package}.*{message}"):
+        ShardWriter(tmp_path / "b.h5", 1, header())
+    with pytest.raises(StorageError, match=f"package {package}"), Shard(path) as shard:
+        shard.read("transient", 0)
+    if package == "hdf5plugin":
+        with Shard(write(path, [sample(0)], compression="gzip")) as shard:
+            assert shard.read("transient", 0).shape == (1, 256, 16, 16)

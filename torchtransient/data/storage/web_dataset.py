@@ -1,0 +1,216 @@
+"""Data sets as WebDataset tars, for clusters that stream them: what was measured as ``.npy.zst``, labels as ``.npy``,
+values as ``.json``. Equal data sets give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.data.array_file import check_source, damage_said, path_of
+from torchtransient.data.hdf5_limits import check_memory
+from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.data.storage.encodings import COUNTED, ROUNDED
+from torchtransient.data.storage.part_files import whole_file, writing_said
+from torchtransient.errors import StorageError
+from torchtransient.quantities import positive
+from torchtransient.render.progress import with_bar
+
+_WHAT = "WebDataset"
+_LEVEL = 3
+_NPY, _PACKED, _JSON = ".npy", ".npy.zst", "sample.json"
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def export_web_dataset(
+    where: Any, folder: str | Path, *, megabytes: float = 256, progress: bool = True, **reading: Any
+) -> list[Path]:
+    """Write the samples of shards as ``samples-000000.tar``, ... of about `megabytes` each; returns their paths.
+
+    ``where`` and ``reading``: as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`, windows
+    and transforms too. ``about.json`` beside them tells what the shards say about the render, and the axis of what was
+    written. Counts keep the type that they are stored in. A tar appears once it is whole; those that are there are
+    replaced. Raises StorageError as the data set does, for a folder that is missing, a full disk, and without the
+    package zstandard.
+    """
+    limit = positive(f"{_WHAT}: megabytes", megabytes) * 1e6
+    place = path_of(folder, _WHAT)
+    if not place.is_dir():
+        raise StorageError(f"{_WHAT}: expected a folder to write to, got '{place}'. Create it first.")
+    compressor = _zstandard().ZstdCompressor(level=_LEVEL)
+    data = TransientDataset(where, **{"as_stored": True, **reading})
+    numbers = iter(with_bar(range(len(data)), "export", progress))
+    _write_about(place / "about.json", data)
+    written: list[Path] = []
+    left = len(data)
+    while left:
+        target = place / f"samples-{len(written):06d}.tar"
+        with (
+            whole_file(target, _WHAT) as unfinished,
+            writing_said(target, _WHAT),
+            tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            while left and tar.offset < limit:
+                _add(tar, data[next(numbers)], compressor)
+                left -= 1
+        written.append(target)
+    next(numbers, None)  # which ends the bar
+    return written
+
+
+def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) -> dict[str, Any]:
+    """A sample from its members by ending, bytes: ``webdataset.WebDataset(tars).map(decode_web_sample)``.
+
+    The sample is that of a TransientDataset; counts are float32, unless ``as_stored``. Members that begin with "__" are
+    left out. Raises StorageError for members that are damaged or of other kinds.
+    """
+    found: dict[str, Any] = {}
+    with damage_said(Path(str(members.get("__key__", "sample"))), _WHAT, "a sample of a data set of torchtransient"):
+        for ending in sorted(members):
+            if ending.startswith("__"):
+                continue
+            if ending == _JSON:
+                found |= _values(members[ending])
+                continue
+            suffix = next((one for one in (_PACKED, _NPY) if ending.endswith(one)), None)
+            if suffix is None:
+                raise StorageError(f"{_WHAT}: expected members that end in {_NPY}, {_PACKED} or {_JSON}, got {ending}.")
+            name = ending.removesuffix(suffix)
+            array = _array(_unpacked(members[ending]) if suffix == _PACKED else members[ending], name)
+            counts = name == COUNTED and array.dtype.kind == "u" and not as_stored
+            found[name] = torch.from_numpy(array.astype(np.float32) if counts else array)
+    return found
+
+
+def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[dict[str, Any]]:
+    """The samples of a tar one by one, without the package webdataset. Raises StorageError for damaged files."""
+    source = check_source(path, _WHAT)
+    with damage_said(source, _WHAT, "a WebDataset of torchtransient"), _tar_said(source), tarfile.open(source) as tar:
+        members: dict[str, Any] = {}
+        for member in tar:
+            key, _, ending = member.name.partition(".")
+            if not member.isfile():
+                raise StorageError(f"{_WHAT}: '{source}' holds '{member.name}', which is no plain file.")
+            if members and members["__key__"] != key:
+                yield decode_web_sample(members, as_stored=as_stored)
+                members = {}
+            check_memory(member.size, f"{_WHAT}: '{member.name}'")
+            opened = tar.extractfile(member)
+            assert opened is not None  # it is a file
+            members |= {"__key__": key, ending: opened.read()}
+        if members:
+            yield decode_web_sample(members, as_stored=as_stored)
+
+
+# ------------------------------------------------------------------------------------------------------------- members
+
+
+def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any) -> None:
+    key = f"{sample['index']:08d}"
+    values = {name: v if isinstance(v, str) else np.asarray(v) for name, v in sample.get("values", {}).items()}
+    plain = {
+        "index": sample["index"],
+        "values": {name: v if isinstance(v, str) else v.tolist() for name, v in values.items()},
+        "dtypes": {name: str(v.dtype) for name, v in values.items() if not isinstance(v, str)},
+    }
+    _member(tar, f"{key}.{_JSON}", json.dumps(plain, sort_keys=True).encode())
+    for name in sorted(sample):
+        if name in ("index", "values"):
+            continue
+        if not isinstance(sample[name], torch.Tensor) or "." in name:
+            raise StorageError(f"{_WHAT}: expected '{name}' as a tensor, under a name without points.")
+        buffer = io.BytesIO()
+        np.lib.format.write_array(buffer, np.ascontiguousarray(sample[name].numpy()), version=(1, 0))
+        packed = name in ROUNDED
+        content = compressor.compress(buffer.getbuffer()) if packed else buffer.getvalue()
+        _member(tar, f"{key}.{name}{_PACKED if packed else _NPY}", content)
+
+
+def _member(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    """A member without an owner or a time."""
+    entry = tarfile.TarInfo(name)
+    entry.size = len(content)
+    tar.addfile(entry, io.BytesIO(content))
+
+
+def _write_about(target: Path, data: TransientDataset) -> None:
+    axis = data.axis
+    about = {"about": data.about, "fields": list(data.fields)}
+    if axis is not None:
+        about["axis"] = {"start_opl": axis.start_opl, "bin_width_opl": axis.bin_width_opl, "num_bins": axis.num_bins}
+    with whole_file(target, _WHAT) as unfinished, writing_said(target, _WHAT):
+        unfinished.write_text(json.dumps(about, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _values(content: bytes) -> dict[str, Any]:
+    plain = json.loads(content)
+    dtypes = plain["dtypes"]
+    values = {
+        name: value if name not in dtypes else torch.from_numpy(np.array(value, _number_type(dtypes[name])))
+        for name, value in plain["values"].items()
+    }
+    return {"index": int(plain["index"]), **({"values": values} if values else {})}
+
+
+def _number_type(name: str) -> np.dtype[Any]:
+    dtype = np.dtype(name)
+    if dtype.kind not in "biufc":
+        raise ValueError(f"expected a type of numbers, got {name}")
+    return dtype
+
+
+def _unpacked(content: bytes) -> bytes:
+    zstandard = _zstandard()
+    try:
+        size = zstandard.get_frame_parameters(content).content_size
+        if size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR):
+            raise ValueError("its size is not known")
+        check_memory(size, _WHAT)
+        found: bytes = zstandard.ZstdDecompressor().decompress(content, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from error
+    return found
+
+
+def _array(content: bytes, name: str) -> NDArray[Any]:
+    """An array of a `.npy`, in memory that may be written to, which no header makes larger than its bytes."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"'{name}' is an array of version {version}")
+    shape, fortran, dtype = _HEADERS[version](stream)
+    if dtype.kind not in "biufc" or fortran:
+        raise ValueError(f"'{name}' is an array of {dtype}")
+    return np.frombuffer(bytearray(memoryview(content)[stream.tell() :]), dtype).reshape(shape)
+
+
+class _tar_said:  # noqa: N801
+    """Errors of tar files as ValueError, which readers tell as damage."""
+
+    def __init__(self, source: Path) -> None:
+        self.source = source
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if isinstance(error, tarfile.TarError):
+            raise ValueError(str(error)) from error
+
+
+def _zstandard() -> Any:
+    try:
+        import zstandard
+    except ImportError as error:
+        raise StorageError(
+            f"{_WHAT}: needs the package zstandard. Install it with pip install 'torchtransient[webdataset]'."
+        ) from error
+    return zstandard
