@@ -25,7 +25,7 @@ LEVEL = {
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
-    "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
+    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip
@@ -149,10 +149,10 @@ def is_below(other, room):
     if LEVEL[other] != LEVEL[room]:
         return LEVEL[other] < LEVEL[room]
     # Within a level: `accuracy` quotes the statistics of `testing`, and everything may know errors and units;
-    # likelihoods are those of the sensors; captures are records with axes; simulated ones have files.
+    # likelihoods are those of the sensors; captures are records with axes; simulated ones have files, data sets both.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "data"),
+        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 
@@ -252,7 +252,7 @@ def test_every_package_has_a_level():
         ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
         ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
         ("render", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("data", "from torchtransient.nlos import scene", "imports 'nlos'"),
+        ("files", "from torchtransient.nlos import scene", "imports 'nlos'"),
         ("toolbox", "import os", "has no level"),
     ],
 )

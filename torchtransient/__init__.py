@@ -24,6 +24,7 @@ _LAZY = {
     "TimeAxis": "torchtransient.axes",
     "TransientRenderer": "torchtransient.render.renderer",
     "cost_of_accuracy": "torchtransient.accuracy.cost",
+    "data": "torchtransient.data",
     "Plan": "torchtransient.render.plan",
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",

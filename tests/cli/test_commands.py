@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from torchtransient.cli.main import COMMANDS, main
-from torchtransient.data.result_file import read_result
+from torchtransient.files.result_file import read_result
 
 VARIANT = "llvm_ad_rgb"  # what the commands take when none is active, as in a process of their own
 SCENE = """<scene version="3.0.0">

@@ -9,7 +9,7 @@ from PIL import Image
 
 import torchtransient as tt
 from torchtransient.cli.main import main
-from torchtransient.data.result_file import write_result
+from torchtransient.files.result_file import write_result
 
 VARIANT = "llvm_ad_rgb"  # what the commands take when none is active, as in a process of their own
 SCENE = """<scene version="3.0.0">

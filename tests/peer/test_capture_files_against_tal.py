@@ -12,7 +12,7 @@ import torch
 
 from support.capture_files import holdable
 from torchtransient.axes import FrequencyAxis
-from torchtransient.data.captures.formats import LAYOUTS, read_capture
+from torchtransient.files.captures.formats import LAYOUTS, read_capture
 
 pytestmark = pytest.mark.peer
 

@@ -10,8 +10,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import GradientError, SceneError
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins.sampling.light_box import LightBox
 from torchtransient.testing.film_storage import storage
 from torchtransient.testing.small_room import GREY, WALL_POSE, make_room

@@ -9,8 +9,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import SceneError
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins.films.response import SensorResponse
 from torchtransient.testing.statistics import two_sample_z_test, z_test
 

@@ -11,7 +11,7 @@ from torch.utils import _pytree
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 import torchtransient as tt
-from torchtransient.data.result_file import read_result, write_result
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 
 

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.data import hdf5_writing
 from torchtransient.errors import SceneError
-
+from torchtransient.files import hdf5_writing
 
 TROUBLES = ("raising", "hanging", "crashing", "dying")
 

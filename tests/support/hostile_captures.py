@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 
 from support.capture_files import holdable, read_only
-from torchtransient.data.captures.formats import LAYOUTS
-from torchtransient.data.captures.mat_file import write_mat
+from torchtransient.files.captures.formats import LAYOUTS
+from torchtransient.files.captures.mat_file import write_mat
 
 ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(

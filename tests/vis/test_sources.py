@@ -11,8 +11,8 @@ import torch
 
 import torchtransient as tt
 from support.cubes import AXIS, sweep
-from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import ShapeError, StorageError
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.vis.sources import phasor_of, steady_of, stokes_of, transient_of
 
 

@@ -39,7 +39,7 @@ class Counts(click.ParamType):
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def command(scene: Path, **options: Any) -> None:
     """Measure the error of SCENE's transient, and of derivatives, against seconds and samples; print a table."""
-    from torchtransient.data.result_file import check_folder
+    from torchtransient.files.result_file import check_folder
     from torchtransient.vis.overview import check_picture
 
     film = from_options(options)

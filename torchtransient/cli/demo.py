@@ -73,8 +73,8 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     import torch
 
     import torchtransient as tt
-    from torchtransient.data.result_file import write_result
     from torchtransient.errors import StorageError
+    from torchtransient.files.result_file import write_result
     from torchtransient.vis.fit_progress import plot_fit
     from torchtransient.vis.overview import plot_overview
 

@@ -53,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
     import torch
 
     import torchtransient as tt
-    from torchtransient.data.capture_file import check_capture_target
+    from torchtransient.files.capture_file import check_capture_target
     from torchtransient.nlos.arguments import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.

@@ -39,7 +39,7 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
 
 def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
-    from torchtransient.data.result_file import read_result
+    from torchtransient.files.result_file import read_result
     from torchtransient.render.films.choices import of_output
 
     def overview() -> None:

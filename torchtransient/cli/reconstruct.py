@@ -121,7 +121,7 @@ def command(capture: Path, **options: Any) -> None:
 
 def _run(capture: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
-    from torchtransient.data.volume_file import check_volume_target
+    from torchtransient.files.volume_file import check_volume_target
 
     told = {name: options[name] for name in _OPEN if options[name] is not None}
     measured = tt.nlos.read_capture(capture, options["layout"], **{**told, **_wall_size(told)})

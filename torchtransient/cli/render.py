@@ -32,9 +32,9 @@ def command(scene: Path, **options: Any) -> None:
     The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
     polarized variant, the time axis in metres of optical path, and how it was made. With --frequencies or --gates, or
     for a scene with such a film, phasor (C, F, H, W) or gated (C, G, H, W) stands in place of the transient.
-    torchtransient.data.result_file.read_result reads it.
+    torchtransient.files.result_file.read_result reads it.
     """
-    from torchtransient.data.result_file import check_target, write_result
+    from torchtransient.files.result_file import check_target, write_result
 
     assignments(options["params"], "--param")
     film = from_options(options)

@@ -44,10 +44,10 @@ docs/nlos.md.
 from torchtransient.capture import Capture as Capture
 from torchtransient.capture import Scan as Scan
 from torchtransient.capture import Wall as Wall
-from torchtransient.data.captures.formats import read_capture as read_capture
-from torchtransient.data.captures.formats import write_capture as write_capture
-from torchtransient.data.volume_file import read_volume as read_volume
-from torchtransient.data.volume_file import write_volume as write_volume
+from torchtransient.files.captures.formats import read_capture as read_capture
+from torchtransient.files.captures.formats import write_capture as write_capture
+from torchtransient.files.volume_file import read_volume as read_volume
+from torchtransient.files.volume_file import write_volume as write_volume
 from torchtransient.nlos.methods import choose_method as choose_method
 from torchtransient.nlos.preparation import sum_bins as sum_bins
 from torchtransient.nlos.preparation import without_slab as without_slab

@@ -25,8 +25,8 @@ from typing import Any
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import KINDS
-from torchtransient.data.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos import defaults
 from torchtransient.nlos.described_shapes import albedo_of, described_shapes
 from torchtransient.nlos.mesh_file import mesh_of_npz

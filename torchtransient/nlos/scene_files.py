@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchtransient.data.content_key import contents_of
 from torchtransient.errors import SceneError
+from torchtransient.files.content_key import contents_of
 from torchtransient.render.scene_handle import Scene
 from torchtransient.render.variant import active_variant
 

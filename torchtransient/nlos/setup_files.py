@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.data.array_file import path_of
-from torchtransient.data.yaml_files import read_yaml
 from torchtransient.errors import SceneError
+from torchtransient.files.array_file import path_of
+from torchtransient.files.yaml_files import read_yaml
 from torchtransient.nlos.description import read_description
 from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml

@@ -22,8 +22,8 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import path_of
 from torchtransient.errors import SceneError
+from torchtransient.files.array_file import path_of
 from torchtransient.nlos import defaults
 from torchtransient.nlos.answers import checked_module, measured, say_black
 from torchtransient.nlos.arguments import check_is_scan, check_sensor, checked_count, checked_samples, checked_seed

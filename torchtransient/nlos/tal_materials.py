@@ -6,8 +6,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from typing import Any
 
-from torchtransient.data.yaml_files import Section, as_number
 from torchtransient.errors import SceneError
+from torchtransient.files.yaml_files import Section, as_number
 
 _VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum")
 _PLUGINS = ("bsdf", "texture")

@@ -12,8 +12,8 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import KINDS
-from torchtransient.data.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.errors import SceneError
+from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 from torchtransient.nlos.tal_materials import material, spectrum
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.transform_bins import transform_bins

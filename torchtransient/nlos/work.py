@@ -12,7 +12,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.content_key import content_key
+from torchtransient.files.content_key import content_key
 from torchtransient.nlos.renderer import POINTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
 from torchtransient.nlos.scene_files import files_of

@@ -15,13 +15,16 @@ from torchtransient.errors import ShapeError
 from torchtransient.vis.files import figure_type, save_figure
 
 # Sizes of one sample's pictures on paper, inches.
-_PICTURE, _CURVE, _TITLE = 1.35, 0.45, 0.3
+_PICTURE, _CURVE, _TITLE = 1.35, 0.45, 0.2
+# Letters of a title that fit above a picture.
+_LETTERS = 30
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One sample. ``title``: a line or two. ``images``: by name, (H, W, 3) in [0, 1] as they are shown, or (H, W) of
-    numbers, which share one scale in a sheet. ``curve``: light over the bins, (T,), or None.
+    """One sample. ``title``: a line, cut off where it would run into the next one. ``images``: by name, (H, W, 3) in
+    [0, 1] as they are shown, or (H, W) of numbers, which share one scale in a sheet. ``curve``: light over the bins,
+    (T,), or None.
     """
 
     title: str
@@ -45,10 +48,10 @@ def contact_sheet(
         raise ShapeError("contact_sheet: expected at least one sample, got none.")
     names = list(cells[0].images)
     curves = any(cell.curve is not None for cell in cells)
-    across = columns or max(1, min(len(cells), round(math.sqrt(len(cells) * 1.6 / max(1, len(names))))))
+    across = columns or max(1, min(len(cells), round(math.sqrt(len(cells) / max(1, len(names))))))
     down = -(-len(cells) // across)
     width, height = across * (len(names) * _PICTURE + 0.15), down * (_PICTURE + _TITLE + (_CURVE if curves else 0.0))
-    top = 0.35 if title else 0.05
+    top = 0.2 if title else 0.0
     figure = figure_type()(figsize=(width, height + top + 0.3), layout=None)
     scales = {name: _scale([cell.images[name] for cell in cells]) for name in names}
     for number, cell in enumerate(cells):
@@ -64,16 +67,21 @@ def contact_sheet(
             if number < across and len(names) > 1:
                 axes.text(0.03, 0.03, name, transform=axes.transAxes, fontsize=6, color="white", va="bottom")
             if place == 0:
-                axes.set_title(cell.title, fontsize=6, loc="left", pad=2)
+                axes.set_title(_cut(cell.title, len(names)), fontsize=6, loc="left", pad=2)
         if cell.curve is not None:
             box = (left, low + 0.06, len(names) * _PICTURE - 0.05, _CURVE - 0.12)
             _draw_curve(figure.add_axes(_share(box, figure)), cell.curve, times)
     if times is not None and curves:
-        words = f"light over time: {times[0]:.3g} m to {times[-1]:.3g} m of optical path"
+        words = f"square root of the light over time, {times[0]:.3g} m to {times[-1]:.3g} m of optical path"
         figure.text(0.01, 0.03 / (height + top), words, fontsize=6, va="bottom")
     if title:
-        figure.text(0.01, 1 - 0.05 / (height + top), title, fontsize=8, va="top")
+        figure.text(0.01, 1 - 0.05 / (height + top + 0.3), title, fontsize=7, va="top")
     return save_figure(figure, path, "contact_sheet", dpi=160)
+
+
+def _cut(title: str, pictures: int) -> str:
+    most = _LETTERS * pictures
+    return title if len(title) <= most else title[: most - 3] + "..."
 
 
 def _share(box: tuple[float, float, float, float], figure: Any) -> tuple[float, float, float, float]:
@@ -92,7 +100,8 @@ def _scale(images: Sequence[NDArray[Any]]) -> dict[str, Any]:
 
 def _draw_curve(axes: Any, curve: NDArray[Any], times: NDArray[Any] | None) -> None:
     edges = np.arange(len(curve) + 1.0) if times is None else np.asarray(times)
-    axes.fill_between(edges[:-1], 0, np.abs(curve), step="post", color="#444444", linewidth=0)
+    # The square root: what comes after the first reflection is weak.
+    axes.fill_between(edges[:-1], 0, np.sqrt(np.abs(curve)), step="post", color="#444444", linewidth=0)
     axes.set_xlim(edges[0], edges[-1])
     axes.set_ylim(bottom=0)
     axes.set_xticks([])

@@ -17,8 +17,8 @@ from click.testing import CliRunner
 import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.cli.options import scene_options
-from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import SceneError
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.plugins import _registry
 from torchtransient.render.films import choices
 from torchtransient.render.films.choice import CommandOption, FilmChoice, measured

@@ -14,8 +14,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.data.result_file import read_result, write_result
 from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError
+from torchtransient.files.result_file import read_result, write_result
 from torchtransient.render import films
 from torchtransient.render.films import choices
 from torchtransient.render.films.gates import Gates

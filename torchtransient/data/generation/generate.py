@@ -290,9 +290,9 @@ def _check_whole(value: Any, name: str, least: int) -> None:
 
 
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
-    from torchtransient.data.hdf5_writing import hdf5_package
     from torchtransient.data.storage.chunks import check_compression
     from torchtransient.data.storage.encodings import check_store
+    from torchtransient.files.hdf5_writing import hdf5_package
 
     hdf5_package(_WHAT)
     check_store(store, _WHAT)
@@ -311,7 +311,7 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
 
 
 def _folder(folder: Any) -> Path:
-    from torchtransient.data.array_file import path_of
+    from torchtransient.files.array_file import path_of
 
     place = path_of(folder, _WHAT).absolute()
     try:

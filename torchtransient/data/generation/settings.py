@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.data.generation.plan import Plan
+from torchtransient.data.recipes.places import without_places
 from torchtransient.errors import StorageError
 
 RECIPE_FILE = "recipe.json"
@@ -35,8 +36,12 @@ class Settings:
 
 
 def shard_header(settings: Settings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
-    """The header of a shard file: the data set's description with the number of the shard."""
-    return {**described, "shard": shard, "samples": list(_ends(Plan(settings.n, described["per_shard"]), shard))}
+    """The header of a shard file: the data set's description with the number of the shard, and without the places that
+    files of its recipe had on the machine that began it.
+    """
+    recipe = without_places(described["recipe"])
+    samples = list(_ends(Plan(settings.n, described["per_shard"]), shard))
+    return {**described, "recipe": recipe, "shard": shard, "samples": samples}
 
 
 def _ends(plan: Plan, shard: int) -> tuple[int, int]:

@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchtransient.axes import TimeAxis
-from torchtransient.data.array_file import tensor_in
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import tensor_in
 from torchtransient.quantities import shown
 
 _MEASURED = "measurement"

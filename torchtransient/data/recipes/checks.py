@@ -10,10 +10,10 @@ import numpy as np
 from torchtransient.data.recipes.distribution import POSE
 from torchtransient.data.recipes.maker import Kept, Maker, changed
 from torchtransient.data.recipes.reach import check_reach
-from torchtransient.data.recipes.recipe import Recipe
+from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Extreme
 from torchtransient.data.recipes.structures import Structure
-from torchtransient.errors import SceneError, TorchTransientError, UnitError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.render.physics import is_singular, outside_message, singular_message
 from torchtransient.render.variant import active_variant
 
@@ -21,10 +21,18 @@ from torchtransient.render.variant import active_variant
 SAMPLES, STRUCTURES = 64, 8
 
 
-def check_recipe(recipe: Recipe, maker: Maker) -> None:
+def check_recipe(recipe: Specification, maker: Maker) -> None:
     """Raise SceneError, ShapeError, UnitError, or another error of this library, for what is wrong."""
+    sizes: dict[str, tuple[int, ...]] = {}
     for structure, indices in structures_of(recipe, range(SAMPLES)):
         kept = maker.kept(structure)
+        sizes[structure.text] = kept.size
+        if len(set(sizes.values())) > 1:
+            words = ", ".join(f"{size} for '{text}'" for text, size in sizes.items())
+            raise ShapeError(
+                f"recipe: expected films of one size and one number of channels in all scenes, got {words}. "
+                "time_axis= makes bins of one size."
+            )
         draws = list(_draws(recipe, kept, indices))
         _check_device(recipe, kept, [drawn for _, drawn in draws])
         with active_variant(recipe.variant):
@@ -36,7 +44,7 @@ def check_recipe(recipe: Recipe, maker: Maker) -> None:
             check_reach(built, kept, draws)
 
 
-def structures_of(recipe: Recipe, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:
+def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:
     """The structures of some samples, in the order in which they come, and which samples are theirs; at most
     ``STRUCTURES`` of them.
     """
@@ -48,7 +56,7 @@ def structures_of(recipe: Recipe, indices: Iterable[int]) -> list[tuple[Structur
     return list(found.values())
 
 
-def _draws(recipe: Recipe, kept: Kept, indices: Iterable[int]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _draws(recipe: Specification, kept: Kept, indices: Iterable[int]) -> Iterator[tuple[str, dict[str, Any]]]:
     """What can come: the ends of every distribution, and the first samples."""
     for words, upper in (("lower", False), ("upper", True)):
         yield f"at the {words} end", kept.drawn(dict.fromkeys(recipe.vary, Extreme(upper)))
@@ -73,7 +81,7 @@ def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) 
             raise UnitError(f"recipe: vary: {where}: {singular_message(key)}")
 
 
-def _check_device(recipe: Recipe, kept: Kept, draws: Iterable[Mapping[str, Any]]) -> None:
+def _check_device(recipe: Specification, kept: Kept, draws: Iterable[Mapping[str, Any]]) -> None:
     if recipe.device is None:
         return
     if kept.renderer.axis is None:

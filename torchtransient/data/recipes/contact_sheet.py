@@ -11,25 +11,29 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.axes import TimeAxis
+from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.sample import Sample
+from torchtransient.data.recipes.specification import Specification
 from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
 from torchtransient.vis.tone_mapping import tone_map
 
 # Drawn values that a title has room for, and letters of each.
-_MOST_VALUES, _MOST_LETTERS = 2, 26
+_MOST_VALUES, _MOST_LETTERS = 3, 24
 _MEASURED = ("transient", "phasor", "gated")
 
 
-def contact_sheet(recipe: Any, indices: Iterable[int], path: str | Path | None, progress: bool = False) -> Any:
+def contact_sheet(
+    recipe: Specification, maker: Maker, indices: Iterable[int], path: str | Path | None, progress: bool = False
+) -> Any:
     """Render some samples of a recipe and draw them; see :meth:`Recipe.preview`."""
     wanted = list(indices)
     if progress:
         from tqdm.auto import tqdm
 
         wanted = tqdm(wanted, desc="preview", unit="sample")
-    samples = [recipe.sample(index) for index in wanted]
-    return sheet_of(samples, path, recipe._maker.about().get("axis"), repr(recipe))
+    samples = [maker.sample(index) for index in wanted]
+    return sheet_of(samples, path, maker.about().get("axis"), repr(recipe))
 
 
 def sheet_of(
@@ -42,7 +46,7 @@ def sheet_of(
 
 def cell_of(sample: Sample) -> Cell:
     """A sample as a picture and a curve."""
-    words = [f"{key.split('.reflectance')[0]}: {_short(value)}" for key, value in sample.values.items() if _fits(value)]
+    words = [f"{_name(key)} {_short(value)}" for key, value in sample.values.items() if _fits(value)]
     names = ", ".join(words[:_MOST_VALUES])
     images = {"light": _picture(sample.arrays)}
     images |= {name: image for name, array in sample.arrays.items() if (image := _label(name, array)) is not None}
@@ -53,8 +57,14 @@ def _fits(value: Any) -> bool:
     return isinstance(value, str) or np.size(value) <= 3
 
 
+def _name(key: str) -> str:
+    """The first part of a key, and its last one where it says something."""
+    parts = [part for part in key.split(".") if part not in ("value", "data", "reflectance", "bsdf", "emitter")]
+    return ".".join(dict.fromkeys((parts or [key])[:1] + (parts or [key])[-1:]))
+
+
 def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else ", ".join(f"{number:.3g}" for number in np.ravel(value))
+    text = value if isinstance(value, str) else ", ".join(f"{number:.2g}" for number in np.ravel(value))
     return text if len(text) <= _MOST_LETTERS else f"...{text[3 - _MOST_LETTERS :]}"
 
 
@@ -82,10 +92,14 @@ def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
     if name in (*_MEASURED, "steady", "measurement"):
         return None
     if name == "normals":
-        return np.clip((np.moveaxis(_last(array, 3), 0, -1) + 1) / 2, 0, 1)
+        directions: NDArray[Any] = np.clip((np.moveaxis(_last(array, 3), 0, -1) + 1) / 2, 0, 1)
+        return directions
     if name == "albedo":
         colour = np.moveaxis(_last(array, 3), 0, -1)
-        return np.clip(np.broadcast_to(colour, (*colour.shape[:2], 3)) if colour.shape[-1] == 1 else colour, 0, 1)
+        if colour.shape[-1] != 3:
+            colour = np.repeat(colour.mean(-1, keepdims=True), 3, axis=-1)
+        shown: NDArray[Any] = np.clip(colour, 0, 1)
+        return shown
     if array.ndim < 2 or name in ("position", "uv"):
         return None
     numbers: NDArray[Any] = _last(array, 2)
@@ -94,4 +108,7 @@ def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
 
 def _curve(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
     name = next((name for name in ("transient", "measurement") if name in arrays and arrays[name].ndim >= 4), None)
-    return None if name is None else np.asarray(_last(arrays[name], 4).sum((0, 2, 3), dtype=np.float64))
+    if name is None:
+        return None
+    curve: NDArray[Any] = _last(arrays[name], 4).sum((0, 2, 3), dtype=np.float64)
+    return curve

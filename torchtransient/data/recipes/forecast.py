@@ -18,7 +18,7 @@ from torchtransient.quantities import count
 
 if TYPE_CHECKING:
     from torchtransient.data.recipes.maker import Maker
-    from torchtransient.data.recipes.recipe import Recipe
+    from torchtransient.data.recipes.specification import Specification
 
 # Structures that are measured, and calls of each before a time counts: the second one is recorded, the third launched.
 _MEASURED, _WARM = 4, 3
@@ -77,7 +77,7 @@ class Cost:
         yield f"light outside     {self.outside[0]:.2%} on average, {self.outside[1]:.2%} at most"
         yield f"standard error    {self.standard_error:.1%} of a sample's numbers (root mean square)"
         if self.n is not None:
-            sizes = [self.n * (size or self.sample_bytes) for size in self.stored_bytes.values()]
+            sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]
             hours = self.n * self.sample_s / 3600
             yield f"{self.n} samples    {hours:.2f} hours of one worker, {_bytes(min(sizes))} to {_bytes(max(sizes))}"
 
@@ -91,7 +91,7 @@ def _bytes(size: float) -> str:
     return f"{size:.3g} TB"
 
 
-def forecast(recipe: Recipe, maker: Maker, samples: int, progress: bool) -> Cost:
+def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) -> Cost:
     """See :meth:`Recipe.cost`."""
     wanted = count("cost: samples", samples)
     found = structures_of(recipe, range(SAMPLES))

@@ -13,16 +13,26 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
-from torchtransient.data.recipes.recipe import DEVICE, NOISE, RENDER, SECOND, Recipe, label_of, samples_of
 from torchtransient.data.recipes.sample import Sample
+from torchtransient.data.recipes.specification import (
+    DEVICE,
+    NOISE,
+    RENDER,
+    SECOND,
+    Specification,
+    label_of,
+    samples_of,
+)
 from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_scan, written_shape
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import unknown_key
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import load
+from torchtransient.render.variant import stokes_components
 from torchtransient.sensing import Compose, Device
 
 if TYPE_CHECKING:
@@ -40,7 +50,7 @@ class Maker:
     before, on one kind of processor with one thread (``tt.threads(1)``).
     """
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Specification) -> None:
         self.recipe = recipe
         self._kept: OrderedDict[str, Kept] = OrderedDict()
         self._shapes: dict[str, tuple[Any, ...]] | None = None
@@ -83,7 +93,8 @@ class Maker:
 
     def standard_error(self, index: int) -> float:
         """Relative standard error of a sample: root mean square over the cube of the error of a number, by the root
-        mean square of the numbers. Of two renders, the sample's and one more. NaN for a black sample.
+        mean square of the numbers as they are rendered, so that 1 is noise alone. Of two renders, the sample's and one
+        more; 0 for a black sample.
         """
         (index,) = samples_of([index])
         kept = self.kept(self.recipe.structure(index))
@@ -91,10 +102,9 @@ class Maker:
         one, other = (
             kept.light(varied, Stream(self.recipe.seed, index, purpose).seed()) for purpose in (RENDER, SECOND)
         )
-        power = float(np.mean(np.abs(np.asarray((one + other) / 2, np.complex128)) ** 2))
-        noise = float(np.mean(np.abs(np.asarray(one - other, np.complex128)) ** 2)) / 2
-        # Half of the noise's power is in their mean too.
-        return float(np.sqrt(noise / max(power - noise / 2, np.finfo(float).tiny))) if power > 0 else float("nan")
+        noise, power, second = (float(np.mean(np.abs(x).astype(np.float64) ** 2)) for x in (one - other, one, other))
+        # The difference has twice the variance of one render.
+        return float(np.sqrt(noise / (power + second))) if power + second > 0 else 0.0
 
     def about(self) -> dict[str, Any]:
         """How samples are made, plain data: the same for all structures of a recipe."""
@@ -151,8 +161,9 @@ class Kept:
     not have.
     """
 
-    def __init__(self, recipe: Recipe, structure: Structure) -> None:
+    def __init__(self, recipe: Specification, structure: Structure) -> None:
         self.recipe, self.structure = recipe, structure
+        _check_labels(recipe.settings.labels)
         self.keys = [key for key in recipe.vary if key not in recipe.exchanged and key.split(".")[0] != DEVICE]
         self.device_keys = [key for key in recipe.vary if key.split(".")[0] == DEVICE]
         self.scan: Scan | None = None
@@ -218,6 +229,11 @@ class Kept:
             found[key] = Place(key, POSE if is_pose else NUMBERS, described.shape, described)
         return found
 
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Of what the film measures: rows, columns, bins, channels."""
+        return (*self.renderer._cube_shape, len(self.renderer._channels))
+
     # ----------------------------------------------------------------------------------------------------- samples
 
     def draw(self, index: int) -> dict[str, Any]:
@@ -242,8 +258,6 @@ class Kept:
         tensors = dict(found.tensors)
         labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
         if labels:
-            from torchtransient.render.labels import scene_labels
-
             tensors |= scene_labels(self.renderer, values, labels)
         if FIRST_RETURN in self.recipe.settings.labels:
             tensors[FIRST_RETURN] = self._first_return(tensors)
@@ -275,10 +289,8 @@ class Kept:
     def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
         if self.renderer.axis is None or "transient" not in tensors:
             raise SceneError(f"recipe: labels: {FIRST_RETURN!r} is read off a transient; give time_axis=.")
-        from torchtransient.render.labels import first_return
-
-        found: torch.Tensor = first_return(tensors["transient"], self.renderer.axis)
-        return found
+        polarized = stokes_components(self.recipe.variant) > 1
+        return first_return(tensors["transient"], self.renderer.axis, polarized=polarized)
 
     # ------------------------------------------------------------------------------------------------- measurements
 
@@ -321,22 +333,17 @@ class Kept:
             "versions": versions(),
         }
         if "shape" in settings.labels:
-            from torchtransient.render.labels import label_names
-
             found["shapes"] = list(label_names(renderer))
         if self.scan is not None:
             found["scan"] = written_scan(self.scan)
         return found
 
 
-def described_parameters(recipe: Recipe) -> frozenset[str]:
-    """Keys that have a derivative in the scene as it is described."""
-    given, scan = recipe.scenes.build(Structure(recipe.scenes.names[0], ""))
-    if scan is not None:
-        from torchtransient.nlos.scene import capture_scene
-
-        given = load(capture_scene(given, scan, recipe.settings.bounces, recipe.settings.energy), recipe.variant)
-    return frozenset(given.parameters().differentiable())
+def _check_labels(names: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in (*LABELS, FIRST_RETURN):
+            known = ", ".join((*LABELS, FIRST_RETURN))
+            raise SceneError(f"recipe: labels: unknown label {name!r}. Known ones are {known}.")
 
 
 def changed(device: Device, key: str, value: Any) -> Device:

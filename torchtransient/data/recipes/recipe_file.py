@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.axes import TimeAxis
-from torchtransient.data.content_key import contents_of
-from torchtransient.data.recipes.recipe import Recipe
+from torchtransient.data.recipes.places import without_places
+from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
 from torchtransient.data.recipes.written import (
     read,
@@ -33,8 +33,9 @@ from torchtransient.data.recipes.written import (
     written_scan,
     written_shape,
 )
-from torchtransient.data.yaml_files import Section, read_yaml
 from torchtransient.errors import SceneError, StorageError
+from torchtransient.files.content_key import contents_of
+from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.quantities import shown
 from torchtransient.render.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.render.scene_handle import Scene
@@ -55,7 +56,7 @@ _NO_NUMBERS = ("n", "format")
 # ------------------------------------------------------------------------------------------------------------ written
 
 
-def to_dict(recipe: Recipe) -> dict[str, Any]:
+def to_dict(recipe: Specification) -> dict[str, Any]:
     """See :meth:`Recipe.to_dict`."""
     settings = recipe.settings
     found: dict[str, Any] = {"format": FORMAT, "scene": _written_scenes(recipe)}
@@ -85,7 +86,7 @@ def to_dict(recipe: Recipe) -> dict[str, Any]:
     return plain
 
 
-def _written_scenes(recipe: Recipe) -> Any:
+def _written_scenes(recipe: Specification) -> Any:
     scenes = recipe.scenes
     described = {name: _written_scene(one) for name, one in scenes.descriptions.items()}
     if list(described) == [""]:
@@ -100,7 +101,7 @@ def _written_scene(description: Any) -> dict[str, Any]:
     return {"tree": written(description.tree), "folder": description.folder}
 
 
-def to_yaml(recipe: Recipe, path: str | Path | None) -> str:
+def to_yaml(recipe: Specification, path: str | Path | None) -> str:
     """See :meth:`Recipe.to_yaml`."""
     try:
         import yaml
@@ -118,7 +119,7 @@ def to_yaml(recipe: Recipe, path: str | Path | None) -> str:
     return text
 
 
-def key_of(recipe: Recipe) -> str:
+def key_of(recipe: Specification) -> str:
     """See :meth:`Recipe.key`."""
     plain = {name: entry for name, entry in to_dict(recipe).items() if name not in _NO_NUMBERS}
     files: dict[str, str] = {}
@@ -129,19 +130,8 @@ def key_of(recipe: Recipe) -> str:
         files |= {f"{name}/{file}": sha for file, sha in _files_of(content, folder).items()}
     for key in recipe.exchanged:
         files |= {f"{key}/{file}": sha for file, sha in _files_of(written(recipe.vary[key]), Path.cwd()).items()}
-    text = json.dumps([_without_places(plain), files], sort_keys=True, separators=(",", ":"))
+    text = json.dumps([without_places(plain), files], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _without_places(plain: dict[str, Any]) -> dict[str, Any]:
-    def placeless(scene: Any) -> Any:
-        if not isinstance(scene, dict):
-            return scene
-        if "one_of" in scene:
-            return {**scene, "one_of": {name: placeless(one) for name, one in scene["one_of"].items()}}
-        return {name: entry for name, entry in scene.items() if name not in ("folder", "xml")}
-
-    return {**plain, "scene": placeless(plain["scene"])}
 
 
 def _files_of(content: Any, folder: Path) -> dict[str, str]:
@@ -164,21 +154,20 @@ def _files_of(content: Any, folder: Path) -> dict[str, str]:
 # --------------------------------------------------------------------------------------------------------------- read
 
 
-def read_recipe(source: str | Path) -> Recipe:
-    """See :meth:`Recipe.read`."""
+def read_file(source: str | Path) -> tuple[Mapping[str, Any], Path]:
+    """What a file says, and its folder; see :meth:`Recipe.read`."""
     is_text = isinstance(source, str) and "\n" in source
     if not is_text and Path(source).suffix.lower() == ".json":
         try:
             data = json.loads(Path(source).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise StorageError(f"recipe: '{source}' cannot be read: {error}.") from error
-        return from_dict(data, Path(source).resolve().parent)
-    data, folder = read_yaml(source, "recipe")
-    return from_dict(data, folder)
+        return data, Path(source).resolve().parent
+    return read_yaml(source, "recipe")
 
 
-def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> Recipe:
-    """See :meth:`Recipe.from_dict`."""
+def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> tuple[Any, dict[str, Any]]:
+    """The scene and the other arguments of a recipe; see :meth:`Recipe.from_dict`."""
     section = Section(data, "recipe", _ENTRIES)
     if section.text("format", FORMAT) != FORMAT:
         raise SceneError(f"recipe: expected the format {FORMAT!r}, got {shown(data['format'])}.")
@@ -200,10 +189,10 @@ def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> Recipe:
         return _capture(section, place, arguments)
     if "scan" in section:
         arguments["scan"] = read_scan(section.get("scan"))
-        return Recipe(_hidden(section.get("scene")), **arguments)
+        return _hidden(section.get("scene")), arguments
     if "parameters" in section:
         arguments["parameters"] = section.get("parameters")
-    return Recipe(_scene(section.get("scene"), place), **arguments)
+    return _scene(section.get("scene"), place), arguments
 
 
 def _axis(section: Section) -> TimeAxis | None:
@@ -285,11 +274,11 @@ def _builtin(given: Mapping[str, Any]) -> Any:
         raise SceneError(f"recipe: scene: {name}: {error}.") from error
 
 
-def _capture(section: Section, folder: Path, arguments: dict[str, Any]) -> Recipe:
+def _capture(section: Section, folder: Path, arguments: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     from torchtransient.nlos.described_shapes import described_shapes
     from torchtransient.nlos.description import scan_of, wall_of
 
     hidden = described_shapes(section.get("hidden"), folder)
     arguments["scan"] = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
-    return Recipe(dict(hidden), **arguments)
+    return dict(hidden), arguments
 

@@ -73,6 +73,15 @@ class Scenes:
         """Whether a key stands for an entry of the description of every scene."""
         return all(_has(description, key, self.scan) for description in self.descriptions.values())
 
+    def parameters(self, bounces: Any, energy: Any) -> frozenset[str]:
+        """Keys that have a derivative in the (first) scene as it is described."""
+        given, scan = self.build(Structure(self.names[0], ""))
+        if scan is not None:
+            from torchtransient.nlos.scene import capture_scene
+
+            given = load(capture_scene(given, scan, bounces, energy), self.variant)
+        return frozenset(given.parameters().differentiable())
+
     def build(self, structure: Structure) -> tuple[Any, Scan | None]:
         """The scene of a structure as ``tt.load`` takes it (hidden shapes for a capture), and its scan."""
         description, scan = self.descriptions[structure.name], self.scan
@@ -122,6 +131,11 @@ def _exchanged(description: Description, key: str, value: Any) -> Description:
     node = tree
     for name in above:
         node = node[name]
+    if isinstance(node[last], dict) and not above and not isinstance(fresh, dict):
+        raise SceneError(
+            f"recipe: vary: {key!r} is a whole {node[last].get('type', 'node')!r}: expected a Choice of dictionaries, "
+            f"got {shown(value)}. To vary a number in it, name that: scene.parameters() lists the keys."
+        )
     node[last] = fresh
     return replace(description, tree=tree)
 

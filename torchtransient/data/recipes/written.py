@@ -15,11 +15,11 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.data.plain_data import plain, restored
 from torchtransient.data.recipes.distribution import Distribution
 from torchtransient.data.recipes.distributions import Choice, LogUniform, Normal, Scale, Uniform
 from torchtransient.data.recipes.poses import Compose, LookAt, Offset, Turn
 from torchtransient.errors import SceneError
+from torchtransient.files.plain_data import plain, restored
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown

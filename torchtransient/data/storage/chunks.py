@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.errors import StorageError
+from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 COMPRESSIONS = ("blosc2", "gzip", "none")

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchtransient.data.array_file import path_of
 from torchtransient.data.storage.part_files import sweep_parts as sweep_parts
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import path_of
 from torchtransient.quantities import shown
 from torchtransient.render.progress import with_bar
 

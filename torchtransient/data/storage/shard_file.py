@@ -12,9 +12,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import check_source, damage_said
-from torchtransient.data.hdf5_limits import check_memory, dataset_of, read_dataset
-from torchtransient.data.hdf5_writing import hdf5_package
 from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded
 from torchtransient.data.storage.shard_writing import (
@@ -27,6 +24,9 @@ from torchtransient.data.storage.shard_writing import (
 )
 from torchtransient.data.storage.shard_writing import ShardWriter as ShardWriter
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import check_source, damage_said
+from torchtransient.files.hdf5_limits import check_memory, dataset_of, read_dataset
+from torchtransient.files.hdf5_writing import hdf5_package
 from torchtransient.quantities import shown
 
 _TEXTS = ("format", "store", "compression")

@@ -12,11 +12,11 @@ import torch
 
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.data.array_file import damage_said, path_of
-from torchtransient.data.captures import tal
-from torchtransient.data.plain_data import plain, restored
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import damage_said, path_of
+from torchtransient.files.captures import tal
+from torchtransient.files.plain_data import plain, restored
 from torchtransient.render.progress import with_bar
 
 _WHAT = "TAL export"

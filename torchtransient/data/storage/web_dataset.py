@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.data.array_file import check_source, damage_said, path_of
-from torchtransient.data.hdf5_limits import check_memory
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import COUNTED, ROUNDED
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
+from torchtransient.files.array_file import check_source, damage_said, path_of
+from torchtransient.files.hdf5_limits import check_memory
 from torchtransient.quantities import positive
 from torchtransient.render.progress import with_bar
 

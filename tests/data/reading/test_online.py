@@ -1,0 +1,391 @@
+"""Samples that are rendered while they are used: none torn, none used too often, nothing left behind."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from support.online_recipe import SHAPE, OnlineRecipe
+from torchtransient.data.reading.online import OnlineDataset
+from torchtransient.data.reading.online_schedule import Schedule
+from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError
+
+TESTS = Path(__file__).parents[2]
+
+
+def index_of(sample):
+    """The number of a sample, all of whose parts say the same."""
+    index = sample["index"]
+    for name in ("transient", "depth", "shape"):
+        assert (sample[name] == index).all(), f"sample {index} is torn"
+    assert sample["values"]["wall.reflectance"][0] == index
+    assert sample["values"]["box.filename"] == f"{index % 3}.ply"
+    return index
+
+
+def draws(data, count):
+    """The numbers of so many samples."""
+    return [index_of(data.draw()) for _ in range(count)]
+
+
+def running(pids):
+    """Which of the producers that have left their numbers are still there."""
+    found = []
+    for path in Path(pids).iterdir():
+        try:
+            state = Path(f"/proc/{path.name}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except FileNotFoundError:
+            continue
+        if state != "Z":
+            found.append(int(path.name))
+    return found
+
+
+def gone(pids, seconds=10.0):
+    until = time.monotonic() + seconds
+    while running(pids) and time.monotonic() < until:
+        time.sleep(0.05)
+    return not running(pids)
+
+
+def shared():
+    """Shared memory under a name: torch's has none once it is in use."""
+    return {path.name for path in Path("/dev/shm").iterdir() if "torch" in path.name or "psm_" in path.name}
+
+
+# ------------------------------------------------------------------------------------------------------- schedule
+
+
+def simulate(uses, capacity, speed, draws=4000, producers=2, warm=4):
+    """A trainer and producers that make ``speed`` samples a draw: what was drawn, and the longest reuse."""
+    schedule = Schedule(capacity, producers, uses, warm, first=0, seed=0)
+    content, open_orders, used, budget = {}, [], Counter(), 0.0
+
+    def give_orders():
+        for n in range(producers):
+            while (order := schedule.order(n)) is not None:
+                open_orders.append(order)
+        return open_orders
+
+    while schedule.drawn < draws:
+        budget += speed
+        while give_orders() and (budget >= 1 or not schedule.can_draw()):
+            budget = max(budget - 1, 0.0)
+            order = open_orders.pop(0)
+            content[schedule.finished(order.index)] = order.index
+        assert schedule.can_draw(), "a trainer and producers wait for each other"
+        slot = schedule.draw()
+        assert slot not in {order.slot for order in open_orders}
+        used[content[slot]] += 1
+        assert schedule.drawn <= uses * schedule.made
+    return schedule, used
+
+
+@pytest.mark.parametrize("uses", [0.5, 1.0, 5.0, 20.0])
+@pytest.mark.parametrize("capacity", [2, 3, 64])
+@pytest.mark.parametrize("speed", [0.01, 0.2, 5.0])
+def test_mean_use_is_bounded(uses, capacity, speed):
+    schedule, used = simulate(uses, capacity, speed, warm=min(4, capacity))
+    mean = schedule.drawn / schedule.made
+    assert mean <= uses
+    # No more is made than is used, but for what is in the ring.
+    assert schedule.made <= schedule.drawn / uses + capacity + 2
+    assert sum(used.values()) == 4000
+
+
+def test_uses_of_a_full_ring_are_what_was_asked_for():
+    schedule, used = simulate(5.0, 64, 5.0, draws=20000)
+    settled = [used[index] for index in range(100, 3000)]
+    assert abs(sum(settled) / len(settled) - 5.0) < 0.2
+    assert schedule.drawn / schedule.made > 4.7
+
+
+def test_without_a_bound_nobody_waits():
+    schedule = Schedule(8, 1, math.inf, 1, first=0, seed=0)
+    for _ in range(100):
+        order = schedule.order(0)
+        schedule.finished(order.index)
+    assert schedule.made == 100 and schedule.drawn == 0
+    for _ in range(1000):
+        assert schedule.can_draw()
+        schedule.draw()
+
+
+def test_orders_of_a_lost_producer_come_again():
+    schedule = Schedule(16, 2, 5.0, 1, first=7, seed=0)
+    first = [schedule.order(0) for _ in range(2)]
+    schedule.order(1)
+    assert schedule.lost(0) == [7, 8]
+    again = [schedule.order(0) for _ in range(2)]
+    assert [order.index for order in again] == [order.index for order in first] == [7, 8]
+
+
+# -------------------------------------------------------------------------------------------------- whole data sets
+
+
+def test_samples_are_whole_and_come_from_the_recipe(tmp_path):
+    before = shared()
+    recipe = OnlineRecipe(pids=str(tmp_path), group=3)
+    with OnlineDataset(recipe, capacity=16, workers=2, uses=2.0, warm=8, first=100) as data:
+        seen = []
+        while len(seen) < 400 or len(list(tmp_path.iterdir())) < 2:
+            seen.append(index_of(data.draw()))
+        assert data.drawn == len(seen) <= 2 * data.made
+        # Without a hole but for what is being made.
+        assert set(seen) <= set(range(100, 100 + data.made + 16)) and min(seen) < 116
+        assert len(set(seen)) > 150
+        sample = data.draw()
+        assert sample["transient"].shape == SHAPE and sample["shape"].dtype == torch.int32
+    assert gone(tmp_path) and len(list(tmp_path.iterdir())) == 2
+    assert shared() <= before
+    with pytest.raises(TorchTransientError, match="closed"):
+        data.draw()
+    assert index_of(sample) >= 100
+
+
+def test_every_sample_is_made_once():
+    with OnlineDataset(OnlineRecipe(), capacity=8, workers=3, uses=1.0, warm=1) as data:
+        seen = Counter(index_of(data.draw()) for _ in range(300))
+    assert max(seen.values()) < 20
+    assert max(seen) < 300 + 8 + 3
+
+
+def test_tensors_are_the_callers_own():
+    with OnlineDataset(OnlineRecipe(), capacity=4, uses=1.0, warm=1) as data:
+        kept = [data.draw() for _ in range(60)]
+        numbers = [sample["index"] for sample in kept]
+        data.draw()["transient"].fill_(-1.0)
+        later = [index_of(data.draw()) for _ in range(60)]
+    assert [index_of(sample) for sample in kept] == numbers and min(later) >= 0
+    assert not kept[0]["transient"].is_shared()
+
+
+def test_loader_makes_batches():
+    recipe = OnlineRecipe()
+    with OnlineDataset(recipe, capacity=16, warm=4, transform=lambda x: x.sum(1)) as data:
+        loader = DataLoader(data, batch_size=8, num_workers=0)
+        for _, batch in zip(range(5), loader, strict=False):
+            assert batch["transient"].shape == (8, *SHAPE) and batch["index"].shape == (8,)
+            assert (batch["depth"][:, 0, 0] == batch["index"]).all()
+            assert len(batch["values"]["box.filename"]) == 8
+            assert (batch["measurement"][:, 0, 0, 0] == 16 * batch["index"]).all()
+        with pytest.raises(TorchTransientError, match="num_workers=0"):
+            next(iter(DataLoader(data, batch_size=2, num_workers=1, multiprocessing_context="fork")))
+        assert index_of(data.draw()) >= 0  # the fork has not ended the producers
+        with pytest.raises(TorchTransientError, match="cannot be pickled"):
+            pickle.dumps(data)
+
+
+def test_a_slow_producer_makes_the_trainer_wait():
+    with OnlineDataset(OnlineRecipe(seconds=0.02), capacity=16, uses=2.0, warm=2) as data:
+        for _ in range(60):
+            data.draw()
+            assert data.drawn <= 2.0 * data.made
+        assert data.waited_s > 0.2
+
+
+def test_a_slow_trainer_makes_producers_wait():
+    with OnlineDataset(OnlineRecipe(), capacity=16, uses=4.0, warm=2) as data:
+        for _ in range(40):
+            data.draw()
+            time.sleep(0.01)
+        time.sleep(0.5)
+        data.draw()
+        assert data.made <= 41 / 4 + 16 + 2
+
+
+def test_threads_draw_together():
+    wrong = []
+    with OnlineDataset(OnlineRecipe(), capacity=8, workers=2, uses=3.0, warm=2) as data:
+
+        def work():
+            for _ in range(100):
+                sample = data.draw()
+                if not (sample["transient"] == sample["index"]).all():
+                    wrong.append(sample["index"])
+
+        threads = [threading.Thread(target=work) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert data.drawn == 400 and not wrong
+
+
+# ---------------------------------------------------------------------------------------------------- what goes wrong
+
+
+def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
+    data = OnlineDataset(OnlineRecipe(fail=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
+    for _ in range(2):
+        with pytest.raises(SceneError, match="sample 5 has no light") as caught:
+            draws(data, 100)
+        assert "has no light" in str(caught.value.__cause__) and "online_recipe.py" in str(caught.value.__cause__)
+    assert gone(tmp_path)
+
+
+def test_error_that_cannot_be_sent_is_told():
+    data = OnlineDataset(OnlineRecipe(unpicklable=(0,)), capacity=4)
+    with data, pytest.raises(TorchTransientError, match="UnpicklableError: cannot be sent"):
+        data.draw()
+
+
+def test_error_of_the_recipe_is_raised():
+    data = OnlineDataset(OnlineRecipe(broken="no such mesh"), capacity=4)
+    with data, pytest.raises(SceneError, match="no such mesh"):
+        data.draw()
+
+
+def test_samples_of_another_kind_are_an_error():
+    data = OnlineDataset(OnlineRecipe(odd=(3,)), capacity=8, uses=1.0, warm=1)
+    with data, pytest.raises(ShapeError, match="same names, shapes and types"):
+        draws(data, 100)
+
+
+def test_a_killed_producer_is_started_again(tmp_path):
+    recipe = OnlineRecipe(die=(6,), once=str(tmp_path))
+    data = OnlineDataset(recipe, capacity=8, workers=2, uses=1.0, warm=1)
+    with data, pytest.warns(UserWarning, match="by signal 9 while it rendered sample 6"):
+        seen = draws(data, 300)
+    assert len(set(seen)) > 150 and max(seen) < 320
+
+
+def test_producers_killed_from_outside_are_started_again(tmp_path):
+    recipe = OnlineRecipe(seconds=0.005, pids=str(tmp_path))
+    with OnlineDataset(recipe, capacity=16, workers=2, uses=1.0, warm=4) as data:
+        for _ in range(4):
+            data.draw()
+        os.kill(running(tmp_path)[0], signal.SIGKILL)
+        with pytest.warns(UserWarning, match="another one takes its place"):
+            seen = draws(data, 200)
+        until = time.monotonic() + 60
+        while len(running(tmp_path)) < 2 and time.monotonic() < until:
+            seen += draws(data, 1)
+        assert len(running(tmp_path)) == 2
+    assert gone(tmp_path) and len(set(seen)) > 80
+
+
+def test_a_sample_that_ends_its_producer_twice_is_an_error(tmp_path):
+    data = OnlineDataset(OnlineRecipe(die=(2,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
+    twice = pytest.raises(TorchTransientError, match="rendered sample 2, 2 times now")
+    with data, pytest.warns(UserWarning, match="takes its place"), twice:
+        draws(data, 100)
+    assert gone(tmp_path)
+
+
+def test_a_producer_that_hangs_is_an_error(tmp_path):
+    data = OnlineDataset(OnlineRecipe(hang=(1,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1, timeout_s=120.0)
+    data.draw()
+    # From here on: how long a process takes to start is the machine's.
+    data._producers._timeout_s = 1.0
+    with data, pytest.raises(TorchTransientError, match=r"no news .* for 1 s, at work on samples 1"):
+        draws(data, 100)
+    assert gone(tmp_path)
+
+
+def test_more_than_the_shared_memory_is_an_error(monkeypatch):
+    from torchtransient.data.reading import online_producers
+
+    class Small:
+        free = 2**16
+
+    monkeypatch.setattr(online_producers.shutil, "disk_usage", lambda path: Small)
+    with OnlineDataset(OnlineRecipe(), capacity=1024) as data, pytest.raises(StorageError, match="shared memory"):
+        data.draw()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"capacity": 1}, {"capacity": 2.5}, {"workers": 0}, {"uses": 0.0}, {"uses": float("nan")}, {"warm": 0},
+        {"first": -1}, {"seed": "x"}, {"timeout_s": -1.0}, {"workers": True},
+    ],
+)  # fmt: skip
+def test_mistakes_start_nothing(wrong, tmp_path):
+    with pytest.raises(UnitError, match=next(iter(wrong))):
+        OnlineDataset(OnlineRecipe(pids=str(tmp_path)), **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------------------------------------------- nothing is left
+
+
+def test_forgotten_data_sets_leave_nothing(tmp_path):
+    data = OnlineDataset(OnlineRecipe(pids=str(tmp_path)), capacity=8, warm=1)
+    loader = iter(DataLoader(data, batch_size=2))
+    next(loader)
+    assert running(tmp_path)
+    del data, loader
+    gc.collect()
+    assert gone(tmp_path)
+
+
+SCRIPT = """
+import os, signal, sys, time
+sys.path.insert(0, {tests!r})
+from support.online_recipe import OnlineRecipe
+from torchtransient.data.reading.online import OnlineDataset
+
+if __name__ == "__main__":
+    data = OnlineDataset(OnlineRecipe(pids={pids!r}, hang=(40,)), capacity=16, uses=1.0, warm=1)
+    data.draw()
+    print("drawn", flush=True)
+    {end}
+"""
+ENDS = {
+    "exception": ("raise ValueError('mine')", 1),
+    "killed": ("os.kill(os.getpid(), signal.SIGKILL)", -9),
+    "interrupt while it waits": ("[data.draw() for _ in range(1000)]", None),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_the_end_of_the_interpreter_leaves_nothing(end, tmp_path):
+    before = shared()
+    pids = tmp_path / "pids"
+    pids.mkdir()
+    line, code = ENDS[end]
+    script = tmp_path / "train.py"
+    script.write_text(SCRIPT.format(tests=str(TESTS), pids=str(pids), end=line))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    process = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout.readline() == "drawn\n"
+    if code is None:
+        time.sleep(0.5)
+        os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert gone(pids)
+    if code is None:
+        # One trace, of the trainer: producers do not hear Ctrl-C.
+        assert errors.count("KeyboardInterrupt") == 1 and process.returncode in (1, -2, 130)
+    else:
+        assert process.returncode == code
+    assert shared() <= before
+
+
+def test_a_script_without_a_guard_is_told(tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(
+        f"import sys\nsys.path.insert(0, {str(TESTS)!r})\nfrom support.online_recipe import OnlineRecipe\n"
+        "from torchtransient.data.reading.online import OnlineDataset\n"
+        "OnlineDataset(OnlineRecipe(), capacity=4).draw()\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 1 and "__main__" in done.stderr.splitlines()[-1]

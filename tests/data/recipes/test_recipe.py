@@ -1,0 +1,287 @@
+"""Recipes: sample i depends on the recipe and i alone, and what is wrong is said before anything is rendered."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.data.recipes.maker import MOST_KEPT
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+
+D = tt.data
+VARIANT = "llvm_ad_mono"
+AXIS = tt.TimeAxis(2.0, 0.2, 60)
+
+
+def box(**changes):
+    return tt.scenes.cornell_box(resolution=8, num_bins=60, bin_width_opl=0.2, start_opl=2.0, **changes)
+
+
+def small(scene=None, vary=None, **settings):
+    varied = {
+        "red.reflectance.value": D.Uniform(0.05, 0.9),
+        "small-box.to_world": D.Compose([D.Turn(), D.Offset([-0.2, 0, -0.3], [0.2, 0, 0.3])]),
+    }
+    settings = {"variant": VARIANT, "spp": 4} | settings
+    return D.Recipe(box() if scene is None else scene, varied if vary is None else vary, **settings)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    with tt.threads(1):
+        yield
+
+
+def same(a, b):
+    assert a.index == b.index and a.seed == b.seed and a.structure == b.structure and a.outside == b.outside
+    assert list(a.arrays) == list(b.arrays) and list(a.values) == list(b.values)
+    for name in a.arrays:
+        assert a.arrays[name].dtype == b.arrays[name].dtype
+        assert a.arrays[name].tobytes() == b.arrays[name].tobytes(), name
+    assert all(np.array_equal(a.values[key], b.values[key]) for key in a.values)
+
+
+def test_bytes_depend_on_recipe_and_number_alone():
+    recipe = small(labels=("depth", "normals", "shape", "first_return"))
+    forwards = [recipe.sample(index) for index in range(6)]
+    other = pickle.loads(pickle.dumps(recipe))
+    for index in (5, 0, 3, 3, 1):
+        same(other.sample(index), forwards[index])
+    same(D.Recipe.from_dict(json.loads(json.dumps(recipe.to_dict()))).sample(4), forwards[4])
+    assert not np.array_equal(forwards[0].arrays["transient"], forwards[1].arrays["transient"])
+    assert forwards[0].arrays["depth"].shape == (8, 8) and forwards[0].arrays["normals"].shape == (3, 8, 8)
+    # Equal to what a user renders by hand.
+    values = {key: torch.as_tensor(value) for key, value in forwards[2].values.items()}
+    renderer = tt.TransientRenderer(
+        tt.load(box(), variant=VARIANT), parameters=list(values), spp=4, temporal_filter="box"
+    )
+    with torch.no_grad():
+        out = renderer(values, seed=forwards[2].seed)
+    assert out.transient.numpy().tobytes() == forwards[2].arrays["transient"].tobytes()
+
+
+def test_another_process_makes_the_same_bytes(tmp_path):
+    recipe = small()
+    recipe.to_yaml(tmp_path / "recipe.yaml")
+    program = (
+        "import sys, hashlib, torchtransient as tt\n"
+        "tt.threads(1)\n"
+        "recipe = tt.data.Recipe.read(sys.argv[1])\n"
+        "print(recipe.key(), hashlib.sha256(recipe.sample(7).arrays['transient'].tobytes()).hexdigest())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "recipe.yaml")], capture_output=True, text=True, check=True
+    )
+    mine = hashlib.sha256(recipe.sample(7).arrays["transient"].tobytes()).hexdigest()
+    assert done.stdout.split() == [recipe.key(), mine]
+
+
+def test_structures_are_kept_and_come_back_the_same():
+    """More structures than are kept: a scene that is built again makes the same bytes."""
+    sizes = [0.1 + 0.02 * number for number in range(MOST_KEPT + 2)]
+    ball = {"type": "sphere", "center": [0.0, -0.6, 0.2], "bsdf": {"type": "ref", "id": "white"}}
+    scene = box() | {"ball": ball | {"radius": 0.1}}
+    vary = {"ball.radius": D.Choice(sizes), "red.reflectance.value": D.Uniform(0.1, 0.9)}
+    recipe = small(scene, vary)
+    assert recipe.exchanged == ["ball.radius"]
+    alone = [small(scene, vary).sample(index) for index in range(4)]
+    order = recipe._maker.order(range(30))
+    texts = [recipe.structure(index).text for index in order]
+    assert sorted(order) == list(range(30)) and len(set(texts)) > MOST_KEPT
+    assert texts == sorted(texts, key=texts.index)
+    made = {index: recipe.sample(index) for index in order}
+    assert len(recipe._maker._kept) == MOST_KEPT
+    for index in range(4):
+        same(made[index], alone[index])
+    assert made[0].values["ball.radius"] in np.float32(sizes)
+
+
+def test_scenes_one_of():
+    recipe = small(
+        D.OneOf({"full": box(), "empty": {k: v for k, v in box().items() if k != "small-box"}}, weights=[1, 2]),
+        {"red.reflectance.value": D.Uniform(0.1, 0.9)},
+    )
+    found = [recipe.sample(index) for index in range(8)]
+    assert {sample.values["scene"] for sample in found} == {"full", "empty"}
+    share = np.mean([recipe.structure(index).name == "empty" for index in range(1000)])
+    assert abs(share - 2 / 3) < 4 * np.sqrt(2 / 9 / 1000)
+
+
+def test_nodes_and_texts_are_exchanged():
+    d = box()
+    nodes = [d["small-box"], {"type": "sphere", "to_world": d["small-box"]["to_world"], "bsdf": d["small-box"]["bsdf"]}]
+    recipe = small(d, {"small-box": D.Choice(nodes), "small-box.to_world": D.Turn()})
+    assert recipe.exchanged == ["small-box"]
+    found = {recipe.sample(index).values["small-box"] for index in range(6)}
+    assert found == {"#0", "#1"}
+    by_type = small(d, {"small-box.type": D.Choice(["cube", "sphere"])})
+    assert {by_type.sample(index).values["small-box.type"] for index in range(6)} == {"cube", "sphere"}
+
+
+def test_a_key_more_leaves_the_others_as_they_were():
+    one = small(vary={"red.reflectance.value": D.Uniform(0, 1)})
+    two = small(vary={"green.reflectance.value": D.Uniform(0, 1), "red.reflectance.value": D.Uniform(0, 1)})
+    for index in range(3):
+        assert one.draw(index)["red.reflectance.value"] == two.draw(index)["red.reflectance.value"]
+        assert one.sample(index).seed == two.sample(index).seed
+    assert one.draw(0) != small(vary={"red.reflectance.value": D.Uniform(0, 1)}, seed=1).draw(0)
+    assert one.key() != two.key()
+
+
+def test_poses_leave_the_temporal_filter_alone():
+    """A box, whatever varies: the layer would take a tent for a pose that could have a gradient."""
+    assert small()._maker.about()["temporal_filter"] == "box"
+    tent = small(temporal_filter="tent")._maker.about()
+    assert tent["temporal_filter"] == "tent"
+
+
+def test_calls_are_recorded_and_nothing_is_traced_within_a_structure():
+    recipe = small()
+    for index in range(4):
+        recipe.sample(index)
+    (kept,) = recipe._maker._kept.values()
+    with torch.no_grad():
+        out = kept.renderer(kept.values(kept.draw(9)), seed=9)
+    assert out.stats.recorded == ("launched",)
+
+
+def test_light_outside_of_the_window():
+    recipe = small(time_axis=tt.TimeAxis(6.0, 0.2, 10))
+    sample = recipe.sample(0)
+    whole = small(time_axis=tt.TimeAxis(0.0, 0.2, 400)).sample(0).arrays["transient"].sum((0, 2, 3), dtype=np.float64)
+    assert sample.outside[0] == pytest.approx(whole[:30].sum() / whole.sum(), rel=1e-3)
+    assert sample.outside[1] == pytest.approx(whole[40:].sum() / whole.sum(), rel=1e-2)
+
+
+def test_standard_error_falls_with_samples():
+    """As the square root; of renders that are little but noise it is close to one."""
+    plane = tt.scenes.light_over_plane()
+    few, many = (
+        np.mean([D.Recipe(plane, variant=VARIANT, spp=spp)._maker.standard_error(i) for i in range(3)])
+        for spp in (256, 4096)
+    )
+    # By the power of the light instead of that of light and noise.
+    assert (few / np.sqrt(1 - few**2)) / (many / np.sqrt(1 - many**2)) == pytest.approx(4, rel=0.2)
+    assert 0.8 < small(spp=1, time_axis=tt.TimeAxis(2.0, 0.01, 1200))._maker.standard_error(0) < 1.1
+
+
+def test_several_sensors_phasors_polarization_and_gates():
+    both = small(box() | {"eye": box()["sensor"]}, sensors="all").sample(0)
+    assert both.arrays["transient"].shape == (2, 1, 60, 8, 8)
+    phasor = small(frequencies=[0.0, 0.5]).sample(0)
+    assert phasor.arrays["phasor"].shape == (1, 2, 8, 8) and phasor.arrays["phasor"].dtype == np.complex64
+    gated = small(gates=[tt.Gate.gaussian(8.0, 2.0)]).sample(0)
+    assert gated.arrays["gated"].shape == (1, 1, 8, 8)
+    stokes = small(variant="llvm_ad_mono_polarized", labels=("first_return",)).sample(0)
+    assert stokes.arrays["transient"].shape == (4, 1, 60, 8, 8) and stokes.arrays["first_return"].shape == (8, 8)
+
+
+def test_devices_measure_and_vary():
+    axis = tt.sensing.device("vl53l8_like").axis()
+    recipe = small(device="vl53l8_like", time_axis=axis)
+    first, again = recipe.sample(1), pickle.loads(pickle.dumps(recipe)).sample(1)
+    same(first, again)
+    counts = first.arrays["measurement"]
+    assert counts.shape == first.arrays["transient"].shape and (counts == np.round(counts)).all() and counts.any()
+    vary = {"device.PhotonBudget.cycles": D.Choice([1000, 100000])}
+    bright = small(vary=vary, device="vl53l8_like", time_axis=axis)
+    found = [bright.sample(index) for index in range(6)]
+    sums = {float(one.values["device.PhotonBudget.cycles"]): one.arrays["measurement"].sum() for one in found}
+    assert sums[100000.0] > 1.5 * sums[1000.0]
+
+
+def test_captures_around_a_corner():
+    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
+    scan = tt.nlos.Scan.grid(wall, (4, 4), kind="confocal")
+    turned = tt.scenes.transforms.rotate([0, 1, 0], 180) @ np.diag([0.3, 0.3, 1, 1])
+    hidden = {"letter": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0]) @ turned}}
+    vary = {"letter.to_world": D.Offset([-0.2, -0.2, 0], [0.2, 0.2, 0.3])}
+    with pytest.raises(SceneError, match="time_axis"):
+        D.Recipe(hidden, vary, scan=scan, variant=VARIANT)
+    recipe = D.Recipe(hidden, vary, scan=scan, variant=VARIANT, time_axis=tt.TimeAxis(0, 0.02, 200), spp=64)
+    recipe.check()
+    sample = recipe.sample(2)
+    assert sample.arrays["transient"].shape == (1, 200, 4, 4) and sample.arrays["transient"].sum() > 0
+    again = D.Recipe.from_dict(json.loads(json.dumps(recipe.to_dict())))
+    recipe.sample(5)
+    same(recipe.sample(2), sample)
+    same(again.sample(2), sample)
+    assert recipe._maker.about()["scan"]["kind"] == "confocal"
+
+
+# ------------------------------------------------------------------------------------------------------ what is wrong
+
+
+def dark():
+    return {key: node for key, node in box().items() if key != "light"}
+
+
+RED = "red.reflectance.value"
+BOX, LIGHT, EYE = "small-box.to_world", "light.to_world", "sensor.to_world"
+AWAY = D.Offset([0, 0, -30], [0, 0, 0])
+CYCLES = "device.PhotonBudget.cycles"
+
+
+def without_small_box():
+    return {key: node for key, node in box().items() if key != "small-box"}
+
+
+def two_sizes():
+    return small(D.OneOf([box(), tt.scenes.cornell_box(resolution=4)]), {})
+
+
+WRONG = {
+    "unknown key": (lambda: small(vary={"red.reflectnce.value": D.Uniform(0, 1)}), SceneError, "Did you mean 'red.re"),
+    "too bright": (lambda: small(vary={RED: D.Uniform(0, 1.2)}), UnitError, "more than all"),
+    "normal": (lambda: small(vary={RED: D.Normal(0.5, 0.2)}), UnitError, "share of the light"),
+    "shape": (lambda: small(vary={RED: D.Choice([[1, 2, 3]])}), ShapeError, "choices of shape"),
+    "turned colour": (lambda: small(vary={RED: D.Turn()}), SceneError, "for transforms"),
+    "uniform pose": (lambda: small(vary={BOX: D.Uniform(0, 1)}), SceneError, "Turn, Offset"),
+    "flat": (lambda: small(vary={BOX: D.Scale(0, 1)}), UnitError, "no inverse"),
+    "leaves": (lambda: small(vary={BOX: AWAY}), SceneError, "leaves the window"),
+    "light leaves": (lambda: small(vary={LIGHT: AWAY}), SceneError, "leaves the window"),
+    "camera leaves": (
+        lambda: small(vary={BOX: D.Turn(), EYE: D.Offset([0, 0, 0], [0, 0, 30])}), SceneError, "leaves the window"
+    ),
+    "no light": (lambda: small(dark(), {RED: D.Uniform(0, 1)}), SceneError, "without any emitter"),
+    "light off": (lambda: small(vary={"light.emitter.radiance.value": D.Uniform(0, 0)}), SceneError, "no light ever"),
+    "whole node": (lambda: small(vary={"red": D.Uniform(0, 1)}), SceneError, "whole 'diffuse'"),
+    "unknown plugin": (lambda: small(vary={"small-box.type": D.Choice(["cube", "nonsense"])}), SceneError, "nonsense"),
+    "label": (lambda: small(labels=("depht",)), SceneError, "unknown label 'depht'"),
+    "labels": (lambda: small(labels="depth"), SceneError, "list of names"),
+    "device": (lambda: small(device="vl53l9"), SceneError, "vl53l8_like"),
+    "device key": (lambda: small(vary={CYCLES: D.Uniform(1, 2)}), SceneError, "give device="),
+    "device argument": (
+        lambda: small(vary={CYCLES[:-1]: D.Choice([1])}, device="vl53l8_like"), TorchTransientError, "cycle"
+    ),
+    "device of phasors": (lambda: small(frequencies=[0.0], device="vl53l8_like"), SceneError, "transients"),
+    "not a distribution": (lambda: small(vary={RED: 3}), SceneError, "expected a distribution"),
+    "seed": (lambda: small(seed=-1), SceneError, "seed"),
+    "films of two sizes": (two_sizes, ShapeError, "one size"),
+    "key of one scene": (lambda: small(D.OneOf([box(), without_small_box()])), SceneError, "small-box"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_wrong_is_said_before_anything_is_rendered(wrong, monkeypatch):
+    make, error, words = WRONG[wrong]
+
+    def render(*arguments, **keywords):
+        raise AssertionError("rendered")
+
+    monkeypatch.setattr(tt.TransientRenderer, "forward", render)
+    with pytest.raises(error, match=words):
+        make().check()
+
+
+def test_numbers_of_samples():
+    with pytest.raises(ShapeError, match="at least 0"):
+        small().sample(-1)

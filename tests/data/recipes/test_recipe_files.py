@@ -1,0 +1,146 @@
+"""Recipes as YAML and JSON, and the text that stands for one."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+import torchtransient as tt
+from torchtransient.errors import SceneError, StorageError
+
+D = tt.data
+
+TEXT = """
+scene: {builtin: cornell_box, resolution: 8}
+variant: llvm_ad_mono
+time_axis: {start_opl: 2.0, bin_width_opl: 0.2, num_bins: 60}
+spp: 4
+n: 12
+labels: [depth]
+device: vl53l8_like
+vary:
+  red.reflectance.value: {uniform: [0.05, 0.9]}
+  small-box.to_world: {compose: [{turn: {axis: [0, 1, 0]}}, {offset: [[-0.2, 0, 0], [0.2, 0, 0]]}]}
+  small-box.type: {choice: [cube, sphere]}
+"""
+
+CAPTURE = """
+hidden: {letter: {shape: rectangle, scale: 0.2, rotate: [[0, 1, 0], 180], translate: [0, 0, 1]}}
+wall: {width: 1, height: 1}
+scan: {kind: confocal, size: [4, 4]}
+variant: llvm_ad_mono
+time_axis: {start_opl: 0, bin_width_opl: 0.02, num_bins: 200}
+vary: {letter.to_world: {offset: [[-0.1, -0.1, 0], [0.1, 0.1, 0]]}}
+"""
+
+
+def test_a_file_is_its_recipe(tmp_path):
+    recipe = D.Recipe.read(TEXT)
+    assert recipe.n == 12 and list(recipe.vary) == ["red.reflectance.value", "small-box.to_world", "small-box.type"]
+    recipe.to_yaml(tmp_path / "again.yaml")
+    again = D.Recipe.read(tmp_path / "again.yaml")
+    assert again == recipe and again.key() == recipe.key() and again.to_dict() == recipe.to_dict()
+    assert again.draw(3)["red.reflectance.value"] == recipe.draw(3)["red.reflectance.value"]
+    scene = tt.scenes.cornell_box(resolution=8)
+    by_hand = D.Recipe(
+        scene,
+        {
+            "red.reflectance.value": D.Uniform(0.05, 0.9),
+            "small-box.to_world": D.Compose([D.Turn([0, 1, 0]), D.Offset([-0.2, 0, 0], [0.2, 0, 0])]),
+            "small-box.type": D.Choice(["cube", "sphere"]),
+        },
+        variant="llvm_ad_mono", time_axis=tt.TimeAxis(2.0, 0.2, 60), spp=4, n=12, labels=["depth"],
+        device="vl53l8_like",
+    )  # fmt: skip
+    assert by_hand.key() == recipe.key()
+
+
+def test_captures(tmp_path):
+    recipe = D.Recipe.read(CAPTURE)
+    assert recipe.scan.kind == "confocal"
+    recipe.to_yaml(tmp_path / "again.yaml")
+    again = D.Recipe.read(tmp_path / "again.yaml")
+    assert again == recipe and again.key() == recipe.key()
+
+
+def changed(**entries):
+    import yaml
+
+    data = yaml.safe_load(TEXT)
+    return D.Recipe.from_dict({name: entry for name, entry in (data | entries).items() if entry is not None})
+
+
+def test_keys_tell_recipes_apart():
+    base = changed().key()
+    assert changed(n=13).key() == base
+    others = [
+        changed(seed=1), changed(spp=8), changed(labels=[]), changed(device=None), changed(variant="llvm_ad_rgb"),
+        changed(vary={}), changed(temporal_filter="tent"),
+        changed(time_axis={"start_opl": 2, "bin_width_opl": 0.2, "num_bins": 61}),
+        changed(scene={"builtin": "cornell_box", "resolution": 9}),
+    ]  # fmt: skip
+    assert len({base, *(one.key() for one in others)}) == len(others) + 1
+
+
+XML = """<scene version="3.0.0">
+  <default name="albedo" value="0.5"/>
+  <integrator type="transient_path"/>
+  <sensor type="perspective"><film type="transient_hdr_film"><integer name="width" value="4"/>
+    <integer name="height" value="4"/><integer name="temporal_bins" value="8"/><float name="bin_width_opl" value="1"/>
+    <float name="start_opl" value="0"/></film></sensor>
+  <shape type="obj" id="thing"><string name="filename" value="thing.obj"/>
+    <bsdf type="diffuse"><spectrum name="reflectance" value="$albedo"/></bsdf></shape>
+  <emitter type="point" id="lamp"><point name="position" x="0" y="0" z="0"/></emitter>
+</scene>"""
+OBJ = "v -1 -1 3\nv 1 -1 3\nv 0 1 3\nf 1 3 2\n"
+
+
+def write(folder, mesh=OBJ):
+    folder.mkdir()
+    (folder / "scene.xml").write_text(XML)
+    (folder / "thing.obj").write_text(mesh)
+    (folder / "recipe.yaml").write_text(
+        "scene: scene.xml\nvariant: llvm_ad_mono\nspp: 2\nvary:\n  $albedo: {uniform: [0.1, 0.9]}\n"
+        "  thing.to_world: {offset: [[0, 0, 0], [0, 0, 1]]}\n"
+    )
+    return D.Recipe.read(folder / "recipe.yaml")
+
+
+def test_xml_scenes_their_files_and_places(tmp_path):
+    recipe = write(tmp_path / "a")
+    assert recipe.exchanged == ["$albedo"]
+    sample = recipe.sample(0)
+    assert 0.1 <= float(sample.values["$albedo"]) <= 0.9 and sample.arrays["transient"].sum() > 0
+    # The same elsewhere; another where a file that it names has changed.
+    shutil.copytree(tmp_path / "a", tmp_path / "moved")
+    assert D.Recipe.read(tmp_path / "moved" / "recipe.yaml").key() == recipe.key()
+    assert write(tmp_path / "b", OBJ.replace("0 1 3", "0 2 3")).key() != recipe.key()
+    recipe.to_yaml(tmp_path / "whole.yaml")
+    again = D.Recipe.read(tmp_path / "whole.yaml")
+    assert np.array_equal(again.sample(0).arrays["transient"], sample.arrays["transient"])
+    (tmp_path / "a" / "scene.xml").write_text(XML.replace("0.5", "0.6"))
+    with pytest.raises(SceneError, match="has changed"):
+        D.Recipe.read(tmp_path / "whole.yaml")
+
+
+@pytest.mark.parametrize(
+    "text, error, words",
+    [
+        ("sceen: a\nvary: {}\n", SceneError, "Did you mean 'scene'"),
+        ("vary: {}\nspp: 3\n", SceneError, "'scene', or 'hidden'"),
+        ("scene: nowhere.xml\nspp: 3\n", SceneError, "nowhere.xml"),
+        ("scene: {builtin: cornel_box}\nspp: 3\n", SceneError, "cornell_box"),
+        ("scene: {builtin: cornell_box, resolutoin: 3}\nspp: 3\n", SceneError, "resolutoin"),
+        ("scene: {builtin: cornell_box}\nvary: 3\n", SceneError, "by key"),
+        ("scene: {builtin: cornell_box}\nvary: {a: {unifrm: [0, 1]}}\n", SceneError, "unknown distribution 'unifrm'"),
+        ("scene: {builtin: cornell_box}\nspp: 0\n", SceneError, "spp"),
+        ("scene: {builtin: cornell_box}\nformat: torchtransient recipe 7\n", SceneError, "recipe 1"),
+        ("scene: [\n", StorageError, "YAML"),
+        ("scene: {builtin: cornell_box}\ntime_axis: {start_opl: 1}\n", SceneError, "bin_width_opl"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_file(text, error, words):
+    with pytest.raises(error, match=words):
+        D.Recipe.read(text)

@@ -1,0 +1,37 @@
+"""A layout that is asked for and that a file has not is refused: no file is read with its axes in another order."""
+
+from __future__ import annotations
+
+import pytest
+
+from support.capture_files import holdable, read_only
+from torchtransient.capture import Capture
+from torchtransient.errors import StorageError
+from torchtransient.files.captures.formats import LAYOUTS
+from torchtransient.files.captures.mat_file import write_mat
+
+FILES = [(layout, f"{layout}-{name}", capture) for layout, name, capture in holdable() if layout != "torchtransient"]
+FILES += [(layout, f"{layout}-{number}", arrays) for number, (layout, arrays) in enumerate(read_only())]
+HDF5 = {entry.name for entry in LAYOUTS if ".h5" in entry.endings}
+OTHERS = sorted(layout.name for layout in LAYOUTS)
+
+
+@pytest.mark.parametrize(("layout", "name", "content"), FILES, ids=[name for _, name, _ in FILES])
+def test_no_file_is_read_as_another(tmp_path, layout, name, content):
+    path = tmp_path / ("a.mat" if isinstance(content, dict) else f"a.{'h5' if layout in HDF5 else 'mat'}")
+    if isinstance(content, dict):
+        write_mat(path, content)
+    else:
+        content.write(path, format=layout)
+    said = {"wall_size": 0.6, "bin_width_s": 16e-12}
+    for other in set(OTHERS) - {layout}:
+        with pytest.raises(StorageError, match=f"in the layout '{other}', got one of '{layout}'"):
+            Capture.read(path, other, **said)
+
+
+@pytest.mark.parametrize("layout", OTHERS)
+def test_files_of_no_layout(tmp_path, layout):
+    path = tmp_path / "a.mat"
+    write_mat(path, {"something": [[1.0, 2.0]]})
+    with pytest.raises(StorageError):
+        Capture.read(path, layout, wall_size=1.0, bin_width_s=16e-12)

@@ -1,0 +1,96 @@
+"""A recipe of cheap arrays for the online data set, which goes wrong where it is asked to."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from torchtransient.errors import SceneError
+
+SHAPE = (1, 16, 8, 8)
+
+
+@dataclass(frozen=True)
+class FakeSample:
+    index: int
+    seed: int
+    arrays: dict
+    values: dict
+    outside: tuple = (0.0, 0.0)
+    structure: str = ""
+
+
+class UnpicklableError(Exception):
+    def __init__(self, one, two):
+        super().__init__("cannot be sent")
+
+
+@dataclass(frozen=True)
+class OnlineRecipe:
+    """``fail``, ``die``, ``hang``, ``odd``: numbers of samples that raise, end their process by signal 9, never end, or
+    have another shape. ``once``: a folder in which a death is noted, so that it happens once. ``group``: samples by
+    number modulo it are rendered together. ``pids``: a folder where each producer leaves its process number.
+    """
+
+    seconds: float = 0.0
+    fail: tuple = ()
+    die: tuple = ()
+    hang: tuple = ()
+    odd: tuple = ()
+    unpicklable: tuple = ()
+    once: str = ""
+    pids: str = ""
+    group: int = 1
+    shape: tuple = SHAPE
+    broken: str = field(default="")
+
+    def maker(self):
+        if self.broken:
+            raise SceneError(self.broken)
+        return FakeMaker(self)
+
+
+def arrays_of(index, shape=SHAPE):
+    """All numbers of a sample are its index: a torn one has two."""
+    return {
+        "transient": np.full(shape, index, np.float32),
+        "depth": np.full(shape[-2:], index, np.float32),
+        "shape": np.full(shape[-2:], index, np.int32),
+    }
+
+
+class FakeMaker:
+    def __init__(self, recipe):
+        self.recipe = recipe
+        if recipe.pids:
+            (Path(recipe.pids) / str(os.getpid())).touch()
+
+    def order(self, indices):
+        return sorted(indices, key=lambda index: (index % self.recipe.group, index))
+
+    def sample(self, index):
+        recipe = self.recipe
+        time.sleep(recipe.seconds)
+        if index in recipe.fail:
+            raise SceneError(f"sample {index} has no light")
+        if index in recipe.unpicklable:
+            raise UnpicklableError(1, 2)
+        if index in recipe.die:
+            note = Path(recipe.once) / f"died-{index}"
+            if not recipe.once or not note.exists():
+                if recipe.once:
+                    note.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+        if index in recipe.hang:
+            time.sleep(1000.0)
+        shape = (2, *recipe.shape[1:]) if index in recipe.odd else recipe.shape
+        values = {"wall.reflectance": np.float32([index, 0.5, 0.25]), "box.filename": f"{index % 3}.ply"}
+        return FakeSample(index, index, arrays_of(index, shape), values)
+
+    def close(self):
+        pass

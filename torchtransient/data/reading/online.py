@@ -1,0 +1,125 @@
+"""Rendering while training: processes fill a ring in shared memory, the trainer draws from it at random."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from torchtransient.data.reading.online_producers import WHAT, Producers
+from torchtransient.data.reading.online_schedule import Schedule
+from torchtransient.errors import TorchTransientError, UnitError
+from torchtransient.quantities import shown
+
+
+class OnlineDataset(IterableDataset[dict[str, Any]]):
+    """Samples of a recipe, rendered while they are used: endless, drawn at random from the latest ``capacity`` of them.
+
+    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
+    by name as tensors of the caller's own, ``values`` by key, ``index`` in the recipe. ``DataLoader(data,
+    batch_size=8)`` makes batches; ``num_workers`` other than 0 is an error: the data set has processes of its own. ::
+
+        with OnlineDataset(recipe, workers=2) as data:
+            for step, batch in zip(range(10_000), DataLoader(data, batch_size=8)):
+                ...
+
+    ``recipe``: what can be pickled and has ``maker()``. ``workers``: processes that render, with one thread each; they
+    are spawned at once, so a script needs ``if __name__ == "__main__":``. ``capacity``: samples that are kept, in
+    shared memory. ``warm``: samples there have to be before the first is drawn (at most ``capacity``). ``first``:
+    number of the first sample, so that those of a validation set can be left out; the others follow, each once. What a
+    sample is depends on recipe and number alone, their order on how fast they are made. ``seed``: of the draws. Ranks
+    that train together have a data set each, with another ``first``.
+
+    ``uses``: how often a sample is used, in the mean. It is an upper bound: where the trainer has drawn so many times
+    as many samples as were made, it waits for a new one. A producer waits until those that it would replace have been
+    used so often: every sample is used about that often, less at first, while the ring fills.
+    ``math.inf``: nobody waits, and producers replace what is oldest as fast as they can. ``made``, ``drawn`` and
+    ``waited_s`` (seconds) say how it goes.
+
+    ``transform``: function of the transient; its result stands under ``measurement``. ``timeout_s``: so long without
+    news from a producer is an error.
+
+    An exception of a producer is raised where samples are drawn. A producer that ends otherwise (killed, a crash) is
+    started again with a warning; one that ends twice at the same sample is an error. ``close()``, the end of the
+    with-block, of the object or of the process end the producers and free the memory. Raises UnitError, StorageError
+    (not enough shared memory), ShapeError (samples that differ in kind), TorchTransientError. Not supported: pickling,
+    use in processes that were forked.
+    """
+
+    def __init__(
+        self, recipe: Any, capacity: int = 1024, workers: int = 1, uses: float = 5.0, seed: int = 0, warm: int = 64,
+        *, first: int = 0, transform: Callable[[torch.Tensor], Any] | None = None, timeout_s: float = 600.0,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        capacity, workers = _whole("capacity", capacity, 2), _whole("workers", workers, 1)
+        warm, first, seed = _whole("warm", warm, 1), _whole("first", first, 0), _whole("seed", seed, 0)
+        for name, value in (("uses", uses), ("timeout_s", timeout_s)):
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+                raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
+        self.transform = transform
+        schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)
+        self._producers = Producers(recipe, schedule, capacity, workers, float(timeout_s))
+        # Also when the object is forgotten, and at the end of the interpreter.
+        self._finalizer = weakref.finalize(self, self._producers.close)
+        try:
+            self._producers.start()
+        except BaseException:
+            self.close()
+            raise
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        if get_worker_info() is not None:
+            raise TorchTransientError(
+                f"{WHAT}: it renders in processes of its own; use DataLoader(..., num_workers=0) and "
+                f"{WHAT}(workers=...)."
+            )
+        while True:
+            yield self.draw()
+
+    def draw(self) -> dict[str, Any]:
+        """One sample; waits where there is none that may be used."""
+        sample = self._producers.draw()
+        if self.transform is not None:
+            with torch.no_grad():
+                sample["measurement"] = self.transform(sample["transient"])
+        return sample
+
+    @property
+    def made(self) -> int:
+        """Samples that were rendered."""
+        return self._producers.schedule.made
+
+    @property
+    def drawn(self) -> int:
+        """Samples that were drawn."""
+        return self._producers.schedule.drawn
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds that draws have waited for samples."""
+        return self._producers.waited_s
+
+    def close(self) -> None:
+        """End the producers and free the memory; what was drawn stays."""
+        self._finalizer()
+
+    def __enter__(self) -> OnlineDataset:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise TorchTransientError(
+            f"{WHAT}: processes and shared memory cannot be pickled; make one in each process, or use num_workers=0."
+        )
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise UnitError(f"{WHAT}: expected {name} as a whole number of at least {least}, got {shown(value)}.")
+    return int(value)

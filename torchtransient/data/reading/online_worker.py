@@ -1,0 +1,153 @@
+"""The producer of an online data set: a process that renders what it is asked for, into memory that it is given.
+
+It is told ``("make", index, slot)`` and once ``("ring", {name: tensor})``; it says ``("ready",)``,
+``("layout", {name: (shape, dtype)})`` with its first sample, ``("start", index)``, ``("done", index, values)`` and
+``("error", exception or None, text)``. It ends when nobody listens any more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import signal
+import traceback
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchtransient.errors import ShapeError
+
+Layout = dict[str, tuple[tuple[int, ...], str]]
+
+
+class _NobodyListensError(Exception):
+    pass
+
+
+def produce(connection: Connection, recipe: Any) -> None:
+    """The body of the process."""
+    # Ctrl-C reaches the whole group of processes; the trainer ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    maker = None
+    try:
+        _one_thread()
+        maker = recipe.maker()
+        line = _Line(connection)
+        line.say("ready")
+        _Producer(line, maker).run()
+    except _NobodyListensError:
+        pass
+    except BaseException as error:  # noqa: BLE001 (whatever it is, the trainer has to hear of it)
+        _report(connection, error)
+    finally:
+        if maker is not None:
+            maker.close()
+
+
+def _one_thread() -> None:
+    from torchtransient.render.threads import threads
+
+    threads(1)
+
+
+def _report(connection: Connection, error: BaseException) -> None:
+    text = "".join(traceback.format_exception(error))
+    try:
+        pickle.loads(pickle.dumps(error))
+        sent: BaseException | None = error
+    except Exception:  # noqa: BLE001 (exceptions of others may raise anything here)
+        sent = None
+    with contextlib.suppress(OSError):
+        connection.send(("error", sent, text))
+
+
+class _Line:
+    """The connection; raises _NobodyListensError where its other end is gone."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def say(self, *message: Any) -> None:
+        try:
+            self._connection.send(message)
+        except OSError:
+            raise _NobodyListensError from None
+
+    def hear(self, wait: bool) -> tuple[Any, ...] | None:
+        """The next message; None where there is none and nobody wants to wait."""
+        try:
+            if not wait and not self._connection.poll(0):
+                return None
+            message: tuple[Any, ...] = self._connection.recv()
+            return message
+        except (EOFError, OSError):
+            raise _NobodyListensError from None
+
+
+class _Producer:
+    def __init__(self, line: _Line, maker: Any) -> None:
+        self._line, self._maker = line, maker
+        self._ring: dict[str, np.ndarray] | None = None
+        self._layout: Layout = {}
+        self._asked: dict[int, int] = {}
+
+    def run(self) -> None:
+        while True:
+            self._listen()
+            # All of them before new ones: a kind of scene that the maker puts last has its turn, too.
+            for index in self._maker.order(list(self._asked)):
+                self._line.say("start", index)
+                sample = self._maker.sample(index)
+                self._write(sample.arrays, index, self._asked.pop(index))
+                self._line.say("done", index, dict(sample.values))
+
+    def _listen(self) -> None:
+        """Take in what has been said; waits where nothing is asked for."""
+        message = self._line.hear(wait=not self._asked)
+        while message is not None:
+            self._take(message)
+            message = self._line.hear(wait=not self._asked)
+
+    def _take(self, message: tuple[Any, ...]) -> None:
+        if message[0] == "make":
+            self._asked[message[1]] = message[2]
+        else:
+            self._ring = {name: tensor.numpy() for name, tensor in message[1].items()}
+
+    def _write(self, arrays: dict[str, np.ndarray], index: int, slot: int) -> None:
+        found = layout_of(arrays)
+        if self._ring is None:
+            self._layout = found
+            self._line.say("layout", found)
+            while self._ring is None:
+                message = self._line.hear(wait=True)
+                assert message is not None
+                self._take(message)
+        if found != self._layout:
+            raise ShapeError(
+                f"OnlineDataset: the samples of a recipe have the same names, shapes and types, expected "
+                f"{said(self._layout)}, got {said(found)} in sample {index}."
+            )
+        for name, array in arrays.items():
+            self._ring[name][slot, ...] = array
+
+
+def layout_of(arrays: dict[str, np.ndarray]) -> Layout:
+    """Names, shapes and types of the arrays of a sample."""
+    return {name: (tuple(np.shape(array)), np.asarray(array).dtype.str) for name, array in arrays.items()}
+
+
+def said(layout: Layout) -> str:
+    """A layout in words."""
+    return ", ".join(f"{name} {shape} {np.dtype(kind).name}" for name, (shape, kind) in layout.items())
+
+
+def empty_ring(layout: Layout, capacity: int) -> dict[str, torch.Tensor]:
+    """Shared memory for so many samples."""
+    ring = {}
+    for name, (shape, kind) in layout.items():
+        like = torch.from_numpy(np.empty(0, np.dtype(kind).newbyteorder("=")))
+        ring[name] = torch.empty((capacity, *shape), dtype=like.dtype).share_memory_()  # type: ignore[no-untyped-call]
+    return ring

@@ -1,0 +1,178 @@
+"""What a recipe says: a scene, what varies in it, and what is measured. Nothing is rendered here."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Scan
+from torchtransient.data.recipes.distribution import Distribution, Place
+from torchtransient.data.recipes.distributions import Choice, pick
+from torchtransient.data.recipes.streams import Stream
+from torchtransient.data.recipes.structures import Scenes, Structure
+from torchtransient.data.recipes.written import read_distribution
+from torchtransient.errors import SceneError, ShapeError
+from torchtransient.gates import Gate
+from torchtransient.pulses import Pulse
+from torchtransient.quantities import count, shown
+from torchtransient.render.variant import resolve_variant
+from torchtransient.sensing import DEVICES, Device
+from torchtransient.sensing import device as device_by_name
+
+# The key of what a device's stages vary in: "device.PhotonBudget.cycles".
+DEVICE = "device"
+# Purposes of random numbers that are no keys.
+_SCENE, RENDER, NOISE, SECOND = "scene of OneOf", "seed of the render", "seed of the noise", "seed of another render"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is rendered, as arguments of :class:`Recipe`; see there."""
+
+    labels: tuple[str, ...] = ()
+    time_axis: TimeAxis | None = None
+    frequencies: FrequencyAxis | None = None
+    gates: tuple[Gate, ...] | None = None
+    temporal_filter: str = "auto"
+    spp: int | None = None
+    max_depth: int | None = None
+    sensors: Any = 0
+    pulse: Pulse | None = None
+    irf: Pulse | None = None
+    bounces: tuple[int, ...] | str = (3,)
+    energy: Any = 1.0
+    physics: str = "ignore"
+
+
+class Specification:
+    """The data of :class:`~torchtransient.data.Recipe`, which has the arguments and says what they mean."""
+
+    def __init__(
+        self,
+        scene: Any,
+        vary: Mapping[str, Any] | None = None,
+        *,
+        labels: Sequence[str] = (),
+        time_axis: TimeAxis | None = None,
+        frequencies: FrequencyAxis | Sequence[float] | None = None,
+        gates: Sequence[Gate] | None = None,
+        temporal_filter: str = "auto",
+        spp: int | None = None,
+        max_depth: int | None = None,
+        sensors: int | Sequence[int] | str = 0,
+        variant: str | None = None,
+        pulse: Pulse | None = None,
+        irf: Pulse | None = None,
+        scan: Scan | None = None,
+        bounces: Sequence[int] | str = (3,),
+        energy: Any = 1.0,
+        device: Device | str | Path | Mapping[str, Any] | None = None,
+        physics: str = "ignore",
+        seed: int = 0,
+        parameters: Mapping[str, Any] | None = None,
+        n: int | None = None,
+    ) -> None:
+        if isinstance(labels, str):
+            raise SceneError(f"recipe: labels: expected a list of names, got the text {labels!r}; write [{labels!r}].")
+        if physics not in ("ignore", "error"):
+            raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
+        if scan is not None and not isinstance(scan, Scan):
+            raise SceneError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
+        if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
+            frequencies = FrequencyAxis(tuple(float(number) for number in frequencies))
+        self.seed = count("recipe: seed", seed, 0)
+        self.n = None if n is None else count("recipe: n", n)
+        self.variant = resolve_variant(variant)
+        self.settings = Settings(
+            labels=tuple(labels), time_axis=time_axis, frequencies=frequencies,
+            gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
+            spp=None if spp is None else count("recipe: spp", spp), max_depth=max_depth,
+            sensors=sensors if isinstance(sensors, int | str) else tuple(sensors), pulse=pulse, irf=irf,
+            bounces=bounces if isinstance(bounces, str) else tuple(bounces), energy=energy, physics=physics,
+        )  # fmt: skip
+        self.scan = scan
+        self.device = _device(device)
+        self.scenes = Scenes(scene, self.variant, scan, parameters)
+        self.vary = {str(key): read_distribution(f"recipe: {key!r}", given) for key, given in (vary or {}).items()}
+        self._check_settings()
+
+    def _check_settings(self) -> None:
+        if self.scan is not None and self.settings.time_axis is None and self.settings.frequencies is None:
+            raise SceneError(
+                "recipe: a capture whose hidden things move needs a time_axis= that holds all of their places. "
+                "scan.default_axis(bounds) finds one for the corners (2, 3) of the space that they stay in."
+            )
+        if self.device is None and any(key.split(".")[0] == DEVICE for key in self.vary):
+            raise SceneError("recipe: keys of 'device.' vary a device; give device= too.")
+
+    # ----------------------------------------------------------------------------------------------- structures
+
+    def structure(self, index: int) -> Structure:
+        """Which structure sample ``index`` is of."""
+        names = self.scenes.names
+        name = names[pick(Stream(self.seed, index, _SCENE), len(names), self.scenes.weights)]
+        entries, words = [], [name] if name else []
+        for key in self.exchanged:
+            value = self.vary[key].draw(Stream(self.seed, index, key), Place(key))
+            entries.append((key, value))
+            words.append(f"{key}={label_of(self.vary[key], value)}")
+        return Structure(name, ", ".join(words), tuple(entries))
+
+    @functools.cached_property
+    def exchanged(self) -> list[str]:
+        """The keys that exchange an entry of the description."""
+        return [key for key, one in self.vary.items() if self._is_exchanged(key, one)]
+
+    def _is_exchanged(self, key: str, distribution: Distribution) -> bool:
+        if key.split(".")[0] == DEVICE or not self.scenes.has_entry(key):
+            return False
+        # Of what stands in the description and is a parameter too, numbers vary as values.
+        texts = isinstance(distribution, Choice) and any(is_entry(value) for value in distribution.values)
+        return texts or key not in self._parameters
+
+    @functools.cached_property
+    def _parameters(self) -> frozenset[str]:
+        """Parameters with a derivative of the scenes as they are described."""
+        return self.scenes.parameters(self.settings.bounces, self.settings.energy)
+
+
+def _device(given: Any) -> Device | None:
+    if given is None or isinstance(given, Device):
+        return given
+    if isinstance(given, Mapping):
+        return Device.from_dict(given)
+    if isinstance(given, str) and given in DEVICES:
+        return device_by_name(given)
+    if isinstance(given, str | Path):
+        if not Path(given).is_file():
+            known = ", ".join(sorted(DEVICES))
+            raise SceneError(f"recipe: device: expected a device, its file, or one of {known}; got {str(given)!r}.")
+        return Device.from_json(Path(given)) if Path(given).suffix == ".json" else Device.from_yaml(Path(given))
+    raise SceneError(f"recipe: device: expected a device, its name or its file, got {shown(given)}.")
+
+
+def is_entry(value: Any) -> bool:
+    """Whether a choice is no number or array, but an entry of a description."""
+    return isinstance(value, str | Mapping | Scan | bool) or value is None
+
+
+def label_of(distribution: Distribution, value: Any) -> str:
+    """A short text for a drawn entry: texts and numbers themselves, others by their number among the choices."""
+    if isinstance(value, str | int | float):
+        return str(value)
+    if isinstance(distribution, Choice):
+        return f"#{next(i for i, one in enumerate(distribution.values) if one is value)}"
+    return str(value)
+
+
+def samples_of(indices: Iterable[int]) -> list[int]:
+    """Numbers of samples, checked. Raises ShapeError."""
+    found = [int(index) for index in indices]
+    if any(index < 0 for index in found):
+        raise ShapeError(f"recipe: expected sample numbers of at least 0, got {min(found)}.")
+    return found
+

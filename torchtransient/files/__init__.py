@@ -1,0 +1,1 @@
+"""Renders, captures and volumes on disk, and what files of this library share."""

@@ -1,0 +1,239 @@
+"""Arrays and entries by name in one file: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Entries are attributes of an HDF5 file and zero-dimensional arrays of an `.npz`. Large arrays are written in parts, so
+that no second copy of them is needed, and a file takes its place once it is whole.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import secrets
+import shutil
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.files.hdf5_limits import check_size, read_attributes, read_dataset
+from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.quantities import shown
+
+HDF5 = (".h5", ".hdf5")
+ENDINGS = (*HDF5, ".npz")
+_PART_BYTES = 2**26
+# What the readers of NumPy and h5py raise for files that are damaged or something else.
+_DAMAGED = (
+    OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile, RuntimeError, AttributeError, IndexError,
+    ArithmeticError, zlib.error, struct.error, tokenize.TokenError, SyntaxError,
+)  # fmt: skip
+
+
+def path_of(path: Any, what: str) -> Path:
+    """`path` as a Path. Raises StorageError for what is no name of a file, on this disk for instance."""
+    try:
+        found = Path(path)
+        os.lstat(found)
+    except (FileNotFoundError, NotADirectoryError):
+        return found
+    except (TypeError, ValueError, OSError) as error:
+        reason = "" if isinstance(error, TypeError) else f": {error}"
+        raise StorageError(f"{what}: expected the name of a file, got {shown(path)}{reason}.") from None
+    return found
+
+
+def check_source(path: Any, what: str) -> Path:
+    """`path`, or StorageError where there is no file to read: nothing, a folder, a device or a pipe."""
+    source = path_of(path, what)
+    if source.is_file():
+        return source
+    problem = "is a folder" if source.is_dir() else "is no file on a disk" if source.exists() else "does not exist"
+    raise StorageError(f"{what}: '{source}' {problem}. Give the name of a file.")
+
+
+def check_target(path: str | Path, what: str) -> Path:
+    """Return `path`, or raise StorageError when a file could not be written there. For before long computations.
+
+    `what`: what the file is, for messages.
+    """
+    target = path_of(path, what)
+    if target.suffix.lower() not in ENDINGS:
+        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{target}'.")
+    check_folder(target, what)
+    if target.suffix.lower() in HDF5:
+        hdf5_package(what)
+    return target
+
+
+def check_folder(path: str | Path, what: str) -> None:
+    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is there and no file that may
+    be written: a folder, a device, a pipe, a file without permission.
+    """
+    target = path_of(path, what)
+    # What a link points to is replaced, not the link.
+    place = Path(os.path.realpath(target)) if target.is_symlink() else target
+    if not place.parent.is_dir():
+        raise StorageError(f"{what}: the folder '{place.parent}' does not exist. Create it first.")
+    closed = next((p for p in (place.parent, place) if p.exists() and not os.access(p, os.W_OK)), None)
+    if place.is_dir() or closed or (place.exists() and not place.is_file()):
+        problem = f"cannot be written: no permission for '{closed}'" if closed else "is no file on a disk"
+        raise StorageError(f"{what}: '{target}' {'is a folder' if place.is_dir() else problem}. Choose another place.")
+
+
+def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
+    """Write a file that was checked. One that is there is replaced once the new one is complete. Raises StorageError
+    for a full disk.
+    """
+    with replacing(target, what) as unfinished:
+        if target.suffix.lower() in HDF5:
+            _write_hdf5(unfinished, arrays, entries, what)
+            return
+        with unfinished.open("wb") as file:
+            # numpy writes arrays that are not contiguous through a small buffer
+            everything: dict[str, Any] = {**arrays, **{name: np.array(value) for name, value in entries.items()}}
+            np.savez(file, **everything)
+
+
+def read_arrays(
+    path: str | Path, form: str, what: str, known: Callable[[str], bool] = lambda name: True
+) -> dict[str, Any]:
+    """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is `form`.
+
+    Raises StorageError for a file that is missing, of another format, or damaged.
+    """
+    source = path_of(path, what)
+    if source.suffix.lower() not in ENDINGS:
+        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
+    check_source(source, what)
+    with damage_said(source, what):
+        hdf5 = source.suffix.lower() in HDF5
+        values = _read_hdf5(source, what, known) if hdf5 else _read_npz(source, what, known)
+        found = str(values["format"])
+        if found != form:
+            raise StorageError(f"{what}: '{source}' is of format '{found}'; this version reads '{form}'.")
+        return values
+
+
+@contextmanager
+def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
+    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected of a file
+    of another program, where the library's own errors are repeated as they are: arguments may have been wrong.
+    """
+    try:
+        yield
+    except MemoryError as error:
+        raise StorageError(f"{what}: '{source}' does not fit into memory, or is damaged.") from error
+    except _DAMAGED as error:
+        if isinstance(error, StorageError):
+            raise
+        if isinstance(error, TorchTransientError) and kind:
+            raise StorageError(f"{what}: '{source}': {error}") from error
+        kind = kind or f"a {what.removesuffix(' file')} of torchtransient"
+        raise StorageError(f"{what}: '{source}' is not {kind}, or is damaged: {str(error).rstrip('.')}.") from error
+
+
+def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
+    """A tensor as an array on the CPU. Raises StorageError for dtypes that NumPy does not have, and for tensors whose
+    numbers do not stand in memory one behind another.
+    """
+    if tensor.layout != torch.strided or tensor.device.type == "meta":
+        raise StorageError(
+            f"{what}: expected a tensor with all its numbers, got one {_lacking(tensor)}. Use tensor.to_dense(), or "
+            "compute it on a device."
+        )
+    plain = tensor.detach().resolve_conj().resolve_neg().cpu()
+    try:
+        array: NDArray[Any] = plain.numpy()
+    except TypeError as error:
+        raise StorageError(f"{what}: {tensor.dtype} cannot be stored; use tensor.float() instead.") from error
+    return array
+
+
+def _lacking(tensor: torch.Tensor) -> str:
+    return "on the device meta" if tensor.device.type == "meta" else f"of layout {tensor.layout}"
+
+
+def tensor_in(array: Any) -> torch.Tensor:
+    """An array of a file as a tensor, on its memory where its bytes have this machine's order."""
+    found = np.asarray(array)
+    return torch.from_numpy(found.astype(found.dtype.newbyteorder("="), copy=False))
+
+
+@contextmanager
+def replacing(target: Path, what: str) -> Iterator[Path]:
+    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails. Of a
+    link, the file that it points to is replaced; permissions stay.
+    """
+    place = Path(os.path.realpath(target))
+    # No longer than names may be.
+    unfinished = place.with_name(f".{place.name[:40]}.{secrets.token_hex(4)}.part")
+    try:
+        yield unfinished
+        if place.exists():
+            shutil.copymode(place, unfinished)
+        unfinished.replace(place)
+    except OSError as error:
+        raise StorageError(f"{what}: '{target}' could not be written: {error}.") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
+    with new_hdf5(path, what) as file:
+        for name, value in entries.items():
+            file.attrs[name] = value
+        for name, array in arrays.items():
+            dataset = file.create_dataset(name, shape=array.shape, dtype=array.dtype)
+            for part in _parts(array):
+                dataset[part] = array[part]
+
+
+def _parts(array: NDArray[Any]) -> Iterator[Any]:
+    """Indices of rows of an image: the film keeps H first, so they are read in order, and only they are copied."""
+    if array.ndim < 2:
+        yield ...
+        return
+    rows = array.shape[-2]
+    step = max(1, _PART_BYTES * rows // max(1, array.nbytes))
+    for row in range(0, rows, step):
+        yield ..., slice(row, row + step), slice(None)
+
+
+def _read_hdf5(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    with hdf5_package(what).File(path, "r") as file:
+        arrays = {name: read_dataset(file, name, what) for name in file if known(name)}
+        return {**arrays, **read_attributes(file, what, [name for name in file.attrs if known(name)])}
+
+
+def _read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    with zipfile.ZipFile(path) as file:
+        for entry in file.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if known(name):
+                _check_member(file, entry, f"{what}: '{name}'")
+                with file.open(entry) as stream:
+                    found[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    return found
+
+
+def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str) -> None:
+    """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise StorageError(f"{what} is packed as NumPy packs nothing (method {entry.compress_type}). Use np.savez.")
+    with file.open(entry) as stream:
+        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        version = np.lib.format.read_magic(stream)
+        if version not in read_header:
+            raise StorageError(f"{what} is an array of version {version}, which NumPy writes for none of numbers.")
+        shape, _, dtype = read_header[version](stream)
+    check_size(math.prod(shape) * dtype.itemsize, entry.compress_size, f"{what} {shape}")

@@ -1,0 +1,166 @@
+"""What lies in a file of another program: arrays and texts by name, whatever kind of file it is.
+
+HDF5, and MATLAB's files of both kinds: 7.3, which are HDF5, and those before. Arrays have the order of HDF5 throughout;
+that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import check_source, damage_said
+from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.hdf5_limits import read_attributes, read_dataset
+from torchtransient.files.hdf5_writing import hdf5_package
+
+WHAT = "capture file"
+
+
+class Contents(Protocol):
+    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
+    names that lead elsewhere, which are not followed.
+
+    ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
+    ``structure/field``. ``text(name)`` likewise.
+    """
+
+    source: Path
+    shapes: Mapping[str, tuple[int, ...] | None]
+    attributes: Mapping[str, str]
+    links: frozenset[str]
+
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None: ...
+    def text(self, name: str) -> str | None: ...
+    def fields(self, name: str) -> frozenset[str]: ...
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[Contents]:
+    """The contents of an HDF5 or MATLAB file. Raises StorageError for others, and for what is damaged."""
+    source = check_source(path, WHAT)
+    with damage_said(source, WHAT, "a capture of the layout that was read"):
+        if _is_old_mat(source):
+            yield MatContents(source)
+            return
+        with hdf5_package(WHAT).File(source, "r") as file:
+            yield Hdf5Contents(source, file)
+
+
+class Hdf5Contents:
+    """An open HDF5 file."""
+
+    def __init__(self, source: Path, file: Any) -> None:
+        self.source, self._file = source, file
+        self.shapes: Mapping[str, tuple[int, ...] | None] = {
+            name: self._shape(name) for name in file if name != "#refs#"
+        }
+        self.attributes: Mapping[str, str] = {
+            name: _sole(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
+        }
+
+        self.links = frozenset(name for name in self.shapes if self._is_link(name))
+
+    def _is_link(self, name: str) -> bool:
+        """Whether there is no more than a way to elsewhere, or nothing."""
+        import h5py
+
+        return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
+
+    def _shape(self, name: str) -> tuple[int, ...] | None:
+        import h5py
+
+        if self._is_link(name):
+            return None
+        found = self._file[name]
+        return found.shape if isinstance(found, h5py.Dataset) else None
+
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
+        value = self._read(name, part)
+        if isinstance(value, str):
+            raise StorageError(f"{WHAT}: expected numbers in '{name}', got a text.")
+        return None if value is None or value.size == 0 else value
+
+    def text(self, name: str) -> str | None:
+        value = self._read(name)
+        if value is not None and not isinstance(value, str):
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
+        return value
+
+    def fields(self, name: str) -> frozenset[str]:
+        """The names in a structure; empty for what is none."""
+        import h5py
+
+        if self._is_link(name):
+            return frozenset()
+        found = self._file[name]
+        return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
+
+    def _read(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
+        return read_dataset(self._file, name, WHAT, part)
+
+
+def _sole(value: Any) -> str:
+    """A text, also one in an array of one."""
+    sole = np.asarray(value).reshape(-1)[0] if np.size(value) == 1 else value
+    return sole.decode("utf-8", "replace") if isinstance(sole, bytes) else str(sole)
+
+
+class MatContents:
+    """A MATLAB file of versions 5 to 7."""
+
+    def __init__(self, source: Path) -> None:
+        self.source = source
+        self._file = Mat5File(source)
+        self.shapes: Mapping[str, tuple[int, ...] | None] = {
+            name: variable.shape for name, variable in self._file.variables.items()
+        }
+        self._kept: dict[str, Any] = {}
+        self.attributes: Mapping[str, str] = {}
+        self.links: frozenset[str] = frozenset()
+
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
+        value: Any = self._variable(name.split("/")[0])
+        for field in name.split("/")[1:]:
+            if not isinstance(value, dict):
+                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {_words(value)}.")
+            value = value.get(field)
+        if value is not None and not isinstance(value, np.ndarray):
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {_words(value)}.")
+        return None if value is None else value[part]
+
+    def text(self, name: str) -> str | None:
+        value = self._variable(name)
+        if value is not None and not isinstance(value, str):
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got {_words(value)}.")
+        return value
+
+    def fields(self, name: str) -> frozenset[str]:
+        value = self._variable(name)
+        return frozenset(value) if isinstance(value, dict) else frozenset()
+
+    def _variable(self, name: str) -> Any:
+        if name not in self.shapes:
+            return None
+        if name not in self._kept:
+            self._kept[name] = self._file.read(name, WHAT)
+        return self._kept[name]
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Other):
+        return value.kind
+    return "a structure" if isinstance(value, dict) else "a text" if isinstance(value, str) else "an array of numbers"
+
+
+def _is_old_mat(source: Path) -> bool:
+    with source.open("rb") as file:
+        start = file.read(HEADER_BYTES)
+    # Version 0x0100, whose bytes tell their order; 7.3 has 0x0200 and is HDF5.
+    return len(start) == HEADER_BYTES and start[124:] in (b"\x00\x01IM", b"\x01\x00MI")

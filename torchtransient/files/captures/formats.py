@@ -1,0 +1,169 @@
+"""Captures of this and of other programs on disk: which layout a file has is found from what lies in it."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from torchtransient.axes import FrequencyAxis
+from torchtransient.capture import Capture
+from torchtransient.capture.files import register_files
+from torchtransient.errors import StorageError
+from torchtransient.files import capture_file
+from torchtransient.files.array_file import HDF5, check_folder, damage_said, path_of
+from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, zaragoza
+from torchtransient.files.captures.contents import WHAT, Contents, opened
+from torchtransient.files.captures.gaps import Gaps
+from torchtransient.files.hdf5_limits import read_attributes
+from torchtransient.files.hdf5_writing import hdf5_package
+from torchtransient.quantities import shown
+
+OWN = "torchtransient"
+_MAT = (".mat",)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout of files: ``recognises`` what lies in one, ``read``, and ``write`` where that makes sense.
+
+    ``endings``: those of files that are written.
+    """
+
+    name: str
+    recognises: Callable[[Contents], bool]
+    read: Callable[[Contents, Gaps], Capture]
+    write: Callable[[Path, Capture], None] | None
+    endings: tuple[str, ...]
+
+
+def _layout(module: ModuleType, endings: tuple[str, ...]) -> Layout:
+    return Layout(module.NAME, module.recognises, module.read, getattr(module, "write", None), endings)
+
+
+# In the order in which they are tried: names of variables that say most come first.
+LAYOUTS = (
+    _layout(tal, HDF5), _layout(zaragoza, HDF5), _layout(dirac, HDF5), _layout(phasor_field, _MAT),
+    _layout(keyhole, _MAT), _layout(rect_data, _MAT), _layout(cdt, _MAT),
+)  # fmt: skip
+FORMATS = (OWN, *(layout.name for layout in LAYOUTS))
+
+
+def read_capture(
+    path: str | Path,
+    format: str | None = None,
+    *,
+    wall_size: Any = None,
+    bin_width_s: float | None = None,
+    start_s: float | None = None,
+    sensor_origin: Any = None,
+    laser_origin: Any = None,
+    frequencies: FrequencyAxis | None = None,
+) -> Capture:
+    """Read a capture of any known layout, as tensors on the CPU. Nothing in the file is executed.
+
+    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data" or "cdt"; None finds
+    it from the content, not from the name. Measured arrays are read once, and not copied after that but to sum bounces
+    or to make signed numbers of unsigned ones; axes change places as views. In what is not of this library
+    ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said, with the value
+    that was taken, and ``metadata["not_read"]`` what else lies in the file.
+
+    The other arguments say what a file leaves open; docs/capture_files.md tells which layout needs which. `wall_size`:
+    metres, one number or (width, height) of a scanned area whose points are the centres of its cells. `bin_width_s`,
+    `start_s`: seconds. `sensor_origin`, `laser_origin`: (3,) metres. `frequencies`: of phasors.
+
+    Raises StorageError for files that are missing, damaged, of no known layout, or that hold what is no capture of this
+    library; where something is left open that counts; where an argument has no meaning or the file says it itself.
+    """
+    given = {
+        "wall_size": wall_size, "bin_width_s": bin_width_s, "start_s": start_s, "sensor_origin": sensor_origin,
+        "laser_origin": laser_origin, "frequencies": frequencies,
+    }  # fmt: skip
+    _check_name(format, FORMATS)
+    source = path_of(path, WHAT)
+    if format == OWN or (format is None and _is_own(source)):
+        Gaps(given, OWN, source).check_all_used()
+        return capture_file.read_capture(source)
+    with opened(source) as contents:
+        layout = _found(contents) if format is None else _asked_for(contents, format)
+        gaps = Gaps(given, layout.name, source)
+        capture = layout.read(contents, gaps)
+        gaps.check_all_used()
+        return capture
+
+
+def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, format: str = OWN) -> Path:
+    """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
+
+    `format`: as in :func:`read_capture` but "keyhole" and "cdt", which are only read. The library's own holds all of a
+    capture, and `metadata`, plain data, beside its own. What another layout cannot hold is an error.
+
+    Raises StorageError for an unknown format or ending, a folder that is missing, a full disk, and captures that the
+    format cannot hold.
+    """
+    _check_name(format, FORMATS)
+    if format == OWN:
+        return capture_file.write_capture(path, capture, metadata)
+    layout = next(entry for entry in LAYOUTS if entry.name == format)
+    if layout.write is None:
+        names = ", ".join([OWN, *(entry.name for entry in LAYOUTS if entry.write is not None)])
+        raise StorageError(f"{WHAT}: the layout {format!r} is only read. Write one of {names}.")
+    if metadata is not None:
+        raise StorageError(f"{WHAT}: metadata= is for the library's own format; got it with format={format!r}.")
+    if not isinstance(capture, Capture):
+        raise StorageError(f"{WHAT}: expected a tt.nlos.Capture, got {type(capture).__name__}.")
+    target = path_of(path, WHAT)
+    if target.suffix.lower() not in layout.endings:
+        endings = ", ".join(layout.endings)
+        raise StorageError(f"{WHAT}: expected a name that ends in {endings} for format={format!r}, got '{target}'.")
+    check_folder(target, WHAT)
+    layout.write(target, capture)
+    return target
+
+
+def _check_name(name: Any, names: tuple[str, ...]) -> None:
+    if name is not None and name not in names:
+        raise StorageError(f"{WHAT}: expected format to be one of {', '.join(names)}, got {shown(name)}.")
+
+
+def _is_own(source: Path) -> bool:
+    """Whether a file says that it is one of this library."""
+    if not source.is_file():
+        return False
+    if zipfile.is_zipfile(source):
+        return True
+    with damage_said(source, WHAT), source.open("rb") as file:
+        if file.read(8) != b"\x89HDF\r\n\x1a\n":
+            return False
+    with damage_said(source, WHAT), hdf5_package(WHAT).File(source, "r") as file:
+        return str(read_attributes(file, WHAT, ["format"]).get("format", "")).startswith(OWN)
+
+
+def _asked_for(contents: Contents, name: str) -> Layout:
+    """The layout of a name. Raises StorageError for a file that has another one."""
+    layout = next(entry for entry in LAYOUTS if entry.name == name)
+    others = [entry.name for entry in LAYOUTS if entry.recognises(contents)]
+    if others and not layout.recognises(contents):
+        raise StorageError(
+            f"{WHAT}: expected '{contents.source}' in the layout {name!r}, got one of {others[0]!r} (it holds "
+            f"{', '.join(sorted(contents.shapes))}). Leave format= out, or give format={others[0]!r}."
+        )
+    return layout
+
+
+def _found(contents: Contents) -> Layout:
+    for layout in LAYOUTS:
+        if layout.recognises(contents):
+            return layout
+    held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
+    names = ", ".join(sorted(held)) or "nothing"
+    raise StorageError(
+        f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
+        "is one of these; read it with h5py and make a tt.nlos.Capture if it is not."
+    )
+
+
+register_files(read_capture, write_capture)

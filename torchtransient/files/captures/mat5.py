@@ -1,0 +1,184 @@
+"""MATLAB files of versions 5 to 7 ("MAT-File Format", The MathWorks, level 5): arrays of numbers, texts and structures
+of them. Others' readers trust the types that a damaged file names, and may end the process.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.files.hdf5_limits import check_memory, check_size
+
+HEADER_BYTES = 128
+# How numbers are stored, by the types of elements; texts have their letters in some of these.
+_STORED = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8", 16: "u1", 17: "u2",
+    18: "u4",
+}  # fmt: skip
+_MATRIX, _COMPRESSED = 14, 15
+_INT32, _UINT32, _UTF8 = 5, 6, 16
+# What they are, by the classes of arrays. Logical ones are bytes, as in version 7.3.
+_NUMBERS = {
+    6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
+_OTHERS = {1: "a cell array", 2: "an array of structures", 3: "an object", 4: "a text", 5: "a sparse matrix"}
+_STRUCTURE, _TEXT = 2, 4
+_COMPLEX = 0x0800
+# Of the start of a variable: its class, dimensions and name.
+_START_BYTES = 4096
+_LEVELS = 10
+
+Value = NDArray[Any] | str | dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Other:
+    """What is neither numbers nor a text nor one structure; ``kind`` in words."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable whose values have not been read: where it lies, ``stored`` and ``unpacked`` bytes; ``shape`` in the
+    order of HDF5, the reverse of MATLAB's, None for structures.
+    """
+
+    name: str
+    shape: tuple[int, ...] | None
+    place: int
+    stored: int
+    unpacked: int
+    compressed: bool
+
+
+class Mat5File:
+    """A file of version 5 to 7. Raises ValueError, StorageError and zlib.error for damage."""
+
+    def __init__(self, source: Path) -> None:
+        self._source = source
+        with source.open("rb") as file:
+            self._order = "<" if file.read(HEADER_BYTES).endswith(b"IM") else ">"
+            self.variables = {variable.name: variable for variable in self._listed(file)}
+
+    def read(self, name: str, what: str) -> Value | Other:
+        """Numbers in the order of HDF5, a text, a structure by its fields; None for what is empty."""
+        variable = self.variables[name]
+        what = f"{what}: '{name}' {variable.shape or ''}".rstrip()
+        check_size(variable.unpacked, variable.stored, what)
+        with self._source.open("rb") as file:
+            file.seek(variable.place)
+            data: bytes | bytearray = bytearray(variable.stored)
+            file.readinto(data)
+        if not variable.compressed:
+            return _value(memoryview(data), self._order, what, 0)
+        data = zlib.decompressobj().decompress(data, variable.unpacked + 8)
+        return _value(memoryview(data)[8:], self._order, what, 0)
+
+    def _listed(self, file: Any) -> Iterator[Variable]:
+        size = self._source.stat().st_size
+        while len(tag := file.read(8)) == 8:
+            kind, stored = struct.unpack(f"{self._order}II", tag)
+            place, unpacked = file.tell(), stored
+            if place + stored > size:
+                raise ValueError(f"a variable of {stored} bytes does not end in a file of {size}")
+            start = file.read(min(stored, _START_BYTES))
+            if kind == _COMPRESSED:
+                start = zlib.decompressobj().decompress(start, _START_BYTES)
+                inner, unpacked = struct.unpack(f"{self._order}II", start[:8])
+                start = start[8:]
+            if (inner if kind == _COMPRESSED else kind) != _MATRIX:
+                raise ValueError(f"expected a variable at byte {place - 8}, got an element of type {kind}")
+            flags, dims, name = _head(_Elements(memoryview(start), self._order))
+            if name:  # else functions' own
+                shape = None if flags & 0xFF == _STRUCTURE else dims
+                yield Variable(name, shape, place, stored, unpacked, kind == _COMPRESSED)
+            file.seek(place + stored)
+
+
+class _Elements:
+    """The elements of a matrix, one behind another."""
+
+    def __init__(self, data: memoryview, order: str) -> None:
+        self._data, self.order, self._at = data, order, 0
+
+    def next(self) -> tuple[int, memoryview]:
+        """Type and bytes of the next one. Raises ValueError where it does not end."""
+        if len(self._data) < self._at + 8:
+            raise ValueError("a variable ends too early")
+        kind, size = struct.unpack_from(f"{self.order}II", self._data, self._at)
+        small = kind >> 16
+        first = self._at + (4 if small else 8)
+        kind, size = (kind & 0xFFFF, small) if small else (kind, size)
+        if (small > 4) or first + size > len(self._data):
+            raise ValueError(f"an element of {size} bytes does not end where its variable does")
+        self._at = self._at + 8 if small else first + -(-size // 8) * 8
+        return kind, self._data[first : first + size]
+
+    def numbers(self, *kinds: int) -> NDArray[Any]:
+        """The next one as numbers, of one of the types that are given, or any."""
+        kind, data = self.next()
+        if kind not in (kinds or _STORED):
+            raise ValueError(f"expected numbers, got an element of type {kind}")
+        return np.frombuffer(data, np.dtype(self.order + _STORED[kind]))
+
+
+def _head(elements: _Elements) -> tuple[int, tuple[int, ...], str]:
+    """Flags, dimensions in the order of HDF5, and name of a matrix."""
+    flags, dims = elements.numbers(_UINT32), elements.numbers(_INT32)
+    if len(flags) < 1 or len(dims) < 2 or bool((dims < 0).any()):
+        raise ValueError(f"expected two dimensions or more, got {dims[:8].tolist()}")
+    name = bytes(elements.next()[1]).split(b"\0")[0].decode("latin-1")
+    return int(flags[0]), tuple(reversed(dims.tolist())), name
+
+
+def _value(data: memoryview, order: str, what: str, level: int) -> Value | Other:
+    if not len(data):
+        return None
+    if level > _LEVELS:
+        raise ValueError(f"structures in structures, more than {_LEVELS} deep")
+    elements = _Elements(data, order)
+    flags, shape, _ = _head(elements)
+    kind, count = flags & 0xFF, math.prod(shape)
+    if count == 0 and kind in (*_NUMBERS, _TEXT):
+        return None
+    if kind in _NUMBERS:
+        check_memory(count * np.dtype(_NUMBERS[kind]).itemsize, what)
+        real = _numbers(elements, kind, shape)
+        return real + 1j * _numbers(elements, kind, shape) if flags & _COMPLEX else real
+    if kind == _TEXT:
+        stored, letters = elements.next()
+        if stored == _UTF8:
+            return bytes(letters).decode("utf-8")
+        codes = np.frombuffer(letters, np.dtype(order + _STORED[stored]))
+        return "".join(map(chr, codes.tolist()))
+    if kind == _STRUCTURE and count == 1:
+        length = int(elements.numbers(_INT32)[0])
+        names = bytes(elements.next()[1])
+        if length < 1:
+            raise ValueError(f"expected names of a letter or more, got {length}")
+        found: dict[str, Any] = {}
+        for first in range(0, len(names), length):
+            stored, field = elements.next()
+            if stored != _MATRIX:
+                raise ValueError(f"expected an array in a structure, got an element of type {stored}")
+            name = names[first : first + length].split(b"\0")[0].decode("latin-1")
+            found[name] = _value(field, order, what, level + 1)
+        return found
+    return Other(_OTHERS.get(kind, f"of class {kind}"))
+
+
+def _numbers(elements: _Elements, kind: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    stored = elements.numbers()
+    if len(stored) != math.prod(shape):
+        raise ValueError(f"expected {math.prod(shape)} numbers {shape}, got {len(stored)}")
+    with np.errstate(all="ignore"):  # a damaged file may store what its class does not hold
+        return np.require(stored.astype(_NUMBERS[kind], copy=False), requirements="W").reshape(shape)

@@ -1,0 +1,364 @@
+"""Captures of y-tal 0.20 and 0.21 (Royo et al., "TAL", HDF5): read, and written so that y-tal reads them.
+
+``H`` is (T, Sx, Sy), (T, Lx, Ly, Sx, Sy), (T, Si) or (T, Li, Si), in the frequency domain with F in place of T;
+polarized ones have four Stokes components behind. Grids are (X, Y, 3), with x first: here rows run along y, so that all
+of these axes change places, as views. ``delta_t`` and ``t_start`` are metres of optical path, ``scene_info`` is YAML,
+which y-tal executes and this reader does not. What is missing is HDF5's empty dataset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient.capture import Capture, Scan
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of, replacing
+from torchtransient.files.captures import tal_scene_info
+from torchtransient.files.captures.contents import WHAT, Contents
+from torchtransient.files.captures.gaps import (
+    Gaps,
+    assumed_in,
+    cannot,
+    frequency_axis,
+    one_channel,
+    same_points,
+    scan_of,
+    tensor_of,
+    time_axis,
+)
+from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.hdf5_writing import hdf5_package, new_hdf5
+
+NAME = "tal"
+_STOKES = 4
+_LEGS = "t_accounts_first_and_last_bounces"
+_KNOWN = frozenset(
+    f"{who}_{what}" for who in ("sensor", "laser") for what in ("xyz", "grid_xyz", "grid_normals", "grid_format")
+) | {"H", "H_format", "volume_format", "delta_t", "t_start", _LEGS, "scene_info"}
+_GRIDS = {"UNKNOWN": 0, "N_3": 1, "X_Y_3": 2}
+_VOLUMES = {"UNKNOWN": 0, "N_3": 1, "X_Y_Z_3": 2, "X_Y_3": 3}
+
+
+@dataclass(frozen=True)
+class HFormat:
+    """What the dimensions of ``H`` are: ``grids`` of points or lists, with those of the laser or without."""
+
+    number: int
+    frequencies: bool
+    lasers: bool
+    grids: bool
+
+    @property
+    def dims(self) -> int:
+        return 1 + (2 if self.grids else 1) * (2 if self.lasers else 1)
+
+
+_FORMATS = {
+    "T_Sx_Sy": HFormat(1, False, False, True), "T_Lx_Ly_Sx_Sy": HFormat(2, False, True, True),
+    "T_Si": HFormat(3, False, False, False), "T_Li_Si": HFormat(4, False, True, False),
+    "F_Sx_Sy": HFormat(10, True, False, True), "F_Lx_Ly_Sx_Sy": HFormat(11, True, True, True),
+    "F_Si": HFormat(12, True, False, False), "F_Li_Si": HFormat(13, True, True, False),
+}  # fmt: skip
+_NUMBERS = {"UNKNOWN": 0} | {name: form.number for name, form in _FORMATS.items()}
+
+
+def recognises(contents: Contents) -> bool:
+    """Whether a file is one of y-tal's."""
+    return {"H", "H_format", "sensor_grid_xyz"} <= set(contents.shapes)
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+
+
+def read(contents: Contents, gaps: Gaps) -> Capture:
+    """The capture of a file of y-tal. ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` what makes a
+    file that is written of it the same again.
+
+    Origins that are missing are assumed where their distance does not count. Raises StorageError for laser points that
+    are neither one, nor those of the sensor, nor a dimension of their own.
+    """
+    number = _whole(contents, "H_format", gaps)
+    form = next((form for form in _FORMATS.values() if form.number == number), None)
+    if form is None:
+        raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
+    kept: dict[str, Any] = {"dtypes": {}}
+    text = contents.text("scene_info")
+    info = None if text is None else tal_scene_info.parsed(text, WHAT)
+    own = tal_scene_info.own_part(info)
+    legs = gaps.fill(_LEGS, _flag(contents, _LEGS, kept), False)
+    scan = _scan(contents, gaps, form, legs, kept)
+    measured = _measured(contents, gaps, form, kept)
+    polarized = measured.ndim == form.dims + 1
+    start, width = _number(contents, "t_start", kept, gaps), _number(contents, "delta_t", kept, gaps)
+    settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
+    tensor = _from_tal(measured, form, polarized)
+    if form.frequencies:
+        found = tal_scene_info.frequencies(info, own, len(measured), start)
+        axis = frequency_axis(gaps, found)
+        if start is not None and axis.start_opl != start:
+            raise gaps.error(
+                f"t_start says that phases count from {start!r} m, the frequencies from {axis.start_opl!r} m. Give "
+                f"frequencies=FrequencyAxis(..., start_opl={start!r})."
+            )
+        settings |= {"transient": None, "axis": None, "phasor": tensor, "frequencies": axis}
+        kept |= {"delta_t": width}
+    else:
+        settings |= {"transient": tensor, "axis": time_axis(gaps, start, width, len(measured))}
+    left = sorted(set(contents.shapes) - _KNOWN)
+    if own is not None:
+        return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
+    kept |= {"scene_info_text": text, "volume_format": _volume(contents, gaps)}
+    return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
+
+
+def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], left: list[str]) -> dict[str, Any]:
+    """What this library has written beside, into ``scene_info``; ``assumed`` and ``left`` where another program has
+    taken something out since, or put something in.
+    """
+    metadata, steady = dict(own.get("metadata") or {}), own["steady"]
+    if steady is not None and np.shape(steady)[-len(scan.shape) :] != scan.shape:
+        # Another program has cut or thinned the points out since.
+        left, steady = [*left, "steady"], None
+    if assumed:
+        metadata["assumed"] = {**(metadata.get("assumed") or {}), **assumed}
+    if left:
+        metadata["not_read"] = left
+    return {
+        "scan": replace(scan, wall=own["wall"]), "metadata": metadata, "steady": steady,
+        "channels": tuple(own.get("channels") or ()),
+    }  # fmt: skip
+
+
+def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any]) -> Tensor:
+    array = contents.array("H")
+    if array is None:
+        raise gaps.error("H is missing or empty.")
+    if array.ndim != form.dims and not (array.ndim == form.dims + 1 and array.shape[-1] == _STOKES):
+        raise gaps.error(f"expected H with {form.dims} dimensions as H_format says, got {array.shape}.")
+    if (array.dtype.kind == "c") != form.frequencies:
+        raise gaps.error(f"expected {'complex' if form.frequencies else 'real'} numbers in H, got {array.dtype}.")
+    kept["dtypes"]["H"] = array.dtype.str
+    return tensor_of(array)
+
+
+def _from_tal(measured: Tensor, form: HFormat, polarized: bool) -> Tensor:
+    """(T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
+    tensor = _swapped(measured, form)
+    return tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
+
+
+def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
+    """x and y of each grid in the other order, which is its own reverse."""
+    if not form.grids:
+        return tensor
+    return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
+
+
+def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool, kept: dict[str, Any]) -> Scan:
+    points = {who: _points(contents, gaps, f"{who}_grid_xyz", kept) for who in ("sensor", "laser")}
+    normals = {who: _normals(contents, gaps, who, points[who], kept) for who in ("sensor", "laser")}
+    for who in points:
+        # UNKNOWN is what y-tal makes of a format that is missing.
+        said = _whole(contents, f"{who}_grid_format", gaps, missing=0)
+        if said not in (0, points[who].ndim - 1):
+            raise gaps.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
+    kind = _kind(points["sensor"], points["laser"], form, gaps)
+    if kind == "single":
+        points["laser"] = points["laser"].reshape(3)
+        normals["laser"] = None if normals["laser"] is None else normals["laser"].reshape(3)
+    elif kind == "confocal":
+        points["laser"] = points["sensor"]
+    origins = {
+        who: gaps.origin(f"{who}_origin", _plain(contents, f"{who}_xyz", kept), points[who], normals[who], legs)
+        for who in points
+    }
+    return scan_of(
+        kind, points["sensor"], points["laser"], origins["sensor"], origins["laser"], normals["sensor"],
+        normals["laser"], legs,
+    )  # fmt: skip
+
+
+def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) -> str:
+    if form.lasers:
+        return "exhaustive"
+    if sensor.shape == laser.shape:
+        # Not what y-tal takes for confocal, which depends on where the origin of coordinates is.
+        if same_points(sensor, laser):
+            if not np.array_equal(sensor, laser):
+                gaps.assumed["laser_grid_xyz"] = "that of the sensor"
+            return "confocal"
+        if laser.size != 3:
+            raise gaps.error(
+                "each sensor point has a laser point of its own elsewhere, which is no scan of this library. Read H "
+                "and the grids with h5py."
+            )
+    if laser.size != 3:
+        raise gaps.error(
+            f"expected one laser point, or those of the sensor {sensor.shape}, as H has no laser dimensions, got "
+            f"{laser.shape}."
+        )
+    return "single"
+
+
+def _points(contents: Contents, gaps: Gaps, name: str, kept: dict[str, Any]) -> NDArray[np.float64]:
+    array = _plain(contents, name, kept)
+    if array is None or array.ndim not in (2, 3) or array.shape[-1] != 3:
+        raise gaps.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
+    return np.ascontiguousarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
+
+
+def _normals(
+    contents: Contents, gaps: Gaps, who: str, points: NDArray[Any], kept: dict[str, Any]
+) -> NDArray[np.float64] | None:
+    name = f"{who}_grid_normals"
+    array = _plain(contents, name, kept)
+    if array is None:
+        return None
+    found = np.asarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
+    if found.shape != points.shape:
+        raise gaps.error(f"expected {name} in the shape of the points, got {array.shape}.")
+    return np.ascontiguousarray(found)
+
+
+def _plain(contents: Contents, name: str, kept: dict[str, Any]) -> NDArray[Any] | None:
+    array = contents.array(name)
+    if array is not None:
+        if array.dtype.kind not in "iuf":
+            raise StorageError(f"{WHAT}: expected real numbers in '{name}', got {array.dtype}.")
+        kept["dtypes"][name] = array.dtype.str
+    return array
+
+
+def _number(contents: Contents, name: str, kept: dict[str, Any], gaps: Gaps) -> float | None:
+    array = _plain(contents, name, kept)
+    if array is not None and array.size != 1:
+        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
+    return None if array is None else float(array.reshape(-1)[0])
+
+
+def _flag(contents: Contents, name: str, kept: dict[str, Any]) -> bool | None:
+    array = contents.array(name)
+    if array is None:
+        return None
+    if array.size != 1 or array.dtype.kind not in "biuf" or array.reshape(-1)[0] not in (0, 1):
+        raise StorageError(f"{WHAT}: expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}.")
+    return bool(array.reshape(-1)[0])
+
+
+def _whole(contents: Contents, name: str, gaps: Gaps, missing: int | None = None) -> int:
+    array = contents.array(name)
+    if array is None and missing is not None:
+        return missing
+    if array is None or array.size != 1 or array.dtype.kind not in "iu":
+        raise gaps.error(f"expected one whole number as {name}, got {None if array is None else array.dtype}.")
+    return int(array.reshape(-1)[0])
+
+
+def _volume(contents: Contents, gaps: Gaps) -> int | None:
+    return None if contents.array("volume_format") is None else _whole(contents, "volume_format", gaps)
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+
+
+def write(target: Path, capture: Capture) -> None:
+    """Write a capture as y-tal reads it. A phasor is written where there is no transient.
+
+    Channels' names, metadata, the wall and the steady image go into ``scene_info``, unless the capture was read from
+    such a file and has none of them: then ``scene_info`` is written as it was. Raises StorageError for a batch, several
+    channels, and a transient beside a phasor.
+    """
+    form_name, h = _h(capture)
+    form = _FORMATS[form_name]
+    kept = tal_scene_info.kept_of(capture)
+    arrays = _arrays(capture, kept, form)
+    text = tal_scene_info.written(capture, kept, WHAT)
+    formats = {"H_format": (_NUMBERS, form.number)}
+    for who in ("sensor", "laser"):
+        formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
+    if kept.get("volume_format") in _VOLUMES.values():
+        formats["volume_format"] = (_VOLUMES, kept["volume_format"])
+    h5py = hdf5_package(WHAT)
+    with replacing(target, WHAT) as unfinished, new_hdf5(unfinished, WHAT) as file:
+        dtype = np.dtype(kept["dtypes"].get("H", h.dtype))
+        write_parts(file.create_dataset("H", h.shape, dtype if _holds(h, dtype) else h.dtype), h)
+        for name, (numbers, number) in formats.items():
+            file.create_dataset(name, data=np.array([number]), dtype=h5py.enum_dtype(numbers, basetype="i"))
+        for name in sorted(_KNOWN - {"H", "scene_info", *formats}):
+            value = arrays.get(name)
+            file[name] = h5py.Empty(float) if value is None else value
+        file["scene_info"] = h5py.Empty(float) if text is None else text
+
+
+def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
+    """The name of H's format, and H as a view where the tensor lies on the CPU."""
+    if capture.transient is not None and capture.phasor is not None:
+        raise cannot(NAME, "a transient or a phasor", "both; write dataclasses.replace(capture, phasor=None, ...)")
+    scan = capture.scan
+    tensor = capture.transient if capture.transient is not None else capture.phasor
+    assert tensor is not None  # a capture has one
+    one_channel(capture, tensor, NAME, 1 if capture.polarized else 0)
+    if scan.kind == "exhaustive" and len(scan.laser_shape) != len(scan.sensor_shape):
+        raise cannot(NAME, "grids or lists", f"spots {scan.laser_shape} and sensor points {scan.sensor_shape}")
+    sensor, laser = (array_of(points, WHAT).reshape(-1, 3) for points in (scan.sensor_points, scan.laser_points))
+    if scan.kind == "single" and same_points(sensor, laser):
+        raise cannot(NAME, "scans of one point that lights itself as confocal ones", "a single one; say so")
+    dims = {1: "Si", 2: "Sx_Sy"}[len(scan.sensor_shape)]
+    lasers = {"Si": "Li_", "Sx_Sy": "Lx_Ly_"}[dims] if scan.kind == "exhaustive" else ""
+    name = f"{'F' if tensor.is_complex() else 'T'}_{lasers}{dims}"
+    tensor = tensor.squeeze(1).movedim(0, -1) if capture.polarized else tensor.squeeze(0)
+    return name, array_of(_swapped(tensor, _FORMATS[name]), WHAT)
+
+
+def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[str, NDArray[Any]]:
+    scan, dtypes = capture.scan, kept["dtypes"]
+    legs = scan.first_and_last_leg
+    arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS, legs) else {_LEGS: np.bool_(legs)}
+    axis = capture.axis
+    start, width = (None, None) if axis is None else (axis.start_opl, axis.bin_width_opl)
+    if form.frequencies and capture.axis is None:
+        frequencies = capture.frequencies
+        assert frequencies is not None  # a phasor has them
+        start, width = frequencies.start_opl, kept.get("delta_t")
+        if dtypes and "t_start" not in dtypes and start == 0:
+            start = None  # as it was read
+    if not assumed_in(capture, "start_s", start):
+        arrays["t_start"] = start
+    arrays["delta_t"] = width
+    for who in ("sensor", "laser"):
+        if legs or not assumed_in(capture, f"{who}_origin", getattr(scan, f"{who}_origin")):
+            arrays[f"{who}_xyz"] = getattr(scan, f"{who}_origin")
+        for ours, theirs in (("points", "grid_xyz"), ("normals", "grid_normals")):
+            points = getattr(scan, f"{who}_{ours}")
+            if points is not None:
+                spot = points if points.ndim > 1 else points.reshape(*(1,) * len(scan.sensor_shape), 3)
+                arrays[f"{who}_{theirs}"] = spot.transpose(0, 1) if spot.ndim == 3 else spot
+    return {name: _as_stored(name, value, dtypes.get(name)) for name, value in arrays.items() if value is not None}
+
+
+def _as_stored(name: str, value: Any, dtype: str | None) -> NDArray[Any]:
+    """As the file had it that it was read from; else points in single precision, where that loses nothing."""
+    array = np.ascontiguousarray(array_of(value, WHAT)) if isinstance(value, Tensor) else np.asarray(value)
+    if dtype is not None and (
+        _holds(array, np.dtype(dtype)) or (name.endswith("normals") and np.dtype(dtype).kind == "f")
+    ):
+        return array.astype(dtype)
+    return array.astype(np.float32) if array.ndim and _holds(array, np.dtype(np.float32)) else array
+
+
+def _holds(array: NDArray[Any], dtype: np.dtype[Any]) -> bool:
+    """Whether numbers of another kind are the same."""
+    if array.dtype == dtype:
+        return True
+    if dtype.kind not in "iufc" or (dtype.kind != "c" and array.dtype.kind == "c"):
+        return False
+    with np.errstate(all="ignore"):
+        return math.prod(array.shape) == 0 or bool(np.array_equal(array.astype(dtype).astype(array.dtype), array))

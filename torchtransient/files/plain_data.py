@@ -1,0 +1,75 @@
+"""Dictionaries with arrays in them as what JSON can hold, and back."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.errors import StorageError
+from torchtransient.files.array_file import array_of
+
+_WHAT = "capture file"
+# Keys of JSON objects that stand for what JSON does not have.
+_ARRAY, _TUPLE, _NUMBERS = "__array__", "__tuple__", "__numbers__"
+
+
+def plain(value: Any, parts: list[NDArray[Any]] | None, where: str) -> Any:
+    """What JSON can hold. Arrays are put into `parts` and named ``where_0``, ``where_1``, ...; without parts they stand
+    there as their bytes in base64, little-endian. Raises StorageError for what is no data.
+    """
+    return _plain(value, parts, where, where)
+
+
+def _plain(value: Any, parts: list[NDArray[Any]] | None, where: str, stem: str) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry, parts, f"{where}.{name}", stem) for name, entry in value.items()}
+    if isinstance(value, tuple):
+        return {_TUPLE: [_plain(entry, parts, where, stem) for entry in value]}
+    if isinstance(value, list):
+        return [_plain(entry, parts, where, stem) for entry in value]
+    if isinstance(value, torch.Tensor):
+        value = array_of(value, _WHAT)
+    # Transforms of Mitsuba keep their numbers in `matrix`.
+    array = np.asarray(getattr(value, "matrix", value))
+    if array.dtype.kind not in "biufc":
+        raise StorageError(
+            f"capture file: {where} is a {type(value).__name__}, which no file can hold; expected numbers, texts, "
+            "lists, dictionaries and arrays. Write the capture with a scan whose wall is None or of plain data."
+        )
+    if parts is None:
+        little = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        text = base64.b64encode(little.tobytes()).decode("ascii")
+        return {_NUMBERS: text, "dtype": little.dtype.str, "shape": list(array.shape)}
+    parts.append(array)
+    return {_ARRAY: f"{stem}_{len(parts) - 1}"}
+
+
+def restored(value: Any, arrays: Mapping[str, Any]) -> Any:
+    """What `plain` made JSON of; ``arrays``: its parts by name."""
+    if isinstance(value, dict):
+        if set(value) == {_ARRAY}:
+            return np.asarray(arrays[value[_ARRAY]])
+        if set(value) == {_NUMBERS, "dtype", "shape"}:
+            raw = base64.b64decode(value[_NUMBERS], validate=True)
+            numbers = np.frombuffer(raw, _number_type(value["dtype"])).reshape(value["shape"])
+            return numbers.astype(numbers.dtype.newbyteorder("="))  # to memory that may be written to
+        if set(value) == {_TUPLE}:
+            return tuple(restored(entry, arrays) for entry in value[_TUPLE])
+        return {name: restored(entry, arrays) for name, entry in value.items()}
+    return [restored(entry, arrays) for entry in value] if isinstance(value, list) else value
+
+
+def _number_type(name: Any) -> np.dtype[Any]:
+    dtype = np.dtype(str(name))
+    if dtype.kind not in "biufc":
+        raise StorageError(f"capture file: expected a type of numbers, got {name!r}.")
+    return dtype

@@ -1,0 +1,127 @@
+"""A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
+(..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; or `gated` float32 (...,
+C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`. Polarized variants
+have the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
+metres, `num_bins`), `channels` (JSON: the names of the C channels), `format` and `metadata` (JSON) are attributes of
+the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is
+needed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture.metadata import metadata_text
+from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.array_file import array_of, damage_said, read_arrays, write_arrays
+from torchtransient.gates import Gate
+from torchtransient.render.films.choices import of_entries, of_output
+from torchtransient.render.output import RenderOutput, named_fields
+from torchtransient.tensor_record import TensorRecord
+
+FORMAT = "torchtransient result 1"
+_WHAT = "result file"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(TensorRecord):
+    """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
+
+    `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
+    and settings of films that have no attribute here, by name. A batch of results (``stack``, ``cat``,
+    ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    transient: torch.Tensor | None
+    steady: torch.Tensor
+    axis: TimeAxis | None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    phasor: torch.Tensor | None = None
+    frequencies: FrequencyAxis | None = None
+    channels: tuple[str, ...] = ()
+    gates: tuple[Gate, ...] | None = None
+    gated: torch.Tensor | None = None
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
+        return {"metadata": {"batch": [record.metadata for record in records]}}
+
+    def _shown_notes(self) -> dict[str, str]:
+        return {"metadata": ", ".join(self.metadata)} if self.metadata else {}
+
+
+def check_target(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when a result could not be written there. For before a long render."""
+    return array_file.check_target(path, _WHAT)
+
+
+def check_folder(path: str | Path) -> None:
+    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
+    array_file.check_folder(path, _WHAT)
+
+
+def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
+    """Write a render, or a result that was read. An existing file is replaced once the new one is complete.
+
+    `metadata`: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render. Raises
+    StorageError for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
+    """
+    target = check_target(path)
+    given: Any = output
+    if not isinstance(given, RenderOutput | Result):
+        raise StorageError(
+            f"result file: expected what a render returned, a RenderOutput, got {type(given).__name__}. Tensors alone "
+            "have no axis; write them with torch.save."
+        )
+    own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
+    note = metadata_text({**(metadata or {}), **own}, _WHAT)
+    film = of_output(output)
+    tensor = None if film is None else film.tensor(output)
+    if film is None or tensor is None:
+        raise StorageError(
+            "result file: expected an output with what its film measured, transient and axis for instance, got neither."
+        )
+    entries: dict[str, Any] = {
+        "format": FORMAT, **film.numbers(), "channels": json.dumps(output.channels), "metadata": note,
+    }  # fmt: skip
+    arrays = {"steady": array_of(output.steady, _WHAT), film.measures: array_of(tensor, _WHAT), **film.arrays()}
+    write_arrays(target, arrays, entries, _WHAT)
+    return target
+
+
+def read_result(path: str | Path) -> Result:
+    """Read what `write_result` wrote, as tensors on the CPU.
+
+    Raises StorageError when the file is missing, damaged or not a result.
+    """
+    values = read_arrays(path, FORMAT, _WHAT)
+    with damage_said(Path(path), _WHAT):
+        return _result(values, Path(path))
+
+
+def _result(values: Mapping[str, Any], source: Path) -> Result:
+    metadata, steady = json.loads(str(values["metadata"])), torch.from_numpy(values["steady"])
+    # Files of earlier versions have no names of channels.
+    channels = tuple(json.loads(str(values.get("channels", "[]"))))
+    film = of_entries(values)
+    response = torch.from_numpy(film.tensor_in(values))
+    if response.ndim < 4 or response.shape[-3] != film.count:
+        raise StorageError(
+            f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
+            f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
+        )
+    return Result(steady=steady, metadata=metadata, channels=channels, **named_fields(film, response))

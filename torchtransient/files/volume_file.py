@@ -1,0 +1,68 @@
+"""A reconstructed volume on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+
+Both hold the same names: `values` (..., C, Z, Y, X), or (..., C, N, Z, Y, X) with `times` (N,) where a camera filmed;
+`directions` (..., C, 3, Z, Y, X) of methods that find normals, in world coordinates. The grid is float64, in metres:
+`depths` (Z,), `pitch` (2,) as (dy, dx), and the vectors (3,) `first`, `along_x`, `along_y`, `normal`; voxel (k, j, i)
+stands at ``first + j dy along_y + i dx along_x + depths[k] normal``. `method` is a text, `metadata` one of JSON; texts
+are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from torchtransient.capture.metadata import metadata_text
+from torchtransient.errors import StorageError
+from torchtransient.files import array_file
+from torchtransient.files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.files.entries import notes_of, text_of
+from torchtransient.reconstruction.hidden_volume import HiddenVolume
+from torchtransient.reconstruction.voxels import VoxelGrid
+
+FORMAT = "torchtransient volume 1"
+_WHAT = "volume file"
+_VECTORS = ("first", "along_x", "along_y", "normal")
+
+
+def check_volume_target(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when a volume could not be written there. For before long computations."""
+    return array_file.check_target(path, _WHAT)
+
+
+def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
+    """Write a volume; an existing file is replaced once the new one is complete. Returns the path.
+
+    Gradients are not stored. Raises StorageError for an unknown ending, a folder that is missing, a full disk, and
+    metadata that is not plain data.
+    """
+    target = check_volume_target(path)
+    if not isinstance(volume, HiddenVolume):
+        raise StorageError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
+    note = metadata_text(volume.metadata, _WHAT)
+    grid = volume.grid
+    given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}
+    given |= {name: getattr(grid, name) for name in _VECTORS}
+    arrays = {name: array_of(tensor, _WHAT) for name, tensor in given.items() if tensor is not None}
+    arrays["pitch"] = np.array(grid.pitch, np.float64)
+    write_arrays(target, arrays, {"format": FORMAT, "method": volume.method, "metadata": note}, _WHAT)
+    return target
+
+
+def read_volume(path: str | Path) -> HiddenVolume:
+    """Read what `write_volume` wrote, as tensors on the CPU. What somebody put beside it is left alone.
+
+    Raises StorageError when the file is missing, damaged or not a volume.
+    """
+    needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
+    known = {*needed, *optional, "format", "method", "metadata"}
+    found = read_arrays(path, FORMAT, _WHAT, known.__contains__)
+    with damage_said(Path(path), _WHAT):
+        values = {name: tensor_in(found[name]) for name in needed}
+        more = {name: tensor_in(found[name]) for name in optional if name in found}
+        rows, columns = values["values"].shape[-2:]
+        dy, dx = values["pitch"].tolist()
+        vectors = {name: values[name] for name in _VECTORS}
+        grid = VoxelGrid(values["depths"], (rows, columns), (dy, dx), **vectors)
+        return HiddenVolume(values["values"], grid, text_of(found, "method"), notes_of(found, "metadata"), **more)
