@@ -31,15 +31,23 @@ def environment():
 
 
 def start(recipe, folder, *, before="", **arguments):
-    """A process that generates, in a group of its own as a terminal would have it."""
+    """A process that generates."""
     code = SCRIPT.format(recipe=recipe, folder=str(folder), arguments=arguments, before=before)
+    return _process([sys.executable, "-c", code])
+
+
+def start_command(folder, *arguments):
+    """A process of the command line, in a folder."""
+    return _process([sys.executable, "-m", "torchtransient", *arguments], cwd=folder)
+
+
+def _process(command, **more):
+    """In a group of its own, as a terminal would have it."""
     # What is started in the background ignores interrupts, and hands that on.
     handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     try:
-        return subprocess.Popen(
-            [sys.executable, "-c", code], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            start_new_session=True,
-        )  # fmt: skip
+        return subprocess.Popen(command, env=environment(), start_new_session=True, **pipes, **more)
     finally:
         signal.signal(signal.SIGINT, handler)
 

@@ -132,6 +132,27 @@ def cost(recipe: Path, samples: int, quiet: bool) -> None:
     click.echo(str(read_recipe(recipe).cost(samples, progress=not quiet)))
 
 
+@command.command()
+@click.argument("folder", type=PATH)
+@click.option("-o", "--out", type=PATH, required=True, help="Folder to write to.")
+@click.option("--format", "kind", type=click.Choice(["webdataset", "tal"]), default="webdataset", show_default=True)
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def export(folder: Path, out: Path, kind: str, quiet: bool) -> None:
+    """Write the data set in FOLDER for other programs: tar files of WebDataset, or, of captures around a corner, a file
+    of y-tal for each.
+    """
+    from torchtransient.data.storage.tal_export import export_tal
+    from torchtransient.data.storage.web_dataset import export_web_dataset
+    from torchtransient.errors import StorageError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"--out: the folder '{out}' cannot be made: {error}.") from error
+    written = (export_tal if kind == "tal" else export_web_dataset)(folder, out, progress=not quiet)
+    click.echo(f"{out}: {len(written)} files")
+
+
 def read_recipe(path: Path) -> Any:
     """The recipe of a file."""
     from torchtransient.data.recipes.recipe import Recipe

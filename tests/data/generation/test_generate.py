@@ -133,7 +133,7 @@ def test_other_versions_of_packages(calm, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, workers=1, **QUICK)
     (folder / "shard-000001.h5").unlink()
-    with pytest.raises(StorageError, match="versions is .'fake': '1'. there and .'fake': '2'. here"):
+    with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
         generate(replace(RECIPE, versions={"fake": "2"}), folder, workers=1, **QUICK)
     assert not (folder / "shard-000001.h5").exists()
 

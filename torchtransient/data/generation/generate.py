@@ -232,7 +232,8 @@ def _write_manifest(place: Path) -> None:
     seen: set[str] | None = None
     while (now := {path.name for path in place.glob("shard-*.h5")}) != seen:
         seen = now
-        build_manifest(place)
+        if now:
+            build_manifest(place)
 
 
 def _engine(

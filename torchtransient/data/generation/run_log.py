@@ -61,11 +61,16 @@ class SampleBar:
         self.restarts += restarts
         if self._bar is None:
             return
-        if failed or restarts:
-            self._bar.set_postfix({"failed": self.failed, "restarts": self.restarts}, refresh=False)
-        self._bar.update(samples)
+        try:
+            if failed or restarts:
+                self._bar.set_postfix({"failed": self.failed, "restarts": self.restarts}, refresh=False)
+            self._bar.update(samples)
+        except (OSError, ValueError):
+            # The terminal is gone; the night goes on.
+            self._bar = None
 
     def close(self) -> None:
         """End it."""
         if self._bar is not None:
-            self._bar.close()
+            with contextlib.suppress(OSError, ValueError):
+                self._bar.close()

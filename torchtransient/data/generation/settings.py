@@ -96,28 +96,41 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
     is first. Raises StorageError.
     """
     place = folder / RECIPE_FILE
-    part = folder / f".{RECIPE_FILE}.{secrets.token_hex(4)}.new"
     text = json.dumps(described, sort_keys=True, indent=1) + "\n"
     try:
-        with part.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        try:
-            # Not replaced where another run was faster.
-            os.link(part, place)
-        except FileExistsError:
+        while not _put(place, text):
             pass
-        except OSError:
-            # Disks without hard links.
-            part.replace(place)
         sync_folder(folder)
     except OSError as error:
         raise StorageError(f"{_WHAT}: '{place}' could not be written: {error}.") from error
+    return read_description(folder) or dict(described)
+
+
+def _put(place: Path, text: str) -> bool:
+    """Write a file unless it is there; False where what was being written was swept away before it was locked."""
+    import fcntl
+
+    part = place.with_name(f".{place.name}.{secrets.token_hex(4)}.part")
+    try:
+        with part.open("x", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+            try:
+                # Not replaced where another run was faster.
+                os.link(part, place)
+            except FileExistsError:
+                return True
+            except FileNotFoundError:
+                return False
+            except OSError:
+                # Disks without hard links.
+                part.replace(place)
+            return True
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
-    return read_description(folder) or dict(described)
 
 
 def sync_folder(folder: Path) -> None:
@@ -137,11 +150,17 @@ def check_same(
         if name in found and name in wanted and found[name] != wanted[name]:
             told = f"{name} is {found[name]!r} there and {wanted[name]!r} here"
             if name == "key":
-                told = "its recipe is another one" + _first_difference(found.get("recipe"), wanted.get("recipe"))
+                recipes = [_deciding(side.get("recipe")) for side in (found, wanted)]
+                told = "its recipe is another one" + _first_difference(*recipes)
             raise StorageError(
                 f"{_WHAT}: '{where}' belongs to another data set: {told}. Choose another folder, or generate with what "
                 "is there."
             )
+
+
+def _deciding(recipe: Any) -> Any:
+    """Without the number of samples, which is none of what makes a recipe another one."""
+    return {name: entry for name, entry in recipe.items() if name != "n"} if isinstance(recipe, dict) else recipe
 
 
 def _first_difference(there: Any, here: Any, at: str = "") -> str:

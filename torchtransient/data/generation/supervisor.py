@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import signal
 import time
+from collections.abc import Iterator
 from multiprocessing import connection
 from typing import Any
 
@@ -38,6 +39,17 @@ class LocalWorker(Member):
         with contextlib.suppress(OSError):
             self.link.send(task)
 
+    def messages(self) -> Iterator[tuple[Any, ...]]:
+        """What it has said since."""
+        while True:
+            try:
+                if not self.link.poll():
+                    return
+                message = self.link.recv()
+            except (EOFError, OSError):
+                return
+            yield message
+
     def end(self) -> None:
         """Kill it, if it lives."""
         self.process.kill()
@@ -66,9 +78,8 @@ class Supervisor(Crew[LocalWorker]):
         for worker in list(self.workers):
             # What a worker said before it died comes first.
             dead = not worker.process.is_alive()
-            with contextlib.suppress(EOFError, OSError):
-                while worker.link.poll():
-                    self.heard(worker, *worker.link.recv())
+            for message in worker.messages():
+                self.heard(worker, *message)
             if dead:
                 self._bury(worker, worker.process.exitcode or 0)
 

@@ -42,6 +42,9 @@ def work(link: Connection, settings: Settings) -> None:
         with contextlib.suppress(OSError):
             telling.say("fatal", *fatal(error))
         sys.exit(1)
+    finally:
+        # What the interpreter does at its end need not be left in order.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _carry_out(task: tuple[Any, ...], maker: ShardMaker, telling: Telling) -> None:
