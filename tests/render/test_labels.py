@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
+import weakref
 
 import mitsuba as mi
 import numpy as np
@@ -683,3 +684,116 @@ def test_mistakes_have_typed_errors(room_scene):
         scene_labels(renderer, {WALL_POSE: moved(float("nan"))})
     assert torch.isfinite(scene_labels(renderer)["depth"]).all()
     assert set(scene_labels(renderer, names="depth")) == {"depth"}
+
+
+# ------------------------------------------------------------------------------------- recorded calls of every kind
+
+
+# Of plugins that do not show Dr.Jit all of their arrays, renders and labels are traced (docs/speed.md).
+HIDDEN_ARRAYS = "does not show Dr.Jit all of its arrays"
+
+
+def same_recorded(make, values, names, hidden=False):
+    """Recorded calls with these values against traced ones of a scene of their own; the last two are launched, unless
+    arrays are ``hidden``.
+    """
+    recorded, traced = (make(freeze) for freeze in (True, False))
+    said, found = [], []
+    for given in values:
+        a, how = _labels(recorded, given, names, False, 16)
+        b = _labels(traced, given, names, False, 16)[0]
+        said += how
+        found.append(a)
+        for name in names:
+            torch.testing.assert_close(a[name], b[name], rtol=1e-5, atol=1e-5, equal_nan=True)
+    if hidden:
+        assert HIDDEN_ARRAYS in said[-1], said
+    else:
+        assert said[-2:] == [LAUNCHED] * 2, said
+    return found
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
+def test_recorded_calls_follow_the_sensor(kind):
+    more = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
+    poses = [look_at([x, 0.2, DISTANCE - x], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]) for x in (0.0, 0.3, 0.6, 0.9, 1.2)]
+
+    def make(freeze):
+        contents = {"ball": {"type": "sphere", "radius": RADIUS}, "wall": plane()}
+        return renderer_of(
+            camera(kind, **more), parameters=["sensor.to_world"], options={"freeze": freeze}, **contents
+        )
+
+    values = [{"sensor.to_world": pose.astype(np.float32)} for pose in poses]
+    found = same_recorded(make, values, LABELS, hidden=kind != "perspective")
+    for pose, labels in zip(poses, found, strict=True):
+        axis = torch.from_numpy(pose[:3, 2].astype(np.float32))
+        away = labels["position"] - torch.from_numpy(pose[:3, 3].astype(np.float32))[:, None, None]
+        close(labels["z_depth"], (away * axis[:, None, None]).sum(0).numpy(), atol=1e-4)
+        if kind != "orthographic":
+            close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
+
+
+def test_recorded_calls_follow_a_mask():
+    def make(freeze):
+        mask = {"type": "mask", "opacity": {"type": "uniform", "value": 0.2}, "inner": grey(0.2)}
+        pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf=mask)
+        key = "pane.bsdf.opacity.value"
+        return renderer_of(camera(), parameters=[key], options={"freeze": freeze}, pane=pane, wall=plane())
+
+    opacities = [0.2, 0.8, 0.3, 0.9, 0.1]
+    found = same_recorded(make, [{"pane.bsdf.opacity.value": x} for x in opacities], ["shape", "z_depth", "albedo"])
+    for x, labels in zip(opacities, found, strict=True):
+        assert (labels["shape"] == int(x < 0.5)).all()
+
+
+def test_recorded_calls_follow_a_scan():
+    def make(freeze):
+        meter = {"type": "nlos_capture_meter", "film": film(4, 3), "sensor_origin": [0.5, 0.0, 2.0]}
+        description = scene_of(None, wall={"type": "rectangle", "sensor": meter})
+        del description["sensor"]
+        scene = tt.load(description, variant=VARIANT)
+        key = next(key for key in scene.parameters() if key.endswith("sensor_origin"))
+        return tt.TransientRenderer(scene, parameters=[key], physics="ignore", freeze=freeze)
+
+    (key,) = make(True)._keys
+    origins = [[0.5, 0.0, 2.0], [0.6, 0.1, 1.0], [0.0, 0.0, 3.0], [0.1, 0.2, 2.5], [0.3, 0.3, 1.5]]
+    found = same_recorded(make, [{key: origin} for origin in origins], ["depth", "position", "normals"])
+    for origin, labels in zip(origins, found, strict=True):
+        away = labels["position"] - torch.tensor(origin)[:, None, None]
+        close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
+
+
+def test_recorded_calls_follow_instances():
+    group = {"type": "shapegroup", "part": {"type": "sphere", "radius": 0.5}}
+
+    def make(freeze):
+        copied = {"type": "instance", "nested": {"type": "ref", "id": "group"}, "to_world": translate([0, 0, 0])}
+        return renderer_of(
+            camera(fov=FOV), parameters=["copied.to_world"], options={"freeze": freeze}, group=group, copied=copied
+        )
+
+    poses = [translate([x, 0, 0]).astype(np.float32) for x in (0.0, 0.2, 0.4, 0.6, 0.8)]
+    names = ["depth", "position", "shape", "normals"]
+    found = same_recorded(make, [{"copied.to_world": pose} for pose in poses], names)
+    for pose, labels in zip(poses, found, strict=True):
+        hit = labels["shape"] == 0
+        away = labels["position"][:, hit] - torch.from_numpy(pose[:3, 3])[:, None]
+        close(torch.linalg.norm(away, dim=0), np.full(int(hit.sum()), 0.5), atol=1e-4)
+
+
+def test_built_scenes_are_freed():
+    renderer = room_renderer(parameters=[WALL_POSE])
+    for n in range(3):
+        scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)}, LABELS)
+    (built,) = [one for options, one in renderer.scene._builds.items() if one.label_tables is not None]
+    scene = weakref.ref(built.scene.integrator())
+    del built
+    renderer.scene._builds.clear()
+    renderer.scene._slots.clear()
+    renderer.scene._recordings.clear()
+    renderer.scene._unsettled.clear()
+    renderer.scene._table = None
+    gc.collect()
+    gc.collect()
+    assert scene() is None
