@@ -138,7 +138,10 @@ def test_not_a_number_is_like_another():
     assert structure([float("nan")]) == structure([float("inf") - float("inf")])
 
 
-@pytest.mark.parametrize("value", [iter([1]), open, {1: object()}, {(1, 2)}, lambda: 0], ids=("iterator", "builtin", "object", "set", "lambda"))
+INCOMPARABLE = {"iterator": iter([1]), "builtin": open, "object": {1: object()}, "set": {(1, 2)}, "lambda": lambda: 0}
+
+
+@pytest.mark.parametrize("value", INCOMPARABLE.values(), ids=INCOMPARABLE)
 def test_what_cannot_be_compared_is_refused(value):
     from torchtransient.plugins.frozen_state import NotComparableError
 
