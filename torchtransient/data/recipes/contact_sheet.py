@@ -27,12 +27,12 @@ def contact_sheet(
     recipe: Specification, maker: Maker, indices: Iterable[int], path: str | Path | None, progress: bool = False
 ) -> Any:
     """Render some samples of a recipe and draw them; see :meth:`Recipe.preview`."""
-    wanted = list(indices)
+    wanted = maker.order(indices)
     if progress:
         from tqdm.auto import tqdm
 
         wanted = tqdm(wanted, desc="preview", unit="sample")
-    samples = [maker.sample(index) for index in wanted]
+    samples = sorted((maker.sample(index) for index in wanted), key=lambda sample: sample.index)
     return sheet_of(samples, path, maker.about().get("axis"), repr(recipe))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
@@ -26,22 +27,22 @@ from torchtransient.data.recipes.specification import (
 from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.files.scan_data import scan_data
 from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
 from torchtransient.render.output import RenderOutput
-from torchtransient.render.parameters import unknown_key
+from torchtransient.render.parameters import ParameterTable, unknown_key
 from torchtransient.render.renderer import TransientRenderer
-from torchtransient.render.scene_handle import load
+from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant, stokes_components
 from torchtransient.sensing import Compose, Device
 
 if TYPE_CHECKING:
     from torchtransient.capture import Scan
 
-# Structures whose scenes are kept. More take memory, and slow each other's kernels down: Mitsuba compiles a method call
-# for all objects that are alive.
-MOST_KEPT = 8
+# Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
+# Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.
+MOST_KEPT = 1
 # A label that is read off the transient.
 FIRST_RETURN = "first_return"
 
@@ -186,27 +187,35 @@ class Kept:
             "physics": settings.physics,
         }  # fmt: skip
         if self.scan is None:
-            scene = load(given)
-            self._check_keys(list(scene.parameters().differentiable()), scene.parameters())
             own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}
             own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
-            return TransientRenderer(scene, parameters=self.keys, **common, **own)
+            with self._keys_told(lambda: given):
+                return TransientRenderer(given, parameters=self.keys, **common, **own)
         # Imported where it is used: captures read files of this room.
         from torchtransient.nlos.renderer import CaptureRenderer
         from torchtransient.nlos.scene import capture_scene
 
-        bounces, energy = settings.bounces, settings.energy
-        table = load(capture_scene(given, self.scan, bounces, energy), variant=self.recipe.variant).parameters()
-        self._check_keys(table.differentiable(), table)
+        bounces, energy, scan = settings.bounces, settings.energy, self.scan
         # What stands in the way of laser or sensor is no capture.
         common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant, "physics": "error"}
-        renderer = CaptureRenderer(given, self.scan, parameters=self.keys, **common).renderer
+        with self._keys_told(lambda: load(capture_scene(given, scan, bounces, energy), variant=self.recipe.variant)):
+            renderer = CaptureRenderer(given, scan, parameters=self.keys, **common).renderer
         if settings.physics == "ignore":
             # Of light outside of the window the share is told.
             renderer._watch.window_name = ""
         return renderer
 
-    def _check_keys(self, differentiable: list[str], table: Mapping[str, Any]) -> None:
+    @contextmanager
+    def _keys_told(self, scene: Callable[[], Scene]) -> Iterator[None]:
+        """In the words of recipes, where keys are not those of the scene."""
+        try:
+            yield
+        except (SceneError, GradientError):
+            # Not before: the table is of a scene of its own, and Mitsuba compiles for all objects that are alive.
+            self._check_keys(scene().parameters())
+            raise
+
+    def _check_keys(self, table: ParameterTable) -> None:
         for key in self.keys:
             if key not in table:
                 hint = unknown_key(key, list(table))
@@ -214,7 +223,7 @@ class Kept:
                     f"recipe: vary: {hint} Entries of a scene dictionary ('box.filename') and $names of an XML file "
                     "are keys too, where the scene has them."
                 )
-            if key not in differentiable:
+            if key not in table.differentiable():
                 raise SceneError(
                     f"recipe: vary: {key!r} cannot vary as a value: {table[key].reason}. Where a scene dictionary has "
                     "an entry for it, name that."
