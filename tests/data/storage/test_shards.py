@@ -60,6 +60,16 @@ def test_bytes_do_not_tell_the_order(tmp_path, store, compression):
     assert len(found) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("BLOSC_NTHREADS", "2"), ("BLOSC_CLEVEL", "9"), ("BLOSC_BLOCKSIZE", "4096")]
+)
+def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch, name, value):
+    samples = [sample(0, (1, 256, 32, 32))]
+    before = digest(write(tmp_path / "a.h5", samples))
+    monkeypatch.setenv(name, value)
+    assert digest(write(tmp_path / "b.h5", samples)) == before and os.environ[name] == value
+
+
 def test_failures_are_named(tmp_path):
     samples = [sample(0), ValueError("the box left the room"), sample(2)]
     with Shard(write(tmp_path / "a.h5", samples)) as shard:

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -88,7 +91,8 @@ class Compressor:
 
     def compressed(self, array: NDArray[Any]) -> list[bytes]:
         """The chunks of an array, in the order of ``places``."""
-        self._data[0] = array
+        with _without_settings():
+            self._data[0] = array
         return [self._data.id.read_direct_chunk(place)[1] for place in self.places]
 
     def array(self, chunks: list[bytes]) -> NDArray[Any]:
@@ -101,6 +105,16 @@ class Compressor:
     def close(self) -> None:
         """Give the memory back."""
         self._file.close()
+
+
+@contextmanager
+def _without_settings() -> Iterator[None]:
+    """Blosc takes its block size, level and threads from the environment too, and makes other bytes of them."""
+    settings = {name: os.environ.pop(name) for name in list(os.environ) if name.startswith("BLOSC_")}
+    try:
+        yield
+    finally:
+        os.environ.update(settings)
 
 
 def _filters(compression: str, what: str) -> dict[str, Any]:
