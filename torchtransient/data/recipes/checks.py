@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchtransient.data.recipes.distribution import POSE
-from torchtransient.data.recipes.maker import Kept, Maker, changed
+from torchtransient.data.recipes.kept_scene import Kept, changed
+from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Extreme

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import POSE
-from torchtransient.data.recipes.maker import Kept
+from torchtransient.data.recipes.kept_scene import Kept
 from torchtransient.errors import SceneError
 
 # (2, 3): lower and upper corner of a box along the axes of the world; a point is a box without a size.

@@ -1,0 +1,294 @@
+"""A structure's scene, built once: its renderer, what varies in it, and what is measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
+from torchtransient.data.recipes.specification import (
+    DEVICE,
+    NOISE,
+    Specification,
+)
+from torchtransient.data.recipes.streams import Draw, Stream
+from torchtransient.data.recipes.structures import Structure
+from torchtransient.data.recipes.written import written_frequencies, written_shape
+from torchtransient.errors import GradientError, SceneError, TorchTransientError
+from torchtransient.files.scan_data import scan_data
+from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
+from torchtransient.render.output import RenderOutput
+from torchtransient.render.parameters import ParameterTable, unknown_key
+from torchtransient.render.renderer import TransientRenderer
+from torchtransient.render.scene_handle import Scene, load
+from torchtransient.render.variant import active_variant, stokes_components
+from torchtransient.sensing import Compose, Device
+
+if TYPE_CHECKING:
+    from torchtransient.capture import Scan
+
+# A label that is read off the transient.
+FIRST_RETURN = "first_return"
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What a render of either kind brings: its tensors by name, and shares of the light outside of the window."""
+
+    tensors: dict[str, torch.Tensor]
+    outside: tuple[float, float]
+
+
+class Kept:
+    """A structure's scene, its renderer, and the places of what varies in it. Raises SceneError for keys that it does
+    not have.
+    """
+
+    def __init__(self, recipe: Specification, structure: Structure) -> None:
+        self.recipe, self.structure = recipe, structure
+        _check_labels(recipe.settings.labels)
+        self.keys = [key for key in recipe.vary if key not in recipe.exchanged and key.split(".")[0] != DEVICE]
+        self.device_keys = [key for key in recipe.vary if key.split(".")[0] == DEVICE]
+        self.scan: Scan | None = None
+        try:
+            self.renderer = self._make()
+        except TorchTransientError as error:
+            raise _named(error, structure) from error
+        self._settle_filter()
+        self.places = self._places()
+        self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
+
+    # ------------------------------------------------------------------------------------------------------ making
+
+    def _make(self) -> TransientRenderer:
+        settings, (given, self.scan) = self.recipe.settings, self.recipe.scenes.build(self.structure)
+        common: dict[str, Any] = {
+            "time_axis": settings.time_axis, "frequencies": settings.frequencies, "spp": settings.spp,
+            "temporal_filter": settings.temporal_filter, "pulse": settings.pulse, "irf": settings.irf,
+            "physics": settings.physics,
+        }  # fmt: skip
+        if self.scan is None:
+            own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}
+            own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
+            with self._keys_told(lambda: given):
+                return TransientRenderer(given, parameters=self.keys, **common, **own)
+        # Imported where it is used: captures read files of this room.
+        from torchtransient.nlos.renderer import CaptureRenderer
+        from torchtransient.nlos.scene import capture_scene
+
+        bounces, energy, scan = settings.bounces, settings.energy, self.scan
+        # What stands in the way of laser or sensor is no capture.
+        common |= {"bounces": bounces, "energy": energy, "variant": self.recipe.variant, "physics": "error"}
+        with self._keys_told(lambda: load(capture_scene(given, scan, bounces, energy), variant=self.recipe.variant)):
+            renderer = CaptureRenderer(given, scan, parameters=self.keys, **common).renderer
+        if settings.physics == "ignore":
+            # Of light outside of the window the share is told.
+            renderer._watch.window_name = ""
+        return renderer
+
+    @contextmanager
+    def _keys_told(self, scene: Callable[[], Scene]) -> Iterator[None]:
+        """In the words of recipes, where keys are not those of the scene."""
+        try:
+            yield
+        except (SceneError, GradientError):
+            # Not before: the table is of a scene of its own, and Mitsuba compiles for all objects that are alive.
+            self._check_keys(scene().parameters())
+            raise
+
+    def _check_keys(self, table: ParameterTable) -> None:
+        for key in self.keys:
+            if key not in table:
+                hint = unknown_key(key, list(table))
+                raise SceneError(
+                    f"recipe: vary: {hint} Entries of a scene dictionary ('box.filename') and $names of an XML file "
+                    "are keys too, where the scene has them."
+                )
+            if key not in table.differentiable():
+                raise SceneError(
+                    f"recipe: vary: {key!r} cannot vary as a value: {table[key].reason}. Where a scene dictionary has "
+                    "an entry for it, name that."
+                )
+
+    def _settle_filter(self) -> None:
+        """Not another filter because a pose varies: nobody asks for derivatives here."""
+        renderer = self.renderer
+        if renderer.film.has_filter and renderer.temporal_filter == "auto":
+            renderer.temporal_filter = renderer._scene_filter
+
+    def _places(self) -> dict[str, Place]:
+        found = {}
+        for key in self.keys:
+            described = self.renderer.values[key].detach().cpu().numpy().astype(np.float64)
+            is_pose = described.shape == (4, 4) and self.renderer._infos[key].kind.endswith("transform")
+            found[key] = Place(key, POSE if is_pose else NUMBERS, described.shape, described)
+        return found
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Of what the film measures: rows, columns, bins, channels."""
+        return (*self.renderer._cube_shape, len(self.renderer._channels))
+
+    # ----------------------------------------------------------------------------------------------------- samples
+
+    def draw(self, index: int) -> dict[str, Any]:
+        """What a sample draws of parameters and of the device."""
+        return self.drawn({key: Stream(self.recipe.seed, index, key) for key in self.recipe.vary})
+
+    def drawn(self, streams: Mapping[str, Draw]) -> dict[str, Any]:
+        """What comes of some random numbers, by key."""
+        found: dict[str, Any] = {}
+        for key in (*self.keys, *self.device_keys):
+            place = self.places.get(key, Place(key, ANYTHING))
+            try:
+                found[key] = self.recipe.vary[key].draw(streams[key], place)
+            except TorchTransientError as error:
+                raise type(error)(f"recipe: vary: {error}") from error
+        return found
+
+    def arrays(self, index: int, drawn: Mapping[str, Any], seed: int) -> tuple[dict[str, NDArray[Any]], Any]:
+        """What is stored of a sample, and the shares of light outside of the window."""
+        values = self.values(drawn)
+        found = self._render(values, seed)
+        tensors = dict(found.tensors)
+        labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
+        if labels:
+            tensors |= scene_labels(self.renderer, values, labels)
+        if FIRST_RETURN in self.recipe.settings.labels:
+            tensors[FIRST_RETURN] = self._first_return(tensors)
+        if self.recipe.device is not None:
+            tensors["measurement"] = self._measured(index, drawn, tensors)
+        return {name: np.ascontiguousarray(tensor.cpu().numpy()) for name, tensor in tensors.items()}, found.outside
+
+    def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
+        """What the film measures of a sample."""
+        return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
+
+    def values(self, drawn: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+        """What is drawn as the renderer takes it."""
+        return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
+
+    def _render(self, values: Mapping[str, torch.Tensor], seed: int) -> _Measured:
+        measures = self.renderer.film.measures
+        with torch.no_grad():
+            out = self.renderer(values, seed=seed)
+        light = out.others[measures] if measures in out.others else getattr(out, measures)
+        tensors = {measures: light, "steady": out.steady}
+        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
+
+    def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        if self.renderer.axis is None or "transient" not in tensors:
+            raise SceneError(f"recipe: labels: {FIRST_RETURN!r} is read off a transient; give time_axis=.")
+        polarized = stokes_components(self.recipe.variant) > 1
+        return first_return(tensors["transient"], self.renderer.axis, polarized=polarized)
+
+    # ------------------------------------------------------------------------------------------------- measurements
+
+    def _measured(self, index: int, drawn: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        device = self.recipe.device
+        assert device is not None
+        chain = self._chain
+        if chain is None:
+            for key in self.device_keys:
+                device = changed(device, key, drawn[key])
+            chain = self._chain_of(device)
+        transient = tensors.get("transient")
+        if transient is None:
+            raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        generator = torch.Generator().manual_seed(Stream(self.recipe.seed, index, NOISE).seed())
+        return chain.sample(transient, generator)
+
+    def _chain_of(self, device: Device) -> Compose:
+        axis = self.renderer.axis
+        if axis is None:
+            raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        return device.sensor(axis)
+
+    # ------------------------------------------------------------------------------------------------------- about
+
+    def _integrator(self) -> str:
+        with active_variant(self.recipe.variant):
+            built = self.renderer.scene.built(self.renderer._options)
+            depth = getattr(built.scene.integrator(), "max_depth", None)
+        return built.integrator + ("" if depth is None else f", max_depth {'unbounded' if depth > 2**31 else depth}")
+
+    def about(self) -> dict[str, Any]:
+        """Plain data; nothing in it depends on the structure but what its film says."""
+        renderer, settings = self.renderer, self.recipe.settings
+        film = renderer.film
+        found: dict[str, Any] = {
+            "measures": film.measures,
+            "axis": None if renderer.axis is None else asdict(renderer.axis),
+            "frequencies": written_frequencies(renderer.frequencies),
+            "gates": None if renderer.gates is None else [written_shape(gate) for gate in renderer.gates],
+            "channels": list(renderer._channels),
+            "spp": renderer.spp or renderer._scene_spp,
+            "variant": self.recipe.variant,
+            "temporal_filter": renderer.effective_filter,
+            "plan": [
+                f"film: {film.describe(renderer.effective_filter)}", f"variant: {self.recipe.variant}",
+                f"integrator: {self._integrator()}",
+            ],
+            "versions": versions(),
+        }  # fmt: skip
+        if "shape" in settings.labels:
+            found["shapes"] = list(label_names(renderer))
+        if self.scan is not None:
+            found["scan"] = scan_data(self.scan)
+        return found
+
+
+def _check_labels(names: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in (*LABELS, FIRST_RETURN):
+            known = ", ".join((*LABELS, FIRST_RETURN))
+            raise SceneError(f"recipe: labels: unknown label {name!r}. Known ones are {known}.")
+
+
+def changed(device: Device, key: str, value: Any) -> Device:
+    """A device with another argument of a stage: "device.PhotonBudget.cycles", "device.0.cycles"."""
+    parts = key.split(".")
+    if len(parts) < 3:
+        raise SceneError(f"recipe: vary: expected 'device.STAGE.ARGUMENT', got {key!r}.")
+    stage, argument = parts[1], ".".join(parts[2:])
+    plain = value.tolist() if isinstance(value, np.ndarray) else value
+    return device.changed(int(stage) if stage.isdigit() else stage, **{argument: plain})
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that decide about the numbers."""
+    return {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
+
+
+def _outside(out: RenderOutput) -> tuple[float, float]:
+    """Shares of the light before and after the window, over all sensors."""
+    stats, channels = out.stats, out.steady.shape[-3]
+    before, after = sum(stats.energy_before), sum(stats.energy_after)
+    if before + after <= 0:
+        return 0.0, 0.0
+    # Of polarized light the first Stokes component.
+    steady = out.steady[..., 0, :, :, :] if out.polarized else out.steady
+    total = float(steady.sum(dtype=torch.float64)) / channels
+    return (before / total, after / total) if total > 0 else (0.0, 0.0)
+
+
+def _of_scan(tensors: Mapping[str, torch.Tensor], scan: Scan) -> dict[str, torch.Tensor]:
+    """Pixels of a film as points of a scan. The steady image of an exhaustive one sums over the laser's places."""
+    from torchtransient.nlos.renderer import in_scan_shape, steady_in_scan_shape
+
+    found = {name: in_scan_shape(tensor, scan) for name, tensor in tensors.items() if name != "steady"}
+    if scan.kind != "exhaustive":
+        found["steady"] = steady_in_scan_shape(tensors["steady"], scan)
+    return found
+
+
+def _named(error: TorchTransientError, structure: Structure) -> TorchTransientError:
+    where = f"structure '{structure.text}': " if structure.text else ""
+    return type(error)(f"{where}{error}")
