@@ -32,13 +32,15 @@ class UnpicklableError(Exception):
 
 @dataclass(frozen=True)
 class OnlineRecipe:
-    """``fail``, ``die``, ``hang``, ``odd``: numbers of samples that raise, end their process by signal 9, never end, or
-    have another shape. ``once``: a folder in which a death is noted, so that it happens once. ``group``: samples by
-    number modulo it are rendered together. ``pids``: a folder where each producer leaves its process number.
+    """``fail``, ``bug``, ``die``, ``hang``, ``odd``: numbers of samples that fail as scenes do, raise something else,
+    end their process by signal 9, never end, or have another shape. ``once``: a folder in which a death is noted, so
+    that it happens once. ``group``: samples by number modulo it are rendered together. ``pids``: a folder where each
+    producer leaves its process number.
     """
 
     seconds: float = 0.0
     fail: tuple = ()
+    bug: tuple = ()
     die: tuple = ()
     hang: tuple = ()
     odd: tuple = ()
@@ -78,6 +80,8 @@ class FakeMaker:
         time.sleep(recipe.seconds)
         if index in recipe.fail:
             raise SceneError(f"sample {index} has no light")
+        if index in recipe.bug:
+            raise ValueError(f"sample {index} met a mistake")
         if index in recipe.unpicklable:
             raise UnpicklableError(1, 2)
         if index in recipe.die:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -229,12 +230,28 @@ def test_threads_draw_together():
 
 
 def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
-    data = OnlineDataset(OnlineRecipe(fail=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
+    data = OnlineDataset(OnlineRecipe(bug=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
     for _ in range(2):
-        with pytest.raises(SceneError, match="sample 5 has no light") as caught:
+        with pytest.raises(ValueError, match="sample 5 met a mistake") as caught:
             draws(data, 100)
-        assert "has no light" in str(caught.value.__cause__) and "online_recipe.py" in str(caught.value.__cause__)
+        assert "met a mistake" in str(caught.value.__cause__) and "online_recipe.py" in str(caught.value.__cause__)
     assert gone(tmp_path)
+
+
+def test_samples_that_fail_are_left_out():
+    recipe = OnlineRecipe(fail=(2, 3, 7))
+    with OnlineDataset(recipe, capacity=8, workers=2, uses=1.0, warm=1) as data:
+        with pytest.warns(UserWarning, match="sample 2 is left out: SceneError: sample 2 has no light"):
+            seen = set(draws(data, 60))
+        assert data.failed == 3 and not seen & {2, 3, 7} and len(seen) > 20
+
+
+def test_nothing_but_failures_is_an_error():
+    data = OnlineDataset(OnlineRecipe(fail=tuple(range(100))), capacity=8, warm=1)
+    with data, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(TorchTransientError, match=r"16 samples failed one after another, .*has no light"):
+            data.draw()
 
 
 def test_error_that_cannot_be_sent_is_told():

@@ -12,7 +12,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from torchtransient.data.reading.online_producers import WHAT, Producers
 from torchtransient.data.reading.online_schedule import Schedule
-from torchtransient.errors import TorchTransientError, UnitError
+from torchtransient.errors import ShapeError, TorchTransientError, UnitError
 from torchtransient.quantities import shown
 
 
@@ -43,11 +43,12 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     ``transform``: function of the transient; its result stands under ``measurement``. ``timeout_s``: so long without
     news from a producer is an error.
 
-    An exception of a producer is raised where samples are drawn. A producer that ends otherwise (killed, a crash) is
-    started again with a warning; one that ends twice at the same sample is an error. ``close()``, the end of the
-    with-block, of the object or of the process end the producers and free the memory. Raises UnitError, StorageError
-    (not enough shared memory), ShapeError (samples that differ in kind), TorchTransientError. Not supported: pickling,
-    use in processes that were forked.
+    A sample that fails (a TorchTransientError of its scene) is left out with a warning, and counted in ``failed``;
+    16 in a row are an error. Any other exception of a producer is raised where samples are drawn. A producer that
+    ends otherwise (killed, a crash) is started again with a warning; one that ends twice at the same sample is an
+    error. ``close()``, the end of the with-block, of the object or of the process end the producers and free the
+    memory. Raises UnitError, StorageError (not enough shared memory), ShapeError (samples that differ in kind),
+    TorchTransientError. Not supported: pickling, use in processes that were forked.
     """
 
     def __init__(
@@ -85,6 +86,8 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         sample = self._producers.draw()
         if self.transform is not None:
             with torch.no_grad():
+                if "transient" not in sample:
+                    raise ShapeError(f"{WHAT}: transform= is for transients, and samples have {', '.join(sample)}.")
                 sample["measurement"] = self.transform(sample["transient"])
         return sample
 
@@ -92,6 +95,11 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     def made(self) -> int:
         """Samples that were rendered."""
         return self._producers.schedule.made
+
+    @property
+    def failed(self) -> int:
+        """Samples that could not be rendered."""
+        return self._producers.failed
 
     @property
     def drawn(self) -> int:

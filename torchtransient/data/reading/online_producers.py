@@ -24,11 +24,14 @@ import torch.multiprocessing  # teaches connections to hand over shared tensors
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
+from torchtransient.render.physics import level_of_user
 
 WHAT = "OnlineDataset"
 _SHARED = Path("/dev/shm")
 # Ends of producers while the same sample was rendered, and while none was, that are an error.
 _MOST_ENDS, _MOST_IDLE_ENDS = 2, 3
+# Samples in a row that may fail.
+_MOST_FAILED = 16
 # Seconds that a producer has to end once it was told to, and that one wait for messages takes.
 _PATIENCE_S, _WAIT_S = 2.0, 1.0
 
@@ -71,6 +74,7 @@ class Producers:
         self._ends: Counter[int | None] = Counter()
         self._failure: BaseException | None = None
         self._closed = False
+        self.failed = self._failed_in_a_row = 0
 
     def start(self) -> None:
         """Start the processes, and tell them what to make."""
@@ -176,8 +180,23 @@ class Producers:
             index, values = rest
             worker.rendering = None
             self._beside[self.schedule.finished(index)] = index, values
+            self._failed_in_a_row = 0
+        elif kind == "failed":
+            worker.rendering = None
+            self._leave_out(*rest)
         elif kind == "error":
             _raise(*rest)
+
+    def _leave_out(self, index: int, reason: str) -> None:
+        """Of a sample that fails."""
+        self.schedule.failed(index)
+        self.failed += 1
+        self._failed_in_a_row += 1
+        if self._failed_in_a_row >= _MOST_FAILED:
+            raise TorchTransientError(
+                f"{WHAT}: {_MOST_FAILED} samples failed one after another, the last one, {index}: {reason}"
+            )
+        warnings.warn(f"{WHAT}: sample {index} is left out: {reason}", TorchTransientWarning, level_of_user())
 
     def _say(self, worker: _Worker, *message: Any) -> None:
         try:

@@ -71,6 +71,10 @@ class Schedule:
         self.made += 1
         return slot
 
+    def failed(self, index: int) -> None:
+        """A sample cannot be made: its place is for another one."""
+        self._free.append(self.orders.pop(index).slot)
+
     def lost(self, producer: int) -> list[int]:
         """A producer has ended: its samples are ordered anew, of others."""
         orders = sorted((o for o in self.orders.values() if o.producer == producer), key=lambda order: order.index)

@@ -1,8 +1,8 @@
 """The producer of an online data set: a process that renders what it is asked for, into memory that it is given.
 
 It is told ``("make", index, slot)`` and once ``("ring", {name: tensor})``; it says ``("ready",)``,
-``("layout", {name: (shape, dtype)})`` with its first sample, ``("start", index)``, ``("done", index, values)`` and
-``("error", exception or None, text)``. It ends when nobody listens any more.
+``("layout", {name: (shape, dtype)})`` with its first sample, ``("start", index)``, ``("done", index, values)``,
+``("failed", index, reason)`` and ``("error", exception or None, text)``. It ends when nobody listens any more.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, TorchTransientError
 
 Layout = dict[str, tuple[tuple[int, ...], str]]
 
@@ -99,7 +99,13 @@ class _Producer:
             # All of them before new ones: a kind of scene that the maker puts last has its turn, too.
             for index in self._maker.order(list(self._asked)):
                 self._line.say("start", index)
-                sample = self._maker.sample(index)
+                try:
+                    sample = self._maker.sample(index)
+                except TorchTransientError as error:
+                    # One sample that fails must not end the night; what is wrong with the program does.
+                    self._asked.pop(index)
+                    self._line.say("failed", index, f"{type(error).__name__}: {error}")
+                    continue
                 self._write(sample.arrays, index, self._asked.pop(index))
                 self._line.say("done", index, dict(sample.values))
 
