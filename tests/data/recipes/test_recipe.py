@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import torch
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
 from torchtransient.errors import PhysicsError, SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.files.scan_data import scan_from_data
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -245,6 +247,14 @@ def without_small_box():
     return {key: node for key, node in box().items() if key != "small-box"}
 
 
+def shifted():
+    return tt.scenes.cornell_box(resolution=8, num_bins=60, bin_width_opl=0.1, start_opl=4.0)
+
+
+def nested():
+    return box()["small-box"] | {"bsdf": {"type": "conductor"}}
+
+
 def two_sizes():
     return small(D.OneOf([box(), tt.scenes.cornell_box(resolution=4)]), {})
 
@@ -276,7 +286,25 @@ WRONG = {
     "device of phasors": (lambda: small(frequencies=[0.0], device="vl53l8_like"), SceneError, "transients"),
     "not a distribution": (lambda: small(vary={RED: 3}), SceneError, "expected a distribution"),
     "seed": (lambda: small(seed=-1), SceneError, "seed"),
-    "films of two sizes": (two_sizes, ShapeError, "one size"),
+    "films of two sizes": (two_sizes, ShapeError, "size"),
+    "two axes": (lambda: small(D.OneOf([box(), shifted()])), ShapeError, "axis"),
+    "two numbers of samples": (
+        lambda: D.Recipe(D.OneOf([box(spp=4), box(spp=8)]), variant=VARIANT), ShapeError, "spp"
+    ),
+    "label of phasors": (lambda: small(frequencies=[0.0], labels=["first_return"]), SceneError, "off a transient"),
+    "label twice": (lambda: small(labels=["depth", "depth"]), SceneError, "each once"),
+    "label without pixels": (
+        lambda: D.Recipe(tt.scenes.light_over_plane(), variant=VARIANT, labels=["depth"]), SceneError, "line of its own"
+    ),
+    "parameters of a dictionary": (lambda: small(parameters={"resolution": 64}), SceneError, "dictionary has none"),
+    "labels that count other things": (
+        lambda: small(vary={"small-box": D.Choice([box()["small-box"], nested()])}, labels=["material"]),
+        SceneError, "would stand for another",
+    ),
+    "gates": (lambda: small(gates=3), SceneError, "tt.Gate"),
+    "frequencies": (lambda: small(frequencies=3), SceneError, "cycles per metre"),
+    "vary": (lambda: small(vary=[1]), SceneError, "vary"),
+    "sensors": (lambda: small(sensors=1.5), SceneError, "sensors"),
     "key of one scene": (lambda: small(D.OneOf([box(), without_small_box()])), SceneError, "small-box"),
 }  # fmt: skip
 
@@ -294,5 +322,118 @@ def test_what_is_wrong_is_said_before_anything_is_rendered(wrong, monkeypatch):
 
 
 def test_numbers_of_samples():
-    with pytest.raises(ShapeError, match="at least 0"):
-        small().sample(-1)
+    for wrong, words in ((-1, "at least 0"), (1.7, "whole numbers"), ("a", "whole numbers")):
+        with pytest.raises(ShapeError, match=words):
+            small().sample(wrong)
+    assert small().sample(np.int64(1)).index == 1
+
+
+# ------------------------------------------------------------------------------------------- distributions of one's own
+
+
+@dataclass(frozen=True, eq=False)
+class Blob(D.Distribution):
+    """A texture with a square somewhere: arrays that look alike when they are printed."""
+
+    name = "test_blob"
+
+    def draw(self, random, place):
+        pixels = np.zeros((40, 40, 3), np.float32)
+        row, column = (random.random((2,)) * 14 + 4).astype(int)
+        pixels[row : row + 18, column : column + 18] = 1
+        return {"type": "bitmap", "data": pixels, "raw": True}
+
+
+@dataclass(frozen=True, eq=False)
+class Ball(D.Distribution):
+    """By rejection: numbers at the ends never fit."""
+
+    name = "test_ball"
+    radius: float = 0.1
+
+    def draw(self, random, place):
+        moved = place.base("Ball").copy()
+        while True:
+            point = 2 * random.random((3,)) - 1
+            if point @ point <= 1:
+                break
+        moved[:3, 3] += self.radius * point
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Steps(D.Uniform):
+    name = "test_steps"
+
+    def draw(self, random, place):
+        return np.round(super().draw(random, place) * 4) / 4
+
+
+def test_entries_that_look_alike_are_other_structures():
+    scene = box() | {"white": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1] * 3}}}
+    recipe = small(scene, {"white.reflectance": Blob()}, variant="llvm_ad_rgb", labels=["albedo"])
+    found = [recipe.sample(index) for index in range(3)]
+    assert len({float(sample.arrays["albedo"].sum()) for sample in found}) == 3
+    assert len({sample.values["white.reflectance"] for sample in found}) == 3
+
+
+def test_a_distribution_that_rejects_is_checked():
+    small(vary={BOX: Ball()}).check()
+    # Both ends at once have no direction, which no sample draws.
+    point = D.Uniform([-0.5, -0.5, 3], [0.5, 0.5, 4])
+    small(vary={EYE: D.LookAt(point, point)}).check()
+
+
+def test_distributions_of_ones_own_are_told_apart():
+    uniform, steps = small(vary={RED: D.Uniform(0.1, 0.9)}), small(vary={RED: Steps(0.1, 0.9)})
+    assert uniform != steps and uniform.key() != steps.key()
+    again = D.Recipe.from_dict(json.loads(json.dumps(steps.to_dict())))
+    assert again == steps and again.draw(3) == steps.draw(3) != uniform.draw(3)
+    assert small(vary={BOX: Ball(0.2)}).key() != small(vary={BOX: Ball(0.1)}).key()
+
+
+def test_distributions_that_cannot_be_told_apart_are_refused():
+    class Nameless(D.Uniform):
+        pass
+
+    class WithInit(D.Uniform):
+        name = "test_with_init"
+
+        def __init__(self, low):
+            super().__init__(low, low)
+
+    for wrong, words in ((Nameless(0, 1), "name of its own"), (WithInit(0.5), "settings are fields")):
+        with pytest.raises(SceneError, match=words):
+            small(vary={RED: wrong})
+    with pytest.raises(SceneError, match="'uniform' is that of"):
+
+        class Taken(D.Uniform):
+            name = "uniform"
+
+
+def test_recipes_of_a_class_of_ones_own_have_another_key():
+    class Own(D.Recipe):
+        pass
+
+    assert Own(box(), variant=VARIANT).key() != D.Recipe(box(), variant=VARIANT).key()
+
+
+def test_what_scenes_have_of_their_own_is_told_by_scene():
+    turned = dict(reversed(list(box().items())))
+    recipe = small(D.OneOf({"a": box(), "b": turned}), {}, labels=["shape"])
+    about = recipe._maker.about()
+    assert about["shapes"]["a"] == about["shapes"]["b"][::-1]
+    recipe.check()
+
+
+def test_scans_that_vary_are_all_told():
+    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
+    parts = (None, (0.2, 0.2, 0.6, 0.6))
+    scans = [tt.nlos.Scan.grid(wall, (3, 3), kind="confocal", extent=extent) for extent in parts]
+    hidden = {"plate": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])}}
+    recipe = D.Recipe(
+        hidden, {"scan": D.Choice(scans)}, scan=scans[0], variant=VARIANT, time_axis=tt.TimeAxis(0, 0.05, 60), spp=4
+    )
+    told = recipe._maker.about()["scans"]
+    assert [scan_from_data(one) for one in told] == scans
+    assert {recipe.sample(index).values["scan"] for index in range(6)} == {"#0", "#1"}

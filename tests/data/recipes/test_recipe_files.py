@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import numpy as np
 import pytest
 
 import torchtransient as tt
-from torchtransient.errors import SceneError, StorageError
+from torchtransient.data.recipes.places import without_places
+from torchtransient.errors import SceneError, StorageError, UnitError
 
 D = tt.data
 
@@ -125,9 +127,73 @@ def test_xml_scenes_their_files_and_places(tmp_path):
         D.Recipe.read(tmp_path / "whole.yaml")
 
 
+DEFAULT = '<default name="mesh" value="other.obj"/>'
+
+
+def changes(recipe_of, file):
+    """Whether the key follows what is in a file."""
+    before = recipe_of().key()
+    kept = file.read_text()
+    file.write_text(kept.replace("0 1 3", "0 2 3"))
+    after = recipe_of().key()
+    file.write_text(kept)
+    assert recipe_of().key() == before
+    return before != after
+
+
+def test_keys_follow_files_wherever_they_are_named(tmp_path, monkeypatch):
+    folder = tmp_path / "a"
+    write(folder)
+    (folder / "other.obj").write_text(OBJ)
+    (folder / "inner.xml").write_text(
+        '<scene version="3.0.0"><shape type="obj"><string name="filename" value="other.obj"/></shape></scene>'
+    )
+    texts = {
+        "single quotes": XML.replace('"thing.obj"', "'other.obj'"),
+        "default": XML.replace('"thing.obj"', '"$mesh"').replace("<default", f"{DEFAULT}<default", 1),
+        "include": XML.replace("</scene>", '<include filename="inner.xml"/></scene>'),
+    }
+    for name, text in texts.items():
+        (folder / "scene.xml").write_text(text)
+        assert changes(lambda: D.Recipe.read(folder / "recipe.yaml"), folder / "other.obj"), name
+    (folder / "scene.xml").write_text(XML.replace('"thing.obj"', '"$mesh"'))
+    choice = "parameters: {mesh: thing.obj}\nvary: {$mesh: {choice: [thing.obj, other.obj]}}\n"
+    for entries in ("parameters: {mesh: other.obj}\n", choice):
+        (folder / "other.yaml").write_text("scene: scene.xml\nvariant: llvm_ad_mono\n" + entries)
+        assert changes(lambda: D.Recipe.read(folder / "other.yaml"), folder / "other.obj"), entries
+    (folder / "dict.yaml").write_text(
+        "variant: llvm_ad_mono\nscene: {type: scene, thing: {type: obj, filename: thing.obj}}\n"
+        "vary: {thing.filename: {choice: [thing.obj, other.obj]}}\n"
+    )
+    assert changes(lambda: D.Recipe.read(folder / "dict.yaml"), folder / "other.obj")
+    key = D.Recipe.read(folder / "dict.yaml").key()
+    monkeypatch.chdir(folder)
+    assert D.Recipe.read(folder / "dict.yaml").key() == key
+
+
+def test_captures_are_the_same_elsewhere(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "letter.obj").write_text(OBJ)
+    (folder / "recipe.yaml").write_text(CAPTURE.replace("shape: rectangle", "file: letter.obj"))
+    recipe = D.Recipe.read(folder / "recipe.yaml")
+    shutil.copytree(folder, tmp_path / "b")
+    assert D.Recipe.read(tmp_path / "b" / "recipe.yaml").key() == recipe.key()
+    assert str(tmp_path) not in json.dumps(without_places(recipe.to_dict()))
+    assert changes(lambda: D.Recipe.read(folder / "recipe.yaml"), folder / "letter.obj")
+
+
 @pytest.mark.parametrize(
     "text, error, words",
     [
+        ("scene: {builtin: cornell_box}\ngates: 3\n", SceneError, "not what it should be"),
+        ("scene: {builtin: cornell_box}\nlabels: 3\n", SceneError, "list of names"),
+        ("scene: {builtin: cornell_box}\nbounces: 2.5\n", SceneError, "bounces"),
+        ("scene: {one_of: 3}\nspp: 3\n", SceneError, "not what it should be"),
+        ("scene: {builtin: cornell_box}\npulse: {x: 3}\n", SceneError, "not what it should be"),
+        ("scene: {builtin: cornell_box}\nfrequencies: {a: 3}\n", SceneError, "not what it should be"),
+        ("scene: {a: 3}\nspp: 3\n", SceneError, "'type', 'builtin'"),
+        ("scene: {type: scene, xml: {type: sphere}}\nvary: {xml.type: {uniform: [0, .inf]}}\n", UnitError, "finite"),
         ("sceen: a\nvary: {}\n", SceneError, "Did you mean 'scene'"),
         ("vary: {}\nspp: 3\n", SceneError, "'scene', or 'hidden'"),
         ("scene: nowhere.xml\nspp: 3\n", SceneError, "nowhere.xml"),

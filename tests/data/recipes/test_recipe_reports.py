@@ -46,3 +46,12 @@ def test_preview_is_a_picture(recipe, tmp_path):
     assert np.asarray(Image.open(tmp_path / "one.png")).size < picture.size
     with pytest.raises(SceneError, match="whole number"):
         recipe.preview(0)
+
+
+def test_cost_counts_what_is_built():
+    """Every sample is a scene of its own: the forecast is that of making them, within what timing is good for."""
+    ball = {"type": "sphere", "center": [0, -0.6, 0.2], "radius": 0.1, "bsdf": {"type": "ref", "id": "white"}}
+    scene = tt.scenes.cornell_box(resolution=8, num_bins=60, bin_width_opl=0.2, start_opl=2.0) | {"ball": ball}
+    recipe = D.Recipe(scene, {"ball.radius": D.Uniform(0.05, 0.3)}, variant="llvm_ad_mono", spp=4)
+    cost = recipe.cost(1)
+    assert cost.seen == 64 and cost.sample_s >= np.mean([one.first_s for one in cost.structures[1:]])

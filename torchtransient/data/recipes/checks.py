@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Extreme
 from torchtransient.data.recipes.structures import Structure
-from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import SceneError, TorchTransientError, UnitError
 from torchtransient.render.physics import is_singular, outside_message, singular_message
 from torchtransient.render.variant import active_variant
 
@@ -24,16 +25,13 @@ SAMPLES, STRUCTURES = 64, 8
 
 def check_recipe(recipe: Specification, maker: Maker) -> None:
     """Raise SceneError, ShapeError, UnitError, or another error of this library, for what is wrong."""
-    sizes: dict[str, tuple[int, ...]] = {}
+    expected = maker.measures()
+    named: dict[str, dict[str, list[str]]] = {}
     for structure, indices in structures_of(recipe, range(SAMPLES)):
         kept = maker.kept(structure)
-        sizes[structure.text] = kept.size
-        if len(set(sizes.values())) > 1:
-            words = ", ".join(f"{size} for '{text}'" for text, size in sizes.items())
-            raise ShapeError(
-                f"recipe: expected films of one size and one number of channels in all scenes, got {words}. "
-                "time_axis= makes bins of one size."
-            )
+        kept.measures.check(expected, f"structure '{structure.text}'", "sample 0")
+        kept.check_labels()
+        _check_names(named.setdefault(structure.name, kept.named()), kept)
         draws = list(_draws(recipe, kept, indices))
         _check_device(recipe, kept, [drawn for _, drawn in draws])
         with active_variant(recipe.variant):
@@ -52,17 +50,30 @@ def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[S
     found: dict[str, tuple[Structure, list[int]]] = {}
     for index in indices:
         structure = recipe.structure(index)
-        if structure.text in found or len(found) < STRUCTURES:
-            found.setdefault(structure.text, (structure, []))[1].append(index)
+        if structure.key in found or len(found) < STRUCTURES:
+            found.setdefault(structure.key, (structure, []))[1].append(index)
     return list(found.values())
 
 
 def _draws(recipe: Specification, kept: Kept, indices: Iterable[int]) -> Iterator[tuple[str, dict[str, Any]]]:
     """What can come: the ends of every distribution, and the first samples."""
     for words, upper in (("lower", False), ("upper", True)):
-        yield f"at the {words} end", kept.drawn(dict.fromkeys(recipe.vary, Extreme(upper)))
+        # What is wrong everywhere is wrong in samples, too; all ends at once may be what no sample ever draws.
+        with contextlib.suppress(TorchTransientError):
+            yield f"at the {words} end", kept.drawn({key: Extreme(upper) for key in recipe.vary})
     for index in indices:
         yield f"of sample {index}", kept.draw(index)
+
+
+def _check_names(expected: Mapping[str, list[str]], kept: Kept) -> None:
+    """Raise SceneError where a label would number other things in another structure of the same scene."""
+    for label in ("shapes", "materials"):
+        if kept.named().get(label) != expected.get(label):
+            raise SceneError(
+                f"recipe: labels: the {label} of structure '{kept.structure.text}' are {kept.named()[label]}, others "
+                f"have {expected[label]}: a number would stand for another one. Exchange things of one name, or give "
+                "each scene of its own to OneOf."
+            )
 
 
 def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) -> None:

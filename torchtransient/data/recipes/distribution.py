@@ -41,11 +41,41 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Distribution(ABC):
-    """Base of all. Distributions are plain data: they compare, pickle, and stand in YAML files under ``name``."""
+    """Base of all. Distributions are plain data: they compare, pickle, and stand in YAML files under ``name``.
 
+    To write one of your own, derive a class, decorate it with ``@dataclass(frozen=True, eq=False)``, give it a ``name``
+    that no other has, and draw from ``random.random(shape)`` alone. Files that name it can be read once the module that
+    defines it has been imported. SceneError, as the class is made, for a name that is taken.
+    """
+
+    known: ClassVar[dict[str, type[Distribution]]] = {}
     name: ClassVar[str] = ""
     # The field that stands for the whole where a file gives no mapping: {uniform: [0, 1]}.
     short: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        name = vars(cls).get("name")
+        if name:
+            # The same one again where a cell of a notebook is run twice, or a module anew.
+            other = Distribution.known.get(name)
+            if other is not None and (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+                raise SceneError(
+                    f"{cls.__qualname__}: the name {name!r} is that of {other.__module__}.{other.__qualname__}. "
+                    "Choose another one."
+                )
+            Distribution.known[name] = cls
+
+    @classmethod
+    def check_kind(cls) -> None:
+        """Raise SceneError unless the class can be told from all others, and all of its settings are fields."""
+        if not vars(cls).get("name"):
+            raise SceneError(f"{cls.__qualname__}: expected a distribution with a name of its own: name = '...' in it.")
+        if "__init__" in vars(cls) and "__dataclass_fields__" not in vars(cls):
+            raise SceneError(
+                f"{cls.__qualname__}: expected a distribution whose settings are fields: decorate the class with "
+                "@dataclass(frozen=True, eq=False), without an __init__ of its own."
+            )
 
     @abstractmethod
     def draw(self, random: Draw, place: Place) -> Any:

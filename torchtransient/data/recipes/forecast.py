@@ -41,7 +41,8 @@ class Cost:
     combination is a new structure; ``seen`` of these came among the first 64 samples. ``structures``: those measured.
     ``sample_bytes``: before compression; ``stored_bytes``: on disk, by store, None where it could not be measured.
     ``outside``: mean and largest share of light outside of the window. ``standard_error``: relative, of one sample's
-    numbers. ``n``: samples of the data set, None where the recipe does not say.
+    numbers. ``n``: samples of the data set, None where the recipe does not say. ``threads``: of this process, with
+    which seconds were measured; workers have one each.
     """
 
     values: tuple[str, ...]
@@ -53,11 +54,19 @@ class Cost:
     outside: tuple[float, float]
     standard_error: float
     n: int | None
+    threads: int = 1
 
     @property
     def sample_s(self) -> float:
-        """Seconds a sample in a kept structure, the mean of those measured."""
-        return float(np.mean([one.sample_s for one in self.structures]))
+        """Seconds a sample, with its share of building structures: in shards of some 64 samples each structure in it is
+        built once. The first one measured may have compiled, which happens once; it counts where it is the only one.
+        """
+        kept = float(np.mean([one.sample_s for one in self.structures]))
+        if self.seen < 2:
+            return kept
+        built = float(np.mean([one.first_s for one in self.structures[1:]]))
+        new = self.seen / SAMPLES
+        return new * built + (1 - new) * kept
 
     def __str__(self) -> str:
         return "\n".join(self._lines())
@@ -79,8 +88,17 @@ class Cost:
         if self.n is not None:
             sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]
             hours = self.n * self.sample_s / 3600
-            yield f"{self.n} samples    {hours:.2f} hours of one worker, {_bytes(min(sizes))} to {_bytes(max(sizes))}"
+            yield (
+                f"{self.n} samples    {_duration(hours)} of one process with {self.threads} threads, "
+                f"{_bytes(min(sizes))} to {_bytes(max(sizes))}"
+            )
 
+
+
+def _duration(hours: float) -> str:
+    if hours >= 1:
+        return f"{hours:.2f} hours"
+    return f"{60 * hours:.1f} minutes" if hours >= 1 / 60 else f"{3600 * hours:.2g} seconds"
 
 
 def _bytes(size: float) -> str:
@@ -93,6 +111,8 @@ def _bytes(size: float) -> str:
 
 def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) -> Cost:
     """See :meth:`Recipe.cost`."""
+    import drjit
+
     wanted = count("cost: samples", samples)
     found = structures_of(recipe, range(SAMPLES))
     bar = None
@@ -119,13 +139,14 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
     return Cost(
         values=tuple(key for key in recipe.vary if key not in recipe.exchanged),
         exchanged=tuple(recipe.exchanged),
-        seen=len({recipe.structure(index).text for index in range(SAMPLES)}),
+        seen=len({recipe.structure(index).key for index in range(SAMPLES)}),
         structures=tuple(costs),
         sample_bytes=sum(array.nbytes for array in rendered[0].arrays.values()),
         stored_bytes=_stored(rendered, maker),
         outside=(float(np.mean(outside)), max(outside)),
         standard_error=maker.standard_error(found[0][1][0]),
         n=recipe.n,
+        threads=drjit.thread_count(),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -14,16 +14,15 @@ from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
 from torchtransient.data.recipes.specification import (
-    DEVICE,
     NOISE,
     Specification,
 )
 from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
-from torchtransient.errors import GradientError, SceneError, TorchTransientError
+from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
-from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
+from torchtransient.render.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import ParameterTable, unknown_key
 from torchtransient.render.renderer import TransientRenderer
@@ -32,6 +31,7 @@ from torchtransient.render.variant import active_variant, stokes_components
 from torchtransient.sensing import Compose, Device
 
 if TYPE_CHECKING:
+    from torchtransient.axes import TimeAxis
     from torchtransient.capture import Scan
 
 # A label that is read off the transient.
@@ -46,6 +46,29 @@ class _Measured:
     outside: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class Measures:
+    """What the film of a scene measures: its ``name``, rows, columns, bins and channels, and what these stand for."""
+
+    name: str
+    size: tuple[int, ...]
+    axis: Any
+    frequencies: Any
+    gates: Any
+    channels: tuple[str, ...]
+    spp: int
+
+    def check(self, other: Measures, mine: str, others: str) -> None:
+        """Raise ShapeError where another structure's samples do not go into one array with these."""
+        for field in fields(self):
+            here, there = getattr(self, field.name), getattr(other, field.name)
+            if here != there:
+                raise ShapeError(
+                    f"recipe: {mine} has {field.name} {here}, {others} has {there}. All need the same: give time_axis= "
+                    "for bins of one kind, spp= for one number of samples, films of one size."
+                )
+
+
 class Kept:
     """A structure's scene, its renderer, and the places of what varies in it. Raises SceneError for keys that it does
     not have.
@@ -53,9 +76,9 @@ class Kept:
 
     def __init__(self, recipe: Specification, structure: Structure) -> None:
         self.recipe, self.structure = recipe, structure
-        _check_labels(recipe.settings.labels)
-        self.keys = [key for key in recipe.vary if key not in recipe.exchanged and key.split(".")[0] != DEVICE]
-        self.device_keys = [key for key in recipe.vary if key.split(".")[0] == DEVICE]
+        check_label_names(recipe.settings.labels)
+        self.keys = [key for key in recipe.vary if key not in recipe.exchanged and not recipe.is_of_device(key)]
+        self.device_keys = [key for key in recipe.vary if recipe.is_of_device(key)]
         self.scan: Scan | None = None
         try:
             self.renderer = self._make()
@@ -132,9 +155,21 @@ class Kept:
         return found
 
     @property
-    def size(self) -> tuple[int, ...]:
-        """Of what the film measures: rows, columns, bins, channels."""
-        return (*self.renderer._cube_shape, len(self.renderer._channels))
+    def measures(self) -> Measures:
+        """What the film measures."""
+        renderer = self.renderer
+        return Measures(
+            renderer.film.measures, renderer._cube_shape, renderer.axis, renderer.frequencies, renderer.gates,
+            renderer._channels, renderer.spp or renderer._scene_spp,
+        )  # fmt: skip
+
+    def check_labels(self) -> None:
+        """Raise what would be wrong with labels: one intersection, no light."""
+        labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
+        if labels:
+            scene_labels(self.renderer, None, labels)
+        if FIRST_RETURN in self.recipe.settings.labels:
+            self._axis_of_first_return()
 
     # ----------------------------------------------------------------------------------------------------- samples
 
@@ -184,10 +219,20 @@ class Kept:
         return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), _outside(out))
 
     def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        if self.renderer.axis is None or "transient" not in tensors:
-            raise SceneError(f"recipe: labels: {FIRST_RETURN!r} is read off a transient; give time_axis=.")
+        axis = self._axis_of_first_return()
         polarized = stokes_components(self.recipe.variant) > 1
-        return first_return(tensors["transient"], self.renderer.axis, polarized=polarized)
+        return first_return(tensors["transient"], axis, polarized=polarized)
+
+    def _axis_of_first_return(self) -> TimeAxis:
+        if self.renderer.axis is None or self.renderer.film.measures != "transient" or self._is_exhaustive():
+            raise SceneError(
+                f"recipe: labels: {FIRST_RETURN!r} is read off a transient of pixels; give time_axis=, and no "
+                "exhaustive scan."
+            )
+        return self.renderer.axis
+
+    def _is_exhaustive(self) -> bool:
+        return self.scan is not None and self.scan.kind == "exhaustive"
 
     # ------------------------------------------------------------------------------------------------- measurements
 
@@ -220,8 +265,8 @@ class Kept:
         return built.integrator + ("" if depth is None else f", max_depth {'unbounded' if depth > 2**31 else depth}")
 
     def about(self) -> dict[str, Any]:
-        """Plain data; nothing in it depends on the structure but what its film says."""
-        renderer, settings = self.renderer, self.recipe.settings
+        """Plain data, the same for all structures of a recipe."""
+        renderer = self.renderer
         film = renderer.film
         found: dict[str, Any] = {
             "measures": film.measures,
@@ -232,20 +277,24 @@ class Kept:
             "spp": renderer.spp or renderer._scene_spp,
             "variant": self.recipe.variant,
             "temporal_filter": renderer.effective_filter,
-            "plan": [
-                f"film: {film.describe(renderer.effective_filter)}", f"variant: {self.recipe.variant}",
-                f"integrator: {self._integrator()}",
-            ],
             "versions": versions(),
         }  # fmt: skip
-        if "shape" in settings.labels:
-            found["shapes"] = list(label_names(renderer))
         if self.scan is not None:
             found["scan"] = scan_data(self.scan)
         return found
 
+    def named(self) -> dict[str, list[str]]:
+        """What a scene has of its own: lines of its plan, names that the labels count."""
+        renderer, labels = self.renderer, self.recipe.settings.labels
+        film = f"film: {renderer.film.describe(renderer.effective_filter)}"
+        found = {"plan": [film, f"variant: {self.recipe.variant}", f"integrator: {self._integrator()}"]}
+        for label, names in (("shape", label_names), ("material", material_names)):
+            if label in labels:
+                found[f"{label}s"] = list(names(renderer))
+        return found
 
-def _check_labels(names: tuple[str, ...]) -> None:
+
+def check_label_names(names: tuple[str, ...]) -> None:
     for name in names:
         if name not in (*LABELS, FIRST_RETURN):
             known = ", ".join((*LABELS, FIRST_RETURN))

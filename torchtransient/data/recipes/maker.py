@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.data.recipes.kept_scene import Kept
+from torchtransient.data.recipes.distributions import Choice
+from torchtransient.data.recipes.kept_scene import Kept, Measures
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import (
     RENDER,
@@ -19,8 +20,9 @@ from torchtransient.data.recipes.specification import (
     samples_of,
 )
 from torchtransient.data.recipes.streams import Stream
-from torchtransient.data.recipes.structures import Structure
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.data.recipes.structures import SCAN, Structure
+from torchtransient.errors import UnitError
+from torchtransient.files.scan_data import scan_data
 
 # Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
 # Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.
@@ -35,23 +37,24 @@ class Maker:
     def __init__(self, recipe: Specification) -> None:
         self.recipe = recipe
         self._kept: OrderedDict[str, Kept] = OrderedDict()
-        self._size: tuple[int, ...] | None = None
+        self._measures: Measures | None = None
 
     def order(self, indices: Iterable[int]) -> list[int]:
         """The same samples, those of one structure one after another, in the order in which structures first come."""
         groups: dict[str, list[int]] = {}
         for index in samples_of(indices):
-            groups.setdefault(self.recipe.structure(index).text, []).append(index)
+            groups.setdefault(self.recipe.structure(index).key, []).append(index)
         return [index for group in groups.values() for index in group]
 
     def kept(self, structure: Structure) -> Kept:
         """The scene of a structure, built unless it is kept."""
-        found = self._kept.pop(structure.text, None)
+        found = self._kept.pop(structure.key, None)
         if found is None:
-            found = Kept(self.recipe, structure)
+            # Before the next one is built.
             while len(self._kept) >= MOST_KEPT:
                 self._kept.popitem(last=False)
-        self._kept[structure.text] = found
+            found = Kept(self.recipe, structure)
+        self._kept[structure.key] = found
         return found
 
     def draw(self, index: int) -> dict[str, Any]:
@@ -66,24 +69,21 @@ class Maker:
         """Sample ``index``. Raises the errors of the renderer, and UnitError for light that is no number."""
         (index,) = samples_of([index])
         # Of sample 0, whichever comes first here: all processes refuse the same samples.
-        size = self._first_size()
+        expected = self.measures()
         structure = self.recipe.structure(index)
         kept = self.kept(structure)
-        if kept.size != size:
-            raise ShapeError(
-                f"recipe: sample {index} has {kept.size} rows, columns, bins and channels, sample 0 has {size}. Scenes "
-                "of one recipe need films of one size; give time_axis= for bins of one size."
-            )
+        kept.measures.check(expected, f"sample {index}", "sample 0")
         varied = kept.draw(index)
         seed = Stream(self.recipe.seed, index, RENDER).seed()
         arrays, outside = kept.arrays(index, varied, seed)
-        self._check(index, arrays)
+        self._check(index, arrays, expected.name)
         return Sample(index, seed, arrays, self._values(structure, varied), outside, structure.text)
 
-    def _first_size(self) -> tuple[int, ...]:
-        if self._size is None:
-            self._size = self.kept(self.recipe.structure(0)).size
-        return self._size
+    def measures(self) -> Measures:
+        """What sample 0 measures, and with it all."""
+        if self._measures is None:
+            self._measures = self.kept(self.recipe.structure(0)).measures
+        return self._measures
 
     def standard_error(self, index: int) -> float:
         """Relative standard error of a sample: root mean square over the cube of the error of a number, by the root
@@ -101,12 +101,25 @@ class Maker:
         return float(np.sqrt(noise / (power + second))) if power + second > 0 else 0.0
 
     def about(self) -> dict[str, Any]:
-        """How samples are made, plain data: the same for all structures of a recipe."""
-        return self.kept(self.recipe.structure(0)).about()
+        """How samples are made, plain data. Of several scenes ``plan`` and names of shapes and materials stand under
+        the scene's name; of scans that vary all stand in ``scans``, in the order of the choices.
+        """
+        recipe, first = self.recipe, self.recipe.structure(0)
+        # Sample 0's scene last: it is the one that is kept.
+        names = sorted(recipe.scenes.names, key=lambda name: name == first.name)
+        several = {name: self.kept(Structure(name, "", first.entries)).named() for name in names}
+        of_scenes: dict[str, Any] = dict(several[first.name])
+        if len(names) > 1:
+            of_scenes = {what: {name: several[name][what] for name in recipe.scenes.names} for what in of_scenes}
+        found = self.kept(Structure(first.name, "", first.entries)).about() | of_scenes
+        if SCAN in recipe.exchanged:
+            choices = recipe.vary[SCAN]
+            found["scans"] = [scan_data(scan) for scan in choices.values] if isinstance(choices, Choice) else []
+        return found
 
     def forget(self, structure: Structure) -> None:
         """Free the scene of a structure."""
-        self._kept.pop(structure.text, None)
+        self._kept.pop(structure.key, None)
 
     def close(self) -> None:
         """Free the scenes."""
@@ -125,7 +138,8 @@ class Maker:
             found[key] = text if text else np.asarray(value, dtype=np.float32)
         return found
 
-    def _check(self, index: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-        for name in ("transient", "phasor", "gated", "steady"):
+    def _check(self, index: int, arrays: Mapping[str, NDArray[Any]], measured: str) -> None:
+        # Labels have NaN where nothing is seen.
+        for name in (measured, "steady", "measurement"):
             if name in arrays and not np.isfinite(arrays[name]).all():
                 raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")

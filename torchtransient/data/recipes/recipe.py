@@ -70,12 +70,13 @@ class Recipe(Specification):
 
     # --------------------------------------------------------------------------------------- before it is used
 
-    def check(self) -> None:
+    def check(self, maker: Maker | None = None) -> None:
         """Raise what is wrong with the recipe, before anything is rendered: unknown keys, distributions that do not fit
         them, numbers outside of what is physical, poses whose light leaves the window, a scene without light. Looks at
-        the ends of every distribution and at the first samples.
+        the ends of every distribution and at the first samples. ``maker``: whose scenes are used, None for the recipe's
+        own.
         """
-        check_recipe(self, self._maker)
+        check_recipe(self, self._maker if maker is None else maker)
 
     def cost(self, samples: int = 5, *, progress: bool = False) -> Cost:
         """What a sample costs: what is built anew and what is only a value, seconds, bytes, light outside the window.
@@ -102,8 +103,9 @@ class Recipe(Specification):
         """A recipe from plain data: what :meth:`to_dict` made, or what a YAML file says. ``folder``: where files that
         it names are looked up, None for where they were. Raises SceneError for unknown and wrong entries.
         """
-        scene, arguments = recipe_file.from_dict(data, folder)
-        return cls(scene, **arguments)
+        with recipe_file.faults_said():
+            scene, arguments = recipe_file.from_dict(data, folder)
+            return cls(scene, **arguments)
 
     def to_yaml(self, path: str | Path | None = None) -> str:
         """As YAML text, also written to ``path``."""

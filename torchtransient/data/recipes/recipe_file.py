@@ -8,16 +8,17 @@ scene dictionary, ``{builtin: cornell_box, resolution: 32}`` for a function of `
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from torchtransient.axes import TimeAxis
-from torchtransient.data.recipes.places import without_places
+from torchtransient.data.recipes.places import files_of, without_places
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
 from torchtransient.data.recipes.written import (
@@ -31,8 +32,7 @@ from torchtransient.data.recipes.written import (
     written_frequencies,
     written_shape,
 )
-from torchtransient.errors import SceneError, StorageError
-from torchtransient.files.content_key import contents_of
+from torchtransient.errors import SceneError, StorageError, TorchTransientError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.quantities import shown
@@ -81,7 +81,10 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
         "n": recipe.n,
     }
     # Of JSON: no tuples, and nothing that is not plain.
-    plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"recipe: expected finite numbers and plain data throughout: {error}.") from error
     return plain
 
 
@@ -121,33 +124,13 @@ def to_yaml(recipe: Specification, path: str | Path | None) -> str:
 def key_of(recipe: Specification) -> str:
     """See :meth:`Recipe.key`."""
     plain = {name: entry for name, entry in to_dict(recipe).items() if name not in _NO_NUMBERS}
-    files: dict[str, str] = {}
-    for name, description in recipe.scenes.descriptions.items():
-        folder = Path(description.path).parent if isinstance(description, XmlDescription) else Path(description.folder)
-        content = description.text if isinstance(description, XmlDescription) else description.tree
-        # The scene's place is no part of what it is.
-        files |= {f"{name}/{file}": sha for file, sha in _files_of(content, folder).items()}
-    for key in recipe.exchanged:
-        files |= {f"{key}/{file}": sha for file, sha in _files_of(written(recipe.vary[key]), Path.cwd()).items()}
-    text = json.dumps([without_places(plain), files], sort_keys=True, separators=(",", ":"))
+    exchanged = [written(recipe.vary[key]) for key in recipe.exchanged]
+    files = {name: files_of(description, exchanged) for name, description in recipe.scenes.descriptions.items()}
+    # A class of one's own may make other samples.
+    kind = type(recipe)
+    own = "" if kind.__module__.startswith("torchtransient.") else f"{kind.__module__}.{kind.__qualname__}"
+    text = json.dumps([without_places(plain), files, own], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _files_of(content: Any, folder: Path) -> dict[str, str]:
-    """Hashes of the files that a description names, by their names."""
-    found: dict[str, str] = {}
-    if isinstance(content, Mapping):
-        for entry in content.values():
-            found |= _files_of(entry, folder)
-    elif isinstance(content, list):
-        for entry in content:
-            found |= _files_of(entry, folder)
-    elif isinstance(content, str):
-        # Of an XML text every quoted word, of a dictionary every text.
-        for word in set(content.split('"')[1::2]) if "<" in content else {content}:
-            if 0 < len(word) < 1024 and (sha := contents_of(folder / word)):
-                found[word] = sha
-    return found
 
 
 # --------------------------------------------------------------------------------------------------------------- read
@@ -194,6 +177,19 @@ def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> tuple[Any, 
     return _scene(section.get("scene"), place), arguments
 
 
+@contextlib.contextmanager
+def faults_said() -> Iterator[None]:
+    """Entries of a file that are something else than they should be, as SceneError: what is wrong in them is found
+    where they are used.
+    """
+    try:
+        yield
+    except (TypeError, KeyError, ValueError, AttributeError, IndexError, OverflowError, RecursionError) as error:
+        if isinstance(error, TorchTransientError):
+            raise
+        raise SceneError(f"recipe: an entry is not what it should be: {type(error).__name__}: {error}.") from error
+
+
 def _axis(section: Section) -> TimeAxis | None:
     given = section.get("time_axis", None)
     if given is None or isinstance(given, TimeAxis):
@@ -217,6 +213,9 @@ def _scene(given: Any, folder: Path) -> Any:
         return path if path.is_file() else given
     if not isinstance(given, Mapping):
         raise SceneError(f"recipe: scene: expected a file, a scene dictionary or a builtin, got {shown(given)}.")
+    if "type" in given:
+        description = describe_dict(read(given))
+        return Scene(DictDescription(description.tree, str(folder)), None)
     if "one_of" in given:
         several = given["one_of"]
         scenes = (
@@ -231,8 +230,7 @@ def _scene(given: Any, folder: Path) -> Any:
         return _xml(given, folder)
     if "tree" in given:
         return Scene(_of_tree(given), None)
-    description = describe_dict(read(given))
-    return Scene(DictDescription(description.tree, str(folder)), None)
+    raise SceneError(f"recipe: scene: expected a 'type', 'builtin', 'xml' or 'one_of' in it, got {shown(given)}.")
 
 
 def _of_tree(given: Mapping[str, Any]) -> DictDescription:

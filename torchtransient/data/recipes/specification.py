@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
@@ -16,9 +19,10 @@ from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import Scenes, Structure
 from torchtransient.data.recipes.written import read_distribution
 from torchtransient.errors import SceneError, ShapeError
+from torchtransient.files.content_key import content_key
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
-from torchtransient.quantities import count, shown
+from torchtransient.quantities import count, real_array, shown
 from torchtransient.render.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
@@ -76,14 +80,23 @@ class Specification:
         parameters: Mapping[str, Any] | None = None,
         n: int | None = None,
     ) -> None:
-        if isinstance(labels, str):
-            raise SceneError(f"recipe: labels: expected a list of names, got the text {labels!r}; write [{labels!r}].")
+        labels = _names("labels", labels)
         if physics not in ("ignore", "error"):
             raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
         if scan is not None and not isinstance(scan, Scan):
             raise SceneError(f"recipe: scan: expected a tt.nlos.Scan, got {shown(scan)}.")
+        for name, given, kind in (
+            ("time_axis", time_axis, TimeAxis), ("pulse", pulse, Pulse), ("irf", irf, Pulse), ("vary", vary, Mapping),
+        ):  # fmt: skip
+            if given is not None and not isinstance(given, kind):
+                raise SceneError(f"recipe: {name}: expected a {kind.__name__}, got {shown(given)}.")
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-            frequencies = FrequencyAxis(tuple(float(number) for number in frequencies))
+            numbers = real_array(frequencies)
+            if numbers is None or numbers.ndim != 1:
+                raise SceneError(f"recipe: frequencies: expected cycles per metre in a list, got {shown(frequencies)}.")
+            frequencies = FrequencyAxis(tuple(numbers.tolist()))
+        if gates is not None and (isinstance(gates, Gate) or not all(isinstance(g, Gate) for g in _listed(gates))):
+            raise SceneError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
         self.seed = count("recipe: seed", seed, 0)
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
@@ -91,8 +104,8 @@ class Specification:
             labels=tuple(labels), time_axis=time_axis, frequencies=frequencies,
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
             spp=None if spp is None else count("recipe: spp", spp), max_depth=max_depth,
-            sensors=sensors if isinstance(sensors, int | str) else tuple(sensors), pulse=pulse, irf=irf,
-            bounces=bounces if isinstance(bounces, str) else tuple(bounces), energy=energy, physics=physics,
+            sensors=_counts("sensors", sensors, 0), pulse=pulse, irf=irf, bounces=_counts("bounces", bounces),
+            energy=energy, physics=physics,
         )  # fmt: skip
         self.scan = scan
         self.device = _device(device)
@@ -106,7 +119,8 @@ class Specification:
                 "recipe: a capture whose hidden things move needs a time_axis= that holds all of their places. "
                 "scan.default_axis(bounds) finds one for the corners (2, 3) of the space that they stay in."
             )
-        if self.device is None and any(key.split(".")[0] == DEVICE for key in self.vary):
+        of_device = [key for key in self.vary if key.split(".")[0] == DEVICE and not self.scenes.has_entry(key)]
+        if self.device is None and of_device:
             raise SceneError("recipe: keys of 'device.' vary a device; give device= too.")
 
     # ----------------------------------------------------------------------------------------------- structures
@@ -122,13 +136,17 @@ class Specification:
             words.append(f"{key}={label_of(self.vary[key], value)}")
         return Structure(name, ", ".join(words), tuple(entries))
 
+    def is_of_device(self, key: str) -> bool:
+        """Whether a key stands for an argument of the device."""
+        return self.device is not None and key.split(".")[0] == DEVICE
+
     @functools.cached_property
     def exchanged(self) -> list[str]:
         """The keys that exchange an entry of the description."""
         return [key for key, one in self.vary.items() if self._is_exchanged(key, one)]
 
     def _is_exchanged(self, key: str, distribution: Distribution) -> bool:
-        if key.split(".")[0] == DEVICE or not self.scenes.has_entry(key):
+        if self.is_of_device(key) or not self.scenes.has_entry(key):
             return False
         # Of what stands in the description and is a parameter too, numbers vary as values.
         texts = isinstance(distribution, Choice) and any(is_entry(value) for value in distribution.values)
@@ -138,6 +156,30 @@ class Specification:
     def _parameters(self) -> frozenset[str]:
         """Parameters with a derivative of the scenes as they are described."""
         return self.scenes.parameters(self.settings.bounces, self.settings.energy)
+
+
+def _listed(given: Any) -> list[Any]:
+    """Of what is no list or row of things, itself."""
+    return list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else [given]
+
+
+def _names(what: str, given: Any) -> tuple[str, ...]:
+    if isinstance(given, str) or not all(isinstance(one, str) for one in _listed(given)):
+        hint = f"; write [{given!r}]" if isinstance(given, str) else ""
+        raise SceneError(f"recipe: {what}: expected a list of names, got {shown(given)}{hint}.")
+    found = tuple(given)
+    if len(set(found)) < len(found):
+        raise SceneError(f"recipe: {what}: expected each once, got {list(found)}.")
+    return found
+
+
+def _counts(what: str, given: Any, least: int = 1) -> Any:
+    """A number, a text, or a tuple of numbers."""
+    if isinstance(given, str):
+        return given
+    if not isinstance(given, Sequence | np.ndarray):
+        return count(f"recipe: {what}", given, least)
+    return tuple(count(f"recipe: {what}", one, least) for one in given)
 
 
 def _device(given: Any) -> Device | None:
@@ -163,15 +205,19 @@ def is_entry(value: Any) -> bool:
 def label_of(distribution: Distribution, value: Any) -> str:
     """A short text for a drawn entry: texts and numbers themselves, others by their number among the choices."""
     if isinstance(value, str | int | float):
-        return str(value)
+        # Of a file its name: a data set is the same wherever its files are.
+        return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else str(value)
     if isinstance(distribution, Choice):
         return f"#{next(i for i, one in enumerate(distribution.values) if one is value)}"
-    return str(value)
+    return f"#{content_key(value)[:12]}"
 
 
 def samples_of(indices: Iterable[int]) -> list[int]:
     """Numbers of samples, checked. Raises ShapeError."""
-    found = [int(index) for index in indices]
+    try:
+        found = [operator.index(index) for index in indices]
+    except TypeError as error:
+        raise ShapeError(f"recipe: expected whole numbers of samples: {error}.") from None
     if any(index < 0 for index in found):
         raise ShapeError(f"recipe: expected sample numbers of at least 0, got {min(found)}.")
     return found

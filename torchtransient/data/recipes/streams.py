@@ -41,11 +41,17 @@ class Stream:
 
 
 class Extreme:
-    """Instead of a stream: all numbers at the lower or the upper end, for what a distribution can reach."""
+    """Instead of a stream: numbers at the lower or the upper end, for what a distribution can reach. After some calls
+    it is a stream: one that draws until something fits has to come to an end.
+    """
+
+    calls = 16
 
     def __init__(self, upper: bool) -> None:
-        self._number = np.nextafter(1.0, 0.0) if upper else 0.0
+        self._number, self._left = (np.nextafter(1.0, 0.0) if upper else 0.0), self.calls
+        self._otherwise = Stream(0, int(upper), "ends")
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """The same number throughout."""
-        return np.full(shape, self._number)
+        """The same number throughout, for the first calls."""
+        self._left -= 1
+        return np.full(shape, self._number) if self._left >= 0 else self._otherwise.random(shape)

@@ -8,6 +8,7 @@ named by where they stand in the scene dictionary: ``box.filename``, ``box.bsdf`
 from __future__ import annotations
 
 import copy
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from typing import Any
 from torchtransient.capture import Scan
 from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
+from torchtransient.files.content_key import content_key
 from torchtransient.quantities import shown
 from torchtransient.render.description import Description, DictDescription, XmlDescription, describe_dict
 from torchtransient.render.scene_handle import Scene, load
@@ -43,11 +45,16 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Structure:
-    """``name``: of its scene. ``text``: stands for the structure. ``entries``: what is exchanged."""
+    """``name``: of its scene. ``text``: for people. ``entries``: what is exchanged."""
 
     name: str
     text: str
     entries: tuple[tuple[str, Any], ...] = ()
+
+    @functools.cached_property
+    def key(self) -> str:
+        """Equal for equal structures alone."""
+        return content_key(self.name, *self.entries)
 
 
 class Scenes:
@@ -59,7 +66,6 @@ class Scenes:
     def __init__(self, given: Any, variant: str, scan: Scan | None, parameters: Mapping[str, Any] | None) -> None:
         several = given if isinstance(given, OneOf) else OneOf({"": given})
         self.weights, self.variant, self.scan = several.weights, variant, scan
-        self.given = dict(several.scenes)
         self.descriptions = {
             name: _description(scene, scan, parameters or {}) for name, scene in several.scenes.items()
         }
@@ -99,6 +105,8 @@ class Scenes:
 def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -> Description:
     if scan is None:
         scene = load(given, **parameters) if isinstance(given, str | os.PathLike) else load(given)
+        if parameters and not isinstance(scene._description, XmlDescription):
+            raise SceneError("recipe: parameters fill the $names of XML files; a dictionary has none. Leave them out.")
         return scene._description
     if parameters:
         raise SceneError("recipe: parameters fill the $names of XML files; a capture has none. Leave them out.")

@@ -15,9 +15,9 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
+from torchtransient.data.recipes import distributions as distributions
+from torchtransient.data.recipes import poses as poses
 from torchtransient.data.recipes.distribution import Distribution
-from torchtransient.data.recipes.distributions import Choice, LogUniform, Normal, Scale, Uniform
-from torchtransient.data.recipes.poses import Compose, LookAt, Offset, Turn
 from torchtransient.errors import SceneError
 from torchtransient.files.plain_data import plain, restored
 from torchtransient.files.scan_data import scan_data, scan_from_data
@@ -26,9 +26,6 @@ from torchtransient.pulses import Pulse
 from torchtransient.quantities import shown
 from torchtransient.render.description import Pixels
 
-DISTRIBUTIONS: dict[str, type[Distribution]] = {
-    made.name: made for made in (Uniform, LogUniform, Normal, Choice, Scale, Turn, Offset, LookAt, Compose)
-}
 _MOST_LISTED = 64
 # Keys of mappings that stand for what JSON does not have.
 _PIXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__scan__", "__distribution__"
@@ -41,6 +38,7 @@ def written(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Distribution):
+        value.check_kind()
         return {value.name: {name: written(entry) for name, entry in value.entries().items()}}
     if isinstance(value, Mapping):
         return {str(name): written(entry) for name, entry in value.items()}
@@ -62,8 +60,8 @@ def written(value: Any) -> Any:
     return plain(array, None, "recipe")
 
 
-def read(value: Any, folder: Any = None) -> Any:
-    """What :func:`written` made plain data of; lists stay lists. ``folder`` is not looked at."""
+def read(value: Any) -> Any:
+    """What :func:`written` made plain data of; lists stay lists."""
     if isinstance(value, Mapping):
         if _PIXELS in value:
             return Pixels(restored(dict(value[_PIXELS]), {}), bool(value.get("srgb_gamma", False)))
@@ -71,24 +69,28 @@ def read(value: Any, folder: Any = None) -> Any:
             return scan_from_data(value[_SCAN])
         if set(value) == {"__numbers__", "dtype", "shape"}:
             return restored(dict(value), {})
-        return {name: read(entry, folder) for name, entry in value.items()}
-    return [read(entry, folder) for entry in value] if isinstance(value, list) else value
+        return {name: read(entry) for name, entry in value.items()}
+    return [read(entry) for entry in value] if isinstance(value, list) else value
 
 
 def read_distribution(where: str, value: Any) -> Distribution:
     """A distribution from its plain form, or itself. Raises SceneError that says what is known."""
     if isinstance(value, Distribution):
+        value.check_kind()
         return value
-    known = ", ".join(DISTRIBUTIONS)
+    known = ", ".join(Distribution.known)
     if not isinstance(value, Mapping) or len(value) != 1:
         raise SceneError(
             f"{where}: expected a distribution, {{uniform: [0, 1]}} for instance, got {shown(value)}. Known ones are "
             f"{known}."
         )
     name, given = next(iter(value.items()))
-    made = DISTRIBUTIONS.get(str(name))
+    made = Distribution.known.get(str(name))
     if made is None:
-        raise SceneError(f"{where}: unknown distribution {name!r}. Known ones are {known}.")
+        raise SceneError(
+            f"{where}: unknown distribution {name!r}. Known ones are {known}; one of your own is known once its module "
+            "is imported."
+        )
     fields = [entry for entry in made.__dataclass_fields__ if entry not in ("name", "short")]
     if isinstance(given, Mapping):
         arguments = {str(entry): content for entry, content in given.items()}
@@ -102,19 +104,19 @@ def read_distribution(where: str, value: Any) -> Distribution:
     unknown = [entry for entry in arguments if entry not in fields]
     if unknown:
         raise SceneError(f"{where}: {name}: unknown entry {unknown[0]!r}. Known ones are {', '.join(fields)}.")
-    nested = {entry: _nested(f"{where}: {name}", entry, content) for entry, content in arguments.items()}
+    nested = {entry: _nested(f"{where}: {name}", content) for entry, content in arguments.items()}
     try:
         return made(**nested)
     except TypeError as error:
         raise SceneError(f"{where}: {name}: {error}. Its entries are {', '.join(fields)}.") from error
 
 
-def _nested(where: str, entry: str, content: Any) -> Any:
-    """Distributions inside of others."""
-    if entry == "steps" and isinstance(content, list):
-        return [read_distribution(where, step) for step in content]
-    if entry in ("origin", "target") and isinstance(content, Mapping):
+def _nested(where: str, content: Any) -> Any:
+    """Distributions inside of others: mappings of the name of one alone."""
+    if isinstance(content, Mapping) and len(content) == 1 and next(iter(content)) in Distribution.known:
         return read_distribution(where, content)
+    if isinstance(content, list) and any(isinstance(entry, Mapping | list) for entry in content):
+        return [_nested(where, entry) for entry in content]
     return read(content)
 
 
