@@ -95,7 +95,10 @@ def _scale(images: Sequence[NDArray[Any]]) -> dict[str, Any]:
         return {}
     finite = np.concatenate([np.asarray(image)[np.isfinite(image)].ravel() for image in images])
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    return {"cmap": "viridis", "vmin": low, "vmax": max(high, low + 1e-12)}
+    from matplotlib import colormaps
+
+    # What is no number, a pixel that meets nothing, is no hole in the paper.
+    return {"cmap": colormaps["viridis"].with_extremes(bad="0.15"), "vmin": low, "vmax": max(high, low + 1e-12)}
 
 
 def _draw_curve(axes: Any, curve: NDArray[Any], times: NDArray[Any] | None) -> None:

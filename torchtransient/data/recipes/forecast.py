@@ -15,6 +15,7 @@ from torchtransient.data.recipes.checks import SAMPLES, structures_of
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.errors import StorageError
 from torchtransient.quantities import count
+from torchtransient.render.threads import threads
 
 if TYPE_CHECKING:
     from torchtransient.data.recipes.maker import Maker
@@ -101,18 +102,20 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
 
         bar = tqdm(total=len(found[:_MEASURED]) * (wanted + _WARM), desc="cost", unit="sample")
     costs, rendered = [], []
-    for structure, indices in found[:_MEASURED]:
-        # Beginning with nothing: what check() has built is thrown away.
-        maker.forget(structure)
-        times = []
-        for step in range(_WARM + wanted):
-            index = indices[step % len(indices)]
-            start = time.perf_counter()
-            rendered.append(maker.sample(index))
-            times.append(time.perf_counter() - start)
-            if bar is not None:
-                bar.update()
-        costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
+    # Workers compute with one thread.
+    with threads(1):
+        for structure, indices in found[:_MEASURED]:
+            # Beginning with nothing: what check() has built is thrown away.
+            maker.forget(structure)
+            times = []
+            for step in range(_WARM + wanted):
+                index = indices[step % len(indices)]
+                start = time.perf_counter()
+                rendered.append(maker.sample(index))
+                times.append(time.perf_counter() - start)
+                if bar is not None:
+                    bar.update()
+            costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
     if bar is not None:
         bar.close()
     outside = [sum(sample.outside) for sample in rendered]
