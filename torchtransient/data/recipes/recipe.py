@@ -25,7 +25,7 @@ class Recipe(Specification):
 
     - keys of ``scene.parameters()`` that have a derivative vary as values: nothing is built, traced or compiled anew;
     - entries of a scene dictionary (``box.filename``, ``lamp.bsdf``, a whole node) and ``$names`` of an XML file are
-      exchanged: each combination is a *structure*, a scene that is built when it first comes and then kept;
+      exchanged: each combination is a *structure*, a scene of its own that is built when it comes;
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
