@@ -142,7 +142,8 @@ def test_online_and_exports(names, folder):
     assert [path.name for path in names["tars"]] == ["samples-000000.tar"]
     assert torch.equal(names["first"]["transient"], names["rooms"][0]["transient"])
     capture = tt.nlos.read_capture(folder / names["captures"][1])
-    assert capture.transient.shape == (1, names["letters"].settings.time_axis.num_bins, 4, 4) and capture.scan.kind == "confocal"
+    bins = names["letters"].settings.time_axis.num_bins
+    assert capture.transient.shape == (1, bins, 4, 4) and capture.scan.kind == "confocal"
 
 
 def test_commands(names, folder, monkeypatch):
@@ -167,7 +168,8 @@ def test_commands(names, folder, monkeypatch):
 
 
 def test_files_of_a_folder(names, folder):
-    rows = set(re.findall(r"^\| `([\w.-]+)`[,| ]", TEXT.split("## What the folder holds")[1].split("A shard is")[0], re.M))
+    table = TEXT.split("## What the folder holds")[1].split("A shard is")[0]
+    rows = set(re.findall(r"^\| `([\w.-]+)`[,| ]", table, re.M))
     there = {path.name for path in (folder / "rooms").iterdir()}
     assert rows == {name for name in there if not name.startswith("shard-") or name == "shard-000000.h5"}
     described = json.loads((folder / "rooms" / "recipe.json").read_text())

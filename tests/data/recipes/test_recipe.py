@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ import torch
 
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
-from torchtransient.errors import PhysicsError, SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import (
+    PhysicsError,
+    SceneError,
+    ShapeError,
+    TorchTransientError,
+    TorchTransientWarning,
+    UnitError,
+)
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -276,7 +284,7 @@ WRONG = {
     "device of phasors": (lambda: small(frequencies=[0.0], device="vl53l8_like"), SceneError, "transients"),
     "not a distribution": (lambda: small(vary={RED: 3}), SceneError, "expected a distribution"),
     "seed": (lambda: small(seed=-1), SceneError, "seed"),
-    "films of two sizes": (two_sizes, ShapeError, "one size"),
+    "films of two sizes": (two_sizes, ShapeError, r"one size .* \(8, 8, 60, 1\) for '0', \(4, 4, 300, 1\) for '1'"),
     "key of one scene": (lambda: small(D.OneOf([box(), without_small_box()])), SceneError, "small-box"),
 }  # fmt: skip
 
@@ -291,6 +299,18 @@ def test_what_is_wrong_is_said_before_anything_is_rendered(wrong, monkeypatch):
     monkeypatch.setattr(tt.TransientRenderer, "forward", render)
     with pytest.raises(error, match=words):
         make().check()
+
+
+@pytest.mark.parametrize(
+    "key, words", [("red.reflectance", "'red.reflectance.value' varies as a value"), ("ball.radius", "as many as it")]
+)
+def test_a_scene_for_every_sample_is_told(key, words):
+    scene = box() | {"ball": {"type": "sphere", "center": [0.0, -0.6, 0.2], "radius": 0.1}}
+    with pytest.warns(TorchTransientWarning, match=words):
+        small(scene, vary={key: D.Uniform(0.1, 0.3)}).check()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small(scene, vary={key: D.Choice([0.1, 0.3])}).check()
 
 
 def test_numbers_of_samples():

@@ -134,7 +134,7 @@ class Kept:
     @property
     def size(self) -> tuple[int, ...]:
         """Of what the film measures: rows, columns, bins, channels."""
-        return (*self.renderer._cube_shape, len(self.renderer._channels))
+        return (*self.renderer._cube_shape[:-1], len(self.renderer._channels))
 
     # ----------------------------------------------------------------------------------------------------- samples
 
