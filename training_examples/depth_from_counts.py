@@ -86,7 +86,8 @@ def room(sizes: Sizes) -> tt.data.Recipe:
             "white.reflectance.value": data.Uniform(0.2, 0.9),
             "device.PhotonBudget.ambient_rate_hz": data.LogUniform(5e5, 5e6),
         },
-        time_axis=AXIS, spp=sizes.spp, labels=["depth", "shape"], device=counter(), variant="llvm_ad_mono",
+        time_axis=AXIS, spp=sizes.spp, labels=["depth", "shape"], device=counter(),
+        keep=["measurement", "depth", "shape"], variant="llvm_ad_mono",
     )  # fmt: skip
 
 
@@ -226,7 +227,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Errors]:
     count = sizes.test if options.online else sizes.test + sizes.train
     folder = options.output / f"depth_from_counts-{recipe.key()[:8]}-{count}"
     print(tt.data.generate(recipe, folder, count, options.workers, store="counts"))
-    dataset = tt.data.TransientDataset(folder, fields=["measurement", "depth", "shape"])
+    dataset = tt.data.TransientDataset(folder)
     is_test = dataset.index < sizes.test
     test = next(iter(DataLoader(Subset(dataset, is_test.nonzero()[:, 0].tolist()), batch_size=sizes.test)))
     boxes = [number for number, name in enumerate(dataset.about["shapes"]) if name in ("small-box", "large-box")]

@@ -76,6 +76,18 @@ def test_bytes_depend_on_recipe_and_number_alone():
     assert out.transient.numpy().tobytes() == forwards[2].arrays["transient"].tobytes()
 
 
+def test_what_is_kept_of_a_sample():
+    settings = {"device": "vl53l8_like", "labels": ("depth", "first_return")}
+    whole, kept = small(**settings), small(**settings, keep=["first_return", "measurement"])
+    one, other = whole.sample(2), kept.sample(2)
+    assert list(one.arrays) == ["transient", "steady", "depth", "first_return", "measurement"]
+    assert list(other.arrays) == ["first_return", "measurement"]
+    assert all(other.arrays[name].tobytes() == one.arrays[name].tobytes() for name in other.arrays)
+    assert (one.seed, one.outside) == (other.seed, other.outside) and whole.key() != kept.key()
+    same(D.Recipe.from_dict(json.loads(json.dumps(kept.to_dict()))).sample(2), other)
+    kept.preview(1)
+
+
 def test_another_process_makes_the_same_bytes(tmp_path):
     recipe = small()
     recipe.to_yaml(tmp_path / "recipe.yaml")
@@ -276,6 +288,9 @@ WRONG = {
     "unknown plugin": (lambda: small(vary={"small-box.type": D.Choice(["cube", "nonsense"])}), SceneError, "nonsense"),
     "label": (lambda: small(labels=("depht",)), SceneError, "unknown label 'depht'"),
     "labels": (lambda: small(labels="depth"), SceneError, "list of names"),
+    "what is kept": (lambda: small(keep=["depth"]), SceneError, "expected some of transient, steady, got .'depth'"),
+    "keep": (lambda: small(keep="steady"), SceneError, "list of names"),
+    "nothing kept": (lambda: small(keep=[]), SceneError, "expected some of transient"),
     "device": (lambda: small(device="vl53l9"), SceneError, "vl53l8_like"),
     "device key": (lambda: small(vary={CYCLES: D.Uniform(1, 2)}), SceneError, "give device="),
     "device argument": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -23,6 +23,7 @@ from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
 from torchtransient.errors import GradientError, SceneError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
+from torchtransient.quantities import shown
 from torchtransient.render.labels import LABELS, first_return, label_names, scene_labels
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import ParameterTable, unknown_key
@@ -62,6 +63,7 @@ class Kept:
         except TorchTransientError as error:
             raise _named(error, structure) from error
         self._settle_filter()
+        self._names(self._made())
         self.places = self._places()
         self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
 
@@ -131,6 +133,12 @@ class Kept:
             found[key] = Place(key, POSE if is_pose else NUMBERS, described.shape, described)
         return found
 
+    def _made(self) -> list[str]:
+        """Names of what is made of a sample."""
+        steady = () if self.scan is not None and self.scan.kind == "exhaustive" else ("steady",)
+        measured = () if self.recipe.device is None else ("measurement",)
+        return [self.renderer.film.measures, *steady, *self.recipe.settings.labels, *measured]
+
     @property
     def size(self) -> tuple[int, ...]:
         """Of what the film measures: rows, columns, bins, channels."""
@@ -165,7 +173,16 @@ class Kept:
             tensors[FIRST_RETURN] = self._first_return(tensors)
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
-        return {name: np.ascontiguousarray(tensor.cpu().numpy()) for name, tensor in tensors.items()}, found.outside
+        kept = self._names(tensors)
+        return {name: np.ascontiguousarray(tensors[name].cpu().numpy()) for name in kept}, found.outside
+
+    def _names(self, there: Iterable[str]) -> list[str]:
+        """Of what a sample has, what it keeps. Raises SceneError."""
+        names, keep = list(there), self.recipe.settings.keep
+        unknown = [name for name in keep or () if name not in names]
+        if unknown or keep == ():
+            raise SceneError(f"recipe: keep: expected some of {', '.join(names)}, got {shown(unknown or keep)}.")
+        return names if keep is None else [name for name in names if name in keep]
 
     def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
         """What the film measures of a sample."""

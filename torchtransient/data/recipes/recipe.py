@@ -30,7 +30,10 @@ class Recipe(Specification):
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
     ``labels``: names of :func:`torchtransient.render.labels.scene_labels` and ``first_return``, of the same scene and
-    camera. ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in
+    camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
+    ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
+
+    ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in
     :class:`~torchtransient.TransientRenderer`. ``temporal_filter``: "auto" is that of the scene's film, whatever
     varies. ``variant``: None settles it here as :func:`torchtransient.load` does.
 

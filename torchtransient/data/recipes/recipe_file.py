@@ -42,7 +42,8 @@ from torchtransient.render.scene_handle import Scene
 FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
 _PLAIN = (
-    "labels", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant", "seed", "n",
+    "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant", "seed",
+    "n",
 )  # fmt: skip
 _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
@@ -65,6 +66,7 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
     found |= {
         "vary": {key: written(one) for key, one in recipe.vary.items()},
         "labels": list(settings.labels),
+        "keep": None if settings.keep is None else list(settings.keep),
         "time_axis": written_axis(settings.time_axis),
         "frequencies": written_frequencies(settings.frequencies),
         "gates": None if settings.gates is None else [written_shape(gate) for gate in settings.gates],
@@ -127,8 +129,10 @@ def key_of(recipe: Specification) -> str:
         content = description.text if isinstance(description, XmlDescription) else description.tree
         # The scene's place is no part of what it is.
         files |= {f"{name}/{file}": sha for file, sha in _files_of(content, folder).items()}
-    for key in recipe.exchanged:
-        files |= {f"{key}/{file}": sha for file, sha in _files_of(written(recipe.vary[key]), Path.cwd()).items()}
+        # Where the scene looks for what is exchanged in it.
+        for key in recipe.exchanged:
+            exchanged = _files_of(written(recipe.vary[key]), folder)
+            files |= {f"{name}/{key}/{file}": sha for file, sha in exchanged.items()}
     text = json.dumps([without_places(plain), files], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -34,6 +34,7 @@ class Settings:
     """What is rendered, as arguments of :class:`Recipe`; see there."""
 
     labels: tuple[str, ...] = ()
+    keep: tuple[str, ...] | None = None
     time_axis: TimeAxis | None = None
     frequencies: FrequencyAxis | None = None
     gates: tuple[Gate, ...] | None = None
@@ -57,6 +58,7 @@ class Specification:
         vary: Mapping[str, Any] | None = None,
         *,
         labels: Sequence[str] = (),
+        keep: Sequence[str] | None = None,
         time_axis: TimeAxis | None = None,
         frequencies: FrequencyAxis | Sequence[float] | None = None,
         gates: Sequence[Gate] | None = None,
@@ -76,8 +78,10 @@ class Specification:
         parameters: Mapping[str, Any] | None = None,
         n: int | None = None,
     ) -> None:
-        if isinstance(labels, str):
-            raise SceneError(f"recipe: labels: expected a list of names, got the text {labels!r}; write [{labels!r}].")
+        for name, given in (("labels", labels), ("keep", keep)):
+            if isinstance(given, str):
+                words = f"expected a list of names, got the text {given!r}; write [{given!r}]."
+                raise SceneError(f"recipe: {name}: {words}")
         if physics not in ("ignore", "error"):
             raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
         if scan is not None and not isinstance(scan, Scan):
@@ -88,7 +92,8 @@ class Specification:
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
         self.settings = Settings(
-            labels=tuple(labels), time_axis=time_axis, frequencies=frequencies,
+            labels=tuple(labels), keep=None if keep is None else tuple(keep),
+            time_axis=time_axis, frequencies=frequencies,
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
             spp=None if spp is None else count("recipe: spp", spp), max_depth=max_depth,
             sensors=sensors if isinstance(sensors, int | str) else tuple(sensors), pulse=pulse, irf=irf,
