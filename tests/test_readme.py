@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
+
+import torchtransient as tt
 
 VARIANT = "llvm_ad_rgb"
 README = Path(__file__).parents[1] / "README.md"
@@ -16,7 +19,7 @@ def blocks(language):
 
 
 def test_quick_start(capsys):
-    (code,) = blocks("python")
+    code, _ = blocks("python")
     names: dict[str, object] = {}
     exec(compile(code, str(README), "exec"), names)
     assert "red.reflectance.value" in capsys.readouterr().out
@@ -24,6 +27,19 @@ def test_quick_start(capsys):
     red, green, _blue = names["renderer"].values["red.reflectance.value"].tolist()
     assert red > 0.42
     assert green < 0.38
+
+
+def test_data_set(tmp_path, monkeypatch):
+    """The second block goes on where the quick start ends, here with four small samples."""
+    monkeypatch.chdir(tmp_path)
+    _, code = blocks("python")
+    for large, small in (("resolution=32", "resolution=8, spp=4"), ("n=1000", "n=4"), ("batch_size=8", "batch_size=4")):
+        assert large in code
+        code = code.replace(large, small)
+    names: dict[str, object] = {"__name__": "__main__", "tt": tt, "torch": torch}
+    exec(compile(code, str(README), "exec"), names)
+    (batch,) = names["loader"]
+    assert batch["transient"].shape == (4, 3, 200, 8, 8) and batch["normals"].shape == (4, 3, 8, 8)
 
 
 @pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)", README.read_text(encoding="utf-8")))))

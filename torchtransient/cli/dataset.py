@@ -128,7 +128,10 @@ def preview(recipe: Path, out: Path | None, count: int, quiet: bool) -> None:
 @click.option("--samples", type=click.IntRange(min=1), default=5, show_default=True, help="Rendered of each structure.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def cost(recipe: Path, samples: int, quiet: bool) -> None:
-    """Say what a sample of RECIPE takes: seconds, bytes, light outside the window."""
+    """Say what a sample of RECIPE takes.
+
+    Seconds of one thread, bytes, light outside the window, standard error; measured on some samples.
+    """
     click.echo(str(read_recipe(recipe).cost(samples, progress=not quiet)))
 
 

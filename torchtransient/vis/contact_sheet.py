@@ -48,29 +48,31 @@ def contact_sheet(
         raise ShapeError("contact_sheet: expected at least one sample, got none.")
     names = list(cells[0].images)
     curves = any(cell.curve is not None for cell in cells)
-    across = columns or max(1, min(len(cells), round(math.sqrt(len(cells) / max(1, len(names))))))
+    cell = (len(names) * _PICTURE + 0.15, _PICTURE + _TITLE + (_CURVE if curves else 0.0))
+    # About as high as it is wide.
+    across = columns or max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))
     down = -(-len(cells) // across)
-    width, height = across * (len(names) * _PICTURE + 0.15), down * (_PICTURE + _TITLE + (_CURVE if curves else 0.0))
+    width, height = across * cell[0], down * cell[1]
     top = 0.2 if title else 0.0
     figure = figure_type()(figsize=(width, height + top + 0.3), layout=None)
     scales = {name: _scale([cell.images[name] for cell in cells]) for name in names}
-    for number, cell in enumerate(cells):
+    for number, sample in enumerate(cells):
         row, column = divmod(number, across)
-        left = column * (len(names) * _PICTURE + 0.15) + 0.05
-        low = 0.25 + height - (row + 1) * (_PICTURE + _TITLE + (_CURVE if curves else 0.0))
+        left = column * cell[0] + 0.05
+        low = 0.25 + height - (row + 1) * cell[1]
         for place, name in enumerate(names):
             size = _PICTURE * 0.97
             box = (left + place * _PICTURE, low + (_CURVE if curves else 0.0), size, size)
             axes = figure.add_axes(_share(box, figure))
-            axes.imshow(cell.images[name], interpolation="nearest", **scales[name])
+            axes.imshow(sample.images[name], interpolation="nearest", **scales[name])
             axes.set_axis_off()
             if number < across and len(names) > 1:
                 axes.text(0.03, 0.03, name, transform=axes.transAxes, fontsize=6, color="white", va="bottom")
             if place == 0:
-                axes.set_title(_cut(cell.title, len(names)), fontsize=6, loc="left", pad=2)
-        if cell.curve is not None:
+                axes.set_title(_cut(sample.title, len(names)), fontsize=6, loc="left", pad=2)
+        if sample.curve is not None:
             box = (left, low + 0.06, len(names) * _PICTURE - 0.05, _CURVE - 0.12)
-            _draw_curve(figure.add_axes(_share(box, figure)), cell.curve, times)
+            _draw_curve(figure.add_axes(_share(box, figure)), sample.curve, times)
     if times is not None and curves:
         words = f"square root of the light over time, {times[0]:.3g} m to {times[-1]:.3g} m of optical path"
         figure.text(0.01, 0.03 / (height + top), words, fontsize=6, va="bottom")
@@ -95,7 +97,10 @@ def _scale(images: Sequence[NDArray[Any]]) -> dict[str, Any]:
         return {}
     finite = np.concatenate([np.asarray(image)[np.isfinite(image)].ravel() for image in images])
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    return {"cmap": "viridis", "vmin": low, "vmax": max(high, low + 1e-12)}
+    from matplotlib import colormaps
+
+    # What is no number, a pixel that meets nothing, is no hole in the paper.
+    return {"cmap": colormaps["viridis"].with_extremes(bad="0.15"), "vmin": low, "vmax": max(high, low + 1e-12)}
 
 
 def _draw_curve(axes: Any, curve: NDArray[Any], times: NDArray[Any] | None) -> None:

@@ -188,6 +188,11 @@ def test_no_sample_can_be_made(tmp_path):
     assert [e["event"] for e in events(tmp_path)].count("stopped") == 2
 
 
+def test_no_sample_has_its_light_in_the_window(tmp_path):
+    with pytest.raises(SceneError, match=r"max_outside=0.01\. Give a time_axis= that holds its light"):
+        generate(FakeRecipe(late=tuple(range(23))), tmp_path, **QUICK)
+
+
 # --------------------------------------------------------------------------------------------------------- arguments
 
 

@@ -7,6 +7,7 @@ import json
 import pickle
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,14 @@ import torch
 
 import torchtransient as tt
 from torchtransient.data.recipes.maker import MOST_KEPT
-from torchtransient.errors import PhysicsError, SceneError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import (
+    PhysicsError,
+    SceneError,
+    ShapeError,
+    TorchTransientError,
+    TorchTransientWarning,
+    UnitError,
+)
 from torchtransient.files.scan_data import scan_from_data
 
 D = tt.data
@@ -68,6 +76,18 @@ def test_bytes_depend_on_recipe_and_number_alone():
     with torch.no_grad():
         out = renderer(values, seed=forwards[2].seed)
     assert out.transient.numpy().tobytes() == forwards[2].arrays["transient"].tobytes()
+
+
+def test_what_is_kept_of_a_sample():
+    settings = {"device": "vl53l8_like", "labels": ("depth", "first_return")}
+    whole, kept = small(**settings), small(**settings, keep=["first_return", "measurement"])
+    one, other = whole.sample(2), kept.sample(2)
+    assert list(one.arrays) == ["transient", "steady", "depth", "first_return", "measurement"]
+    assert list(other.arrays) == ["first_return", "measurement"]
+    assert all(other.arrays[name].tobytes() == one.arrays[name].tobytes() for name in other.arrays)
+    assert (one.seed, one.outside) == (other.seed, other.outside) and whole.key() != kept.key()
+    same(D.Recipe.from_dict(json.loads(json.dumps(kept.to_dict()))).sample(2), other)
+    kept.preview(1)
 
 
 def test_another_process_makes_the_same_bytes(tmp_path):
@@ -278,6 +298,9 @@ WRONG = {
     "unknown plugin": (lambda: small(vary={"small-box.type": D.Choice(["cube", "nonsense"])}), SceneError, "nonsense"),
     "label": (lambda: small(labels=("depht",)), SceneError, "unknown label 'depht'"),
     "labels": (lambda: small(labels="depth"), SceneError, "list of names"),
+    "what is kept": (lambda: small(keep=["depth"]), SceneError, "expected some of transient, steady, got .'depth'"),
+    "keep": (lambda: small(keep="steady"), SceneError, "list of names"),
+    "nothing kept": (lambda: small(keep=[]), SceneError, "expected some of transient"),
     "device": (lambda: small(device="vl53l9"), SceneError, "vl53l8_like"),
     "device key": (lambda: small(vary={CYCLES: D.Uniform(1, 2)}), SceneError, "give device="),
     "device argument": (
@@ -319,6 +342,18 @@ def test_what_is_wrong_is_said_before_anything_is_rendered(wrong, monkeypatch):
     monkeypatch.setattr(tt.TransientRenderer, "forward", render)
     with pytest.raises(error, match=words):
         make().check()
+
+
+@pytest.mark.parametrize(
+    "key, words", [("red.reflectance", "'red.reflectance.value' varies as a value"), ("ball.radius", "as many as it")]
+)
+def test_a_scene_for_every_sample_is_told(key, words):
+    scene = box() | {"ball": {"type": "sphere", "center": [0.0, -0.6, 0.2], "radius": 0.1}}
+    with pytest.warns(TorchTransientWarning, match=words):
+        small(scene, vary={key: D.Uniform(0.1, 0.3)}).check()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small(scene, vary={key: D.Choice([0.1, 0.3])}).check()
 
 
 def test_numbers_of_samples():

@@ -210,3 +210,24 @@ def test_captures_are_the_same_elsewhere(tmp_path):
 def test_what_is_wrong_with_a_file(text, error, words):
     with pytest.raises(error, match=words):
         D.Recipe.read(text)
+
+
+def test_exchanged_files_count_wherever_one_stands(tmp_path, monkeypatch):
+    """Their names are those beside the recipe, not in the folder that it is read from."""
+    folder = tmp_path / "recipes"
+    folder.mkdir()
+    for name in ("a.obj", "b.obj"):
+        (folder / name).write_text(OBJ)
+    (folder / "recipe.yaml").write_text(
+        "scene: {type: scene, light: {type: point, position: [0, 0, 3], intensity: 1},"
+        " thing: {type: obj, filename: a.obj}}\n"
+        "variant: llvm_ad_mono\nvary: {thing.filename: {choice: [a.obj, b.obj]}}\n"
+    )
+    keys = []
+    for place in (tmp_path, folder):
+        monkeypatch.chdir(place)
+        keys.append(D.Recipe.read(folder / "recipe.yaml").key())
+    assert keys[0] == keys[1]
+    (folder / "b.obj").write_text(OBJ + "# another one\n")
+    monkeypatch.chdir(tmp_path)
+    assert D.Recipe.read(folder / "recipe.yaml").key() != keys[0]

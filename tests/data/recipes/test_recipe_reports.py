@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 import torchtransient as tt
+from torchtransient.data.recipes.maker import Maker
 from torchtransient.errors import SceneError
 
 D = tt.data
@@ -36,6 +37,21 @@ def test_cost(recipe):
     assert all(one.sample_s > 0 for one in cost.structures)
     text = str(cost)
     assert "built when new    small-box.type; 2 structures in 64 samples" in text and "1000 samples" in text
+
+
+def test_cost_is_that_of_workers(recipe, monkeypatch):
+    """Which compute with one thread each."""
+    used = set()
+    sample = Maker.sample
+
+    def watched(maker, index):
+        used.add((tt.threads().torch, tt.threads().drjit))
+        return sample(maker, index)
+
+    monkeypatch.setattr(Maker, "sample", watched)
+    with tt.threads(2) as before:
+        recipe.cost(1)
+        assert used == {(1, 1)} and tt.threads() == before
 
 
 def test_preview_is_a_picture(recipe, tmp_path):

@@ -17,6 +17,8 @@ import torchtransient as tt
 from support.capture_files import grids, made
 from support.stored_samples import AXIS, cube, folder, header, sample, write
 from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.data.recipes.written import written_frequencies
+from torchtransient.data.storage.shard_writing import ShardWriter
 from torchtransient.data.storage.tal_export import export_tal
 from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
 from torchtransient.errors import StorageError
@@ -168,11 +170,26 @@ def test_captures_of_y_tal(tmp_path, kind):
 def test_phasors(tmp_path):
     scan = grids()["confocal"]
     capture = made(scan, phasor=True)
-    axis = {"frequencies": list(capture.frequencies.frequencies), "start_opl": capture.frequencies.start_opl}
-    captures(tmp_path, scan, capture, "phasor", axis=axis)
+    captures(tmp_path, scan, capture, "phasor", axis=None, frequencies=written_frequencies(capture.frequencies))
     (tmp_path / "out").mkdir()
     found = tt.nlos.read_capture(export_tal(tmp_path, tmp_path / "out", progress=False)[0])
     assert torch.equal(found.phasor, capture.phasor) and found.frequencies == capture.frequencies
+
+
+def test_phasors_of_a_recipe(tmp_path):
+    """What its maker says about itself is what the export reads."""
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), (4, 3), kind="confocal")
+    recipe = tt.data.Recipe(
+        tt.scenes.nlos_letter("K"), {"letter.to_world": tt.data.Offset([-0.1, 0, 0], [0.1, 0, 0])}, scan=scan,
+        frequencies=tt.FrequencyAxis((0.5, 1.5), start_opl=2.0), spp=4, variant="llvm_ad_mono",
+    )  # fmt: skip
+    made = recipe.sample(0)
+    with ShardWriter(tmp_path / "shard-000000.h5", 1, {"about": recipe.maker().about()}) as shard:
+        shard.put(0, made)
+    (tmp_path / "out").mkdir()
+    found = tt.nlos.read_capture(export_tal(tmp_path, tmp_path / "out", progress=False)[0])
+    assert found.frequencies == recipe.settings.frequencies
+    assert np.array_equal(found.phasor, made.arrays["phasor"])
 
 
 def test_scans_as_plain_data():

@@ -17,6 +17,8 @@ from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Words of a reason at most: it stands in the file for every sample that failed.
 MOST_CHARACTERS = 500
+# Of a sample that is refused.
+_OUTSIDE = "max_outside="
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
 
 
@@ -78,18 +80,20 @@ class ShardMaker:
         check = getattr(self.settings.recipe, "check", None)
         if check is not None:
             check()
-        reason: str | None = None
+        reason = ""
         for index in indices:
-            reason = told.begin(-1, index)
-            if reason is None:
+            reason = told.begin(-1, index) or ""
+            if not reason:
                 found = self._sample(-1, index, told)
                 told.end(-1, index, found if isinstance(found, str) else None)
                 if not isinstance(found, str):
                     size = sum(array.nbytes for array in found.arrays.values())
                     return Measured(size, plain(self._maker.about()), self._standard_error(index, told))
                 reason = found
+        hint = f". Give a time_axis= that holds its light, or allow more with {_OUTSIDE}." if _OUTSIDE in reason else ""
         raise SceneError(
-            f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: {reason}"
+            f"generate: none of the samples 0 to {indices.stop - 1} of the recipe can be made. The last one: "
+            f"{reason}{hint}"
         )
 
     def make(
@@ -154,7 +158,7 @@ class ShardMaker:
         if most is None or before + after <= most:
             return None
         return (
-            f"{before:.3g} of its light lies before the window and {after:.3g} after it, more than max_outside={most:g}"
+            f"{before:.3g} of its light lies before the window and {after:.3g} after it, more than {_OUTSIDE}{most:g}"
         )
 
     def _standard_error(self, index: int, told: Told) -> float | None:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from torchtransient.data.recipes.distribution import POSE
+from torchtransient.data.recipes.distributions import Choice
 from torchtransient.data.recipes.kept_scene import Kept, changed
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.streams import Extreme
 from torchtransient.data.recipes.structures import Structure
-from torchtransient.errors import SceneError, TorchTransientError, UnitError
-from torchtransient.render.physics import is_singular, outside_message, singular_message
+from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.render.physics import is_singular, level_of_user, outside_message, singular_message
 from torchtransient.render.variant import active_variant
 
 # Samples that are drawn, and structures among them that are built, for a look.
@@ -25,6 +27,7 @@ SAMPLES, STRUCTURES = 64, 8
 
 def check_recipe(recipe: Specification, maker: Maker) -> None:
     """Raise SceneError, ShapeError, UnitError, or another error of this library, for what is wrong."""
+    _tell_of_many_scenes(recipe)
     expected = maker.measures()
     named: dict[str, dict[str, list[str]]] = {}
     for structure, indices in structures_of(recipe, range(SAMPLES)):
@@ -41,6 +44,22 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
             if kept.scan is None:
                 _check_light(built, kept, [drawn for _, drawn in draws])
             check_reach(built, kept, draws)
+
+
+def _tell_of_many_scenes(recipe: Specification) -> None:
+    """Warn of entries of which every sample has another one."""
+    for key in recipe.exchanged:
+        distribution = recipe.vary[key]
+        if isinstance(distribution, Choice):
+            continue
+        better = sorted(name for name in recipe._parameters if name.startswith(f"{key}."))
+        advice = f"{better[0]!r} varies as a value" if better else "a Choice builds as many as it has values"
+        warnings.warn(
+            f"recipe: vary: {key!r} is an entry of the scene's description, and {type(distribution).__name__} draws "
+            f"another one for each sample: every sample builds a scene of its own; {advice}.",
+            TorchTransientWarning,
+            level_of_user(),
+        )
 
 
 def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:

@@ -15,6 +15,7 @@ from torchtransient.data.recipes.checks import SAMPLES, structures_of
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.errors import StorageError
 from torchtransient.quantities import count
+from torchtransient.render.threads import threads
 
 if TYPE_CHECKING:
     from torchtransient.data.recipes.maker import Maker
@@ -27,7 +28,7 @@ _MEASURED, _WARM = 4, 3
 @dataclass(frozen=True)
 class StructureCost:
     """Of one structure: ``first_s`` from nothing to its first sample (building, tracing, compiling), ``sample_s`` each
-    sample after that (median), seconds in this process with the threads that it has.
+    sample after that (median), seconds with one thread, which workers have.
     """
 
     text: str
@@ -41,8 +42,7 @@ class Cost:
     combination is a new structure; ``seen`` of these came among the first 64 samples. ``structures``: those measured.
     ``sample_bytes``: before compression; ``stored_bytes``: on disk, by store, None where it could not be measured.
     ``outside``: mean and largest share of light outside of the window. ``standard_error``: relative, of one sample's
-    numbers. ``n``: samples of the data set, None where the recipe does not say. ``threads``: of this process, with
-    which seconds were measured; workers have one each.
+    numbers. ``n``: samples of the data set, None where the recipe does not say.
     """
 
     values: tuple[str, ...]
@@ -54,7 +54,6 @@ class Cost:
     outside: tuple[float, float]
     standard_error: float
     n: int | None
-    threads: int = 1
 
     @property
     def sample_s(self) -> float:
@@ -89,8 +88,7 @@ class Cost:
             sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]
             hours = self.n * self.sample_s / 3600
             yield (
-                f"{self.n} samples    {_duration(hours)} of one process with {self.threads} threads, "
-                f"{_bytes(min(sizes))} to {_bytes(max(sizes))}"
+                f"{self.n} samples    {_duration(hours)} of one worker, {_bytes(min(sizes))} to {_bytes(max(sizes))}"
             )
 
 
@@ -111,8 +109,6 @@ def _bytes(size: float) -> str:
 
 def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) -> Cost:
     """See :meth:`Recipe.cost`."""
-    import drjit
-
     wanted = count("cost: samples", samples)
     found = structures_of(recipe, range(SAMPLES))
     bar = None
@@ -121,18 +117,20 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
 
         bar = tqdm(total=len(found[:_MEASURED]) * (wanted + _WARM), desc="cost", unit="sample")
     costs, rendered = [], []
-    for structure, indices in found[:_MEASURED]:
-        # Beginning with nothing: what check() has built is thrown away.
-        maker.forget(structure)
-        times = []
-        for step in range(_WARM + wanted):
-            index = indices[step % len(indices)]
-            start = time.perf_counter()
-            rendered.append(maker.sample(index))
-            times.append(time.perf_counter() - start)
-            if bar is not None:
-                bar.update()
-        costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
+    # Workers compute with one thread.
+    with threads(1):
+        for structure, indices in found[:_MEASURED]:
+            # Beginning with nothing: what check() has built is thrown away.
+            maker.forget(structure)
+            times = []
+            for step in range(_WARM + wanted):
+                index = indices[step % len(indices)]
+                start = time.perf_counter()
+                rendered.append(maker.sample(index))
+                times.append(time.perf_counter() - start)
+                if bar is not None:
+                    bar.update()
+            costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
     if bar is not None:
         bar.close()
     outside = [sum(sample.outside) for sample in rendered]
@@ -146,7 +144,6 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool) 
         outside=(float(np.mean(outside)), max(outside)),
         standard_error=maker.standard_error(found[0][1][0]),
         n=recipe.n,
-        threads=drjit.thread_count(),
     )
 
 

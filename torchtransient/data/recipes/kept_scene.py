@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
@@ -22,6 +22,7 @@ from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
 from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
+from torchtransient.quantities import shown
 from torchtransient.render.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.render.output import RenderOutput
 from torchtransient.render.parameters import ParameterTable, unknown_key
@@ -85,6 +86,7 @@ class Kept:
         except TorchTransientError as error:
             raise _named(error, structure) from error
         self._settle_filter()
+        self._names(self._made())
         self.places = self._places()
         self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
 
@@ -154,12 +156,18 @@ class Kept:
             found[key] = Place(key, POSE if is_pose else NUMBERS, described.shape, described)
         return found
 
+    def _made(self) -> list[str]:
+        """Names of what is made of a sample."""
+        steady = () if self.scan is not None and self.scan.kind == "exhaustive" else ("steady",)
+        measured = () if self.recipe.device is None else ("measurement",)
+        return [self.renderer.film.measures, *steady, *self.recipe.settings.labels, *measured]
+
     @property
     def measures(self) -> Measures:
         """What the film measures."""
         renderer = self.renderer
         return Measures(
-            renderer.film.measures, renderer._cube_shape, renderer.axis, renderer.frequencies, renderer.gates,
+            renderer.film.measures, renderer._cube_shape[:-1], renderer.axis, renderer.frequencies, renderer.gates,
             renderer._channels, renderer.spp or renderer._scene_spp,
         )  # fmt: skip
 
@@ -200,7 +208,16 @@ class Kept:
             tensors[FIRST_RETURN] = self._first_return(tensors)
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
-        return {name: np.ascontiguousarray(tensor.cpu().numpy()) for name, tensor in tensors.items()}, found.outside
+        kept = self._names(tensors)
+        return {name: np.ascontiguousarray(tensors[name].cpu().numpy()) for name in kept}, found.outside
+
+    def _names(self, there: Iterable[str]) -> list[str]:
+        """Of what a sample has, what it keeps. Raises SceneError."""
+        names, keep = list(there), self.recipe.settings.keep
+        unknown = [name for name in keep or () if name not in names]
+        if unknown or keep == ():
+            raise SceneError(f"recipe: keep: expected some of {', '.join(names)}, got {shown(unknown or keep)}.")
+        return names if keep is None else [name for name in names if name in keep]
 
     def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
         """What the film measures of a sample."""

@@ -25,12 +25,15 @@ class Recipe(Specification):
 
     - keys of ``scene.parameters()`` that have a derivative vary as values: nothing is built, traced or compiled anew;
     - entries of a scene dictionary (``box.filename``, ``lamp.bsdf``, a whole node) and ``$names`` of an XML file are
-      exchanged: each combination is a *structure*, a scene that is built when it first comes and then kept;
+      exchanged: each combination is a *structure*, a scene of its own that is built when it comes;
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
     ``labels``: names of :func:`torchtransient.render.labels.scene_labels` and ``first_return``, of the same scene and
-    camera. ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in
+    camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
+    ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
+
+    ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in
     :class:`~torchtransient.TransientRenderer`. ``temporal_filter``: "auto" is that of the scene's film, whatever
     varies. ``variant``: None settles it here as :func:`torchtransient.load` does.
 

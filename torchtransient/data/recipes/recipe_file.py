@@ -42,7 +42,8 @@ from torchtransient.render.scene_handle import Scene
 FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
 _PLAIN = (
-    "labels", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant", "seed", "n",
+    "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant",
+    "seed", "n",
 )  # fmt: skip
 _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
@@ -65,6 +66,7 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
     found |= {
         "vary": {key: written(one) for key, one in recipe.vary.items()},
         "labels": list(settings.labels),
+        "keep": None if settings.keep is None else list(settings.keep),
         "time_axis": written_axis(settings.time_axis),
         "frequencies": written_frequencies(settings.frequencies),
         "gates": None if settings.gates is None else [written_shape(gate) for gate in settings.gates],

@@ -38,6 +38,7 @@ class Settings:
     """What is rendered, as arguments of :class:`Recipe`; see there."""
 
     labels: tuple[str, ...] = ()
+    keep: tuple[str, ...] | None = None
     time_axis: TimeAxis | None = None
     frequencies: FrequencyAxis | None = None
     gates: tuple[Gate, ...] | None = None
@@ -61,6 +62,7 @@ class Specification:
         vary: Mapping[str, Any] | None = None,
         *,
         labels: Sequence[str] = (),
+        keep: Sequence[str] | None = None,
         time_axis: TimeAxis | None = None,
         frequencies: FrequencyAxis | Sequence[float] | None = None,
         gates: Sequence[Gate] | None = None,
@@ -80,7 +82,7 @@ class Specification:
         parameters: Mapping[str, Any] | None = None,
         n: int | None = None,
     ) -> None:
-        labels = _names("labels", labels)
+        labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
         if physics not in ("ignore", "error"):
             raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
         if scan is not None and not isinstance(scan, Scan):
@@ -101,7 +103,7 @@ class Specification:
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
         self.settings = Settings(
-            labels=tuple(labels), time_axis=time_axis, frequencies=frequencies,
+            labels=labels, keep=keep, time_axis=time_axis, frequencies=frequencies,
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
             spp=None if spp is None else count("recipe: spp", spp), max_depth=max_depth,
             sensors=_counts("sensors", sensors, 0), pulse=pulse, irf=irf, bounces=_counts("bounces", bounces),

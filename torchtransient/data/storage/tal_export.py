@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.data.recipes.written import read_frequencies
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import damage_said, path_of
 from torchtransient.files.captures import tal
@@ -58,9 +58,6 @@ def _capture(sample: Mapping[str, Any], name: str, scan: Scan, data: TransientDa
     measured = sample[name]
     if not measured.is_complex():
         return Capture(measured, data.axis, **settings)
-    axis = data.about.get("axis")
     with damage_said(Path("about"), _WHAT, "the frequencies of a phasor"):
-        if not isinstance(axis, Mapping):
-            raise ValueError("about has no axis")
-        frequencies = FrequencyAxis(axis["frequencies"], axis.get("start_opl", 0.0))
-        return Capture(None, None, phasor=measured, frequencies=frequencies, **settings)
+        frequencies = read_frequencies(data.about["frequencies"])
+    return Capture(None, None, phasor=measured, frequencies=frequencies, **settings)

@@ -1,0 +1,229 @@
+"""docs/data.md: its blocks run in the order that they stand in, its files and commands are taken, its names exist."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import torchtransient as tt
+from torchtransient.cli.dataset import command
+from torchtransient.cli.main import main
+from torchtransient.data.recipes.checks import SAMPLES
+from torchtransient.data.recipes.distribution import Distribution
+from torchtransient.data.recipes.kept_scene import FIRST_RETURN
+from torchtransient.data.recipes.written import DISTRIBUTIONS, read_distribution
+from torchtransient.data.storage.chunks import chunk_shape
+from torchtransient.data.storage.encodings import MANTISSA_BITS, STORES
+from torchtransient.data.storage.shard_writing import FORMAT, SEAL, SEAL_BYTES
+from torchtransient.render.labels import LABELS
+
+VARIANT = "llvm_ad_mono"
+PAGE = Path(__file__).parents[2] / "docs" / "data.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+# What makes scenes and data sets small.
+SMALLER = {
+    r"resolution=32|resolution: 32": lambda found: found[0].replace("32", "8"),
+    r"n=2000|n: 2000": lambda found: found[0].replace("2000", "6"),
+    r"spp=\d+|spp: \d+": lambda found: re.sub(r"\d+", "4", found[0]),
+    r"\(32, 32\), kind|\[32, 32\]": lambda found: found[0].replace("32", "4"),
+    r"batch_size=8": lambda _: "batch_size=2",
+    r"slice\(0, 16\), slice\(16, 32\)": lambda _: "slice(0, 4), slice(4, 8)",
+    r"preview\(12": lambda _: "preview(2",
+    r"cost\(\)": lambda _: "cost(1)",
+    r"capacity=256|range\(20\)": lambda found: found[0].replace("256", "8").replace("20", "3"),
+    r"first=2000": lambda _: "first=6",
+    r'"letters", 4': lambda _: '"letters", 2',
+    r"num_workers=2": lambda _: "num_workers=1",
+}
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, flags=re.DOTALL)
+
+
+def smaller(code):
+    for large, small in SMALLER.items():
+        code = re.sub(large, small, code)
+    return code
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """With the files that the page speaks of."""
+    place = tmp_path_factory.mktemp("page")
+    rooms, letters = blocks("yaml")
+    (place / "rooms.yaml").write_text(smaller(rooms))
+    (place / "letters.yaml").write_text(smaller(letters))
+    return place
+
+
+@pytest.fixture(scope="module")
+def names(folder):
+    """What stands there after every block has run, in one session from top to bottom."""
+    found: dict[str, object] = {"__name__": "__main__"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for code in blocks("python"):
+            exec(compile(smaller(code), str(PAGE), "exec"), found)
+    return found
+
+
+def test_a_network_was_trained(names, folder):
+    assert np.isfinite(names["loss"].item())
+    assert names["light"].shape == (2, 160, 8, 8) and names["depth"].shape == (2, 1, 8, 8)
+    found = tt.data.verify(folder / "rooms")
+    assert found.complete and found.samples == 6 and not found.failed
+
+
+def test_the_file_is_the_recipe(names):
+    recipe, same = names["recipe"], names["same"]
+    for index in range(2):
+        one, other = recipe.sample(index), same.sample(index)
+        assert all(np.array_equal(one.arrays[name], other.arrays[name], equal_nan=True) for name in one.arrays)
+        assert all(np.array_equal(one.values[key], other.values[key]) for key in one.values)
+    assert same.n == recipe.n and same.vary["small-box.to_world"] == recipe.vary["small-box.to_world"]
+    # A drawn pose is what the data set says that it was.
+    stored = next(item for item in names["rooms"] if item["index"] == 0)
+    assert np.allclose(stored["values"]["large-box.to_world"], recipe.draw(0)["large-box.to_world"])
+
+
+def test_recipes_are_written_and_read(names, folder):
+    assert tt.data.Recipe.read(folder / "written.yaml") == names["recipe"]
+    letters = tt.data.Recipe.read(folder / "letters.yaml")
+    letters.check()
+    # That of the page's scan, which the smaller one needs less of.
+    wide = tt.nlos.Scan.grid(names["wall"], 32, kind="confocal").default_axis(names["stays_in"], 0.02)
+    assert letters.settings.time_axis == wide
+
+
+def test_costs_and_pictures(names, folder):
+    shown = re.search(r"```text\n(.*?)```", TEXT, flags=re.DOTALL)[1]
+    # The same lines, with other numbers.
+    assert [line[:18] for line in shown.splitlines()] == [
+        line[:18] if "samples    " not in line else "2000 samples    0." for line in str(names["cost"]).splitlines()
+    ]
+    assert (folder / "rooms.png").stat().st_size > 5000
+    assert f"and at {SAMPLES} samples" in TEXT
+
+
+def test_what_is_read(names):
+    rooms = names["rooms"]
+    assert len(rooms) == 6 and set(names["item"]) == {"transient", "steady", "depth", "values", "index"}
+    assert names["numbers"].tolist() == list(range(6)) and names["failed"] == {}
+    window = names["window"]
+    assert (window.axis.start_opl, window.axis.num_bins) == (6.0, 80) and set(window[0]) == {
+        "transient", "depth", "index",
+    }  # fmt: skip
+    assert torch.equal(window[3]["transient"], rooms[3]["transient"][:, 20:100])
+    assert torch.equal(names["corner"][1]["transient"], rooms[1]["transient"][:, :64, :4, 4:])
+    assert names["stream"].num_samples == 6
+    assert names["transient"].shape == (1, 64, 8, 8) and names["bins"]["num_bins"] == 160
+    assert names["albedo"].shape == names["there"].shape == (1,) and names["there"].all()
+
+
+def test_measurements(names):
+    counts = names["counts"]
+    assert counts.shape == (1, 160, 8, 8) and np.array_equal(counts, np.round(counts)) and counts.max() > 0
+    first, again = (names["noisy"][0]["measurement"] for _ in range(2))
+    assert not torch.equal(first, again)
+    first, again = (names["fixed"][0]["measurement"] for _ in range(2))
+    assert torch.equal(first, again) and not torch.equal(first, names["mean"])
+    assert set(names["fixed"][0]) == {"depth", "measurement", "index"}
+
+
+def test_online_and_exports(names, folder):
+    assert names["online"].drawn >= 12 and names["batch"]["index"].min() >= 6
+    assert [path.name for path in names["tars"]] == ["samples-000000.tar"]
+    assert torch.equal(names["first"]["transient"], names["rooms"][0]["transient"])
+    capture = tt.nlos.read_capture(folder / names["captures"][1])
+    bins = names["letters"].settings.time_axis.num_bins
+    assert capture.transient.shape == (1, bins, 4, 4) and capture.scan.kind == "confocal"
+
+
+def test_commands(names, folder, monkeypatch):
+    """The data set of the first block is the one that the first command goes on with."""
+    monkeypatch.chdir(folder)
+    tt.data.generate(names["same"], "named", progress=False)
+    for line in (line.split("#")[0].split() for block in blocks("sh") for line in block.splitlines()):
+        assert line[:2] == ["torchtransient", "dataset"]
+        words = [word.replace("$SLURM_ARRAY_TASK_ID", "3").replace("/shared/rooms", "array") for word in line[1:]]
+        words = ["named" if word == "rooms" else word for word in words]
+        if "ray" in words:
+            words = [{"ray": "local", "64": "2"}.get(word, word) for word in words]
+            at = words.index("--address")
+            assert "--address" in {option for p in command.commands["generate"].params for option in p.opts}
+            del words[at : at + 2]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 0, result.output
+    assert (folder / "named" / "samples.png").stat().st_size > 5000
+    assert tt.data.verify("array").complete
+    for said in re.findall(r"`torchtransient dataset (\w+) ", TEXT):
+        assert said in command.commands
+
+
+def test_files_of_a_folder(names, folder):
+    table = TEXT.split("## What the folder holds")[1].split("A shard is")[0]
+    rows = set(re.findall(r"^\| `([\w.-]+)`[,| ]", table, re.M))
+    there = {path.name for path in (folder / "rooms").iterdir()}
+    assert rows == {name for name in there if not name.startswith("shard-") or name == "shard-000000.h5"}
+    described = json.loads((folder / "rooms" / "recipe.json").read_text())
+    assert {"recipe", "key", "n", "per_shard", "store", "compression", "max_outside", "about"} <= set(described)
+
+
+def test_the_table_of_a_shard_is_a_shard(names, folder):
+    """Every data set that a file has is in the table, as the table says."""
+    import h5py
+
+    path = folder / "rooms" / "shard-000000.h5"
+    table = TEXT.split("A shard is HDF5")[1].split("Chunks hold")[0]
+    kinds = dict(re.findall(r"^\| `([\w/]+)` \| `?\(?.*?\)?`? (\w+) \|", table, re.M))
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item.dtype}) if isinstance(item, h5py.Dataset) else None)
+        about = json.loads(file["about"][()].tobytes())
+        assert file["arrays/transient"].chunks == (1, *chunk_shape((1, 160, 8, 8)))
+    for name in ("index", "seed", "outside", "there", "arrays/transient", "arrays/steady"):
+        assert kinds[name] == str(found[name]), name
+    rest = set(found) - set(kinds) - {"about", "arrays/depth"}
+    assert all(name.startswith("values/") and found[name] == np.float32 for name in rest) and len(rest) == 3
+    said = re.search(r"^\| `about` .*", table, re.M)[0]
+    assert set(about) == set(re.findall(r"`(\w+)`", said)) - {"about"} and FORMAT in said
+    content = path.read_bytes()
+    assert f"{SEAL_BYTES} bytes" in TEXT and content[-SEAL_BYTES:].startswith(SEAL) and f"`{SEAL.decode()}`" in TEXT
+
+
+def test_tables_are_those_of_the_code():
+    labels = TEXT.split("## Labels")[1].split("## ")[0]
+    named = {name for cell in re.findall(r"^\| (`.*?) \|", labels, re.M) for name in re.findall(r"`(\w+)`", cell)}
+    assert named == {*LABELS, FIRST_RETURN}
+    rows = re.findall(r"^\| `(\w+)\([^|]*\| `(\{[^`]*\})`", TEXT.split("## What varies")[1], re.M)
+    assert len(rows) >= len(DISTRIBUTIONS) - 1
+    import yaml
+
+    for name, written in rows:
+        known = getattr(tt.data, name)
+        assert issubclass(known, Distribution)
+        if "..." not in written:
+            assert isinstance(read_distribution("page", yaml.safe_load(written)), known)
+    assert f"keeps {MANTISSA_BITS} bits" in TEXT
+    assert all(f'"{store}"' in TEXT for store in STORES)
+
+
+def test_names_and_links_exist():
+    for name in set(re.findall(r"(?<!utils\.)\bdata\.([A-Za-z]\w+)\(", TEXT)):
+        assert hasattr(tt.data, name), name
+    for link, anchor in set(re.findall(r"\]\(([^)#:]+)(?:#([^)]*))?\)", TEXT)):
+        target = PAGE.parent / link
+        assert target.exists(), link
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}, anchor
+    for script in set(re.findall(r"(?:benchmarks|docs|training_examples)/\w+\.py", TEXT)):
+        assert (PAGE.parents[1] / script).is_file(), script
+    assert "docs/data.md" in (PAGE.parents[1] / "README.md").read_text(encoding="utf-8")
