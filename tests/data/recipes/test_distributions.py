@@ -48,12 +48,12 @@ def test_mean_and_deviation(distribution, mean, std):
 def test_ends_are_reached_and_not_left():
     for distribution, low, high in (
         (D.Uniform(-1, 3), -1, 3), (D.LogUniform(0.1, 10), 0.1, 10), (D.Normal(0, 5, -1, 2), -1, 2),
-        (D.Uniform(4, 4), 4, 4), (D.Normal(1, 0), 1, 1),
+        (D.Uniform(4, 4), 4, 4), (D.Normal(1, 0), 1, 1), (D.LogUniform(1e-300, 1e300), 1e-300, 1e300),
     ):  # fmt: skip
         drawn = many(distribution, count=2000)
         assert low <= drawn.min() and drawn.max() <= high
         ends = [float(distribution.draw(Extreme(upper), NUMBER)) for upper in (False, True)]
-        assert ends == pytest.approx([low, high], abs=1e-9)
+        assert ends == pytest.approx([low, high], abs=1e-9, rel=1e-9)
 
 
 def test_entries_are_independent_unless_same():
@@ -118,6 +118,8 @@ def test_compose_goes_on_from_where_the_last_one_was():
 def test_look_at():
     pose = D.LookAt(D.Uniform([0, 0, 4], [0, 0, 4]), [0, 0, 0]).draw(Stream(0, 0, "x"), AT)
     assert pose == pytest.approx(tt.scenes.transforms.look_at([0, 0, 4], [0, 0, 0]))
+    moved = D.LookAt(D.Compose([D.Uniform([0, 0, 4], [0, 0, 4]), D.Offset(0, 0)]), [0, 0, 0])
+    assert moved.draw(Stream(0, 0, "x"), AT) == pytest.approx(pose)
     with pytest.raises(SceneError, match="parallel"):
         D.LookAt([0, 4, 0], [0, 0, 0]).draw(Stream(0, 0, "x"), AT)
 
@@ -131,6 +133,8 @@ WRONG = {
     "shapes": (lambda: D.Uniform([0, 0], [1, 1, 1]), ShapeError, "one shape"),
     "log of zero": (lambda: D.LogUniform(0, 1), UnitError, "greater than zero"),
     "negative deviation": (lambda: D.Normal(0, -1), UnitError, "std"),
+    "mean outside": (lambda: D.Normal(5, 0, low=0, high=1), UnitError, "outside of"),
+    "too far apart": (lambda: D.Uniform(-1.7e308, 1.7e308), UnitError, "more than floats hold"),
     "nothing left": (lambda: D.Normal(0, 1, low=40), UnitError, "next to nothing"),
     "empty choice": (lambda: D.Choice([]), SceneError, "at least one"),
     "choice of a text": (lambda: D.Choice("abc"), SceneError, "list of values"),

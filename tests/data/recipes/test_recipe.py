@@ -25,6 +25,7 @@ from torchtransient.errors import (
     UnitError,
 )
 from torchtransient.files.scan_data import scan_from_data
+from torchtransient.render.variant import active_variant
 
 D = tt.data
 VARIANT = "llvm_ad_mono"
@@ -472,3 +473,91 @@ def test_scans_that_vary_are_all_told():
     told = recipe._maker.about()["scans"]
     assert [scan_from_data(one) for one in told] == scans
     assert {recipe.sample(index).values["scan"] for index in range(6)} == {"#0", "#1"}
+
+
+# ------------------------------------------------------------------------------------------------ orders, kinds, ends
+
+
+def test_nodes_are_exchanged_before_what_is_in_them():
+    """Whatever the order of the keys."""
+    colours = [{"type": "diffuse", "reflectance": value} for value in (0.2, 0.7)]
+    node = {"type": "sphere", "radius": 0.9, "center": [0.0, 0.0, 0.5], "bsdf": {"type": "diffuse", "reflectance": 0.1}}
+    scene = box() | {"thing": node}
+    first = {"thing.bsdf": D.Choice(colours), "thing": D.Choice([node, node | {"radius": 0.8}])}
+    for vary in (first, dict(reversed(list(first.items())))):
+        recipe = small(scene, vary, labels=["albedo"])
+        sample = recipe.sample(0)
+        expected = 0.2 if sample.values["thing.bsdf"] == "#0" else 0.7
+        assert sample.arrays["albedo"][0, 4, 4] == pytest.approx(expected)
+    lacking = first | {"thing": D.Choice([{"type": "sphere"}])}
+    with pytest.raises(SceneError, match="no entry of the scene any more"):
+        small(scene, lacking).check()
+
+
+def test_values_of_a_key_are_of_one_kind():
+    mixed = small(vary={"red.reflectance": D.Choice([0.5, {"type": "rgb", "value": [0.1, 0.2, 0.3]}])})
+    assert {type(mixed.sample(index).values["red.reflectance"]) for index in range(6)} == {str}
+    numbers = small(vary={"integrator.max_depth": D.Choice(np.array([2, 3, 4]))})
+    again = D.Recipe.from_dict(json.loads(json.dumps(numbers.to_dict())))
+    for index in range(3):
+        same(numbers.sample(index), again.sample(index))
+    assert numbers.key() == again.key() and numbers.structure(0).text == again.structure(0).text
+
+
+def test_texts_of_structures_do_not_depend_on_how_arrays_are_printed():
+    scene = box() | {"thing": {"type": "sphere", "radius": 0.9, "center": [0.0, 0.0, 0.5]}}
+    vary = {"thing.center": D.Uniform([0.01] * 3, [0.04] * 3)}
+    with np.printoptions(precision=1):
+        recipe = small(scene, vary, labels=["depth"])
+        texts = [recipe.structure(index).text for index in range(4)]
+        depths = {float(np.nanmin(recipe.sample(index).arrays["depth"])) for index in range(3)}
+    assert len(set(texts)) == 4 and len(depths) == 3
+    assert texts == [small(scene, vary).structure(index).text for index in range(4)]
+    assert small(vary={"small-box.type": D.Choice(["2", 2])})._vary["small-box.type"].values == ["2", 2]
+
+
+def test_what_seldom_comes_is_checked():
+    with pytest.raises(UnitError, match=r"with choice 1 of 'red.reflectance.value', .*more than all"):
+        small(vary={RED: D.Choice([0.5, 7.0, 0.4], weights=[1, 1e-6, 1])}).check()
+    broken = box() | {"thing": {"type": "ply", "filename": "nowhere.ply"}}
+    with pytest.raises(SceneError, match="broken"):
+        small(D.OneOf({"full": box(), "broken": broken}, weights=[1, 1e-6]), {}).check()
+    device = {"device": "vl53l8_like", "time_axis": tt.sensing.device("vl53l8_like").axis()}
+    with pytest.raises(TorchTransientError, match="cycles"):
+        small(vary={CYCLES: D.Choice([10, 0, 20], weights=[1, 1e-6, 1])}, **device).check()
+    with pytest.raises(SceneError, match="stages, numbered from 0"):
+        small(vary={"device.99.cycles": D.Choice([10])}, **device).check()
+
+
+def test_devices_and_polarization():
+    """Of polarized light a detector counts S0; one that looks at polarization needs polarized light."""
+    axis = tt.sensing.device("vl53l8_like").axis()
+    counted = small(variant="llvm_ad_mono_polarized", device="vl53l8_like", time_axis=axis).sample(0)
+    assert counted.arrays["measurement"].shape == counted.arrays["transient"].shape[1:]
+    mosaic = {"device": "imx250mzr_like", "time_axis": tt.TimeAxis(2.0, 12.0, 1)}
+    small(variant="llvm_ad_mono_polarized", **mosaic).check()
+    with pytest.raises(ShapeError):
+        small(**mosaic).check()
+
+
+def test_a_recipe_does_not_change():
+    values = np.array([0.1, 0.2])
+    recipe = small(vary={RED: D.Choice(values)})
+    key = recipe.key()
+    values[:] = 0.5
+    assert recipe.key() == key
+    with pytest.raises(TypeError):
+        recipe.vary["x"] = D.Uniform(0, 1)
+
+
+def test_transforms_of_mitsuba():
+    import mitsuba as mi
+
+    with active_variant(VARIANT):
+        pose = mi.ScalarTransform4f().translate([0.1, -0.7, 0.2]).scale(0.3)
+        node = box()["small-box"] | {"to_world": pose}
+        recipes = [small(vary={BOX: D.Choice([pose])}), small(vary={"small-box": D.Choice([node])})]
+    for recipe in recipes:
+        again = pickle.loads(pickle.dumps(recipe))
+        assert again.key() == recipe.key()
+        same(again.sample(0), recipe.sample(0))

@@ -71,3 +71,17 @@ def test_cost_counts_what_is_built():
     recipe = D.Recipe(scene, {"ball.radius": D.Uniform(0.05, 0.3)}, variant="llvm_ad_mono", spp=4)
     cost = recipe.cost(1)
     assert cost.seen == 64 and cost.sample_s >= np.mean([one.first_s for one in cost.structures[1:]])
+
+
+@pytest.mark.parametrize("kind", ["exhaustive", "list"])
+def test_sheets_of_other_scans(kind, tmp_path):
+    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
+    grid = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal")
+    scan = tt.nlos.Scan.grid(wall, (3, 2), kind="exhaustive")
+    if kind == "list":
+        origins = {"sensor_origin": grid.sensor_origin, "laser_origin": grid.laser_origin}
+        scan = tt.nlos.Scan.points(grid.sensor_points.reshape(-1, 3), kind="confocal", wall=wall, **origins)
+    hidden = {"plate": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])}}
+    recipe = D.Recipe(hidden, {}, scan=scan, variant="llvm_ad_mono", time_axis=tt.TimeAxis(0, 0.1, 40), spp=4)
+    recipe.preview(2, tmp_path / "sheet.png")
+    assert np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).std() > 5

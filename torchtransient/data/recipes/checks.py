@@ -11,11 +11,11 @@ import numpy as np
 
 from torchtransient.data.recipes.distribution import POSE
 from torchtransient.data.recipes.distributions import Choice
-from torchtransient.data.recipes.kept_scene import Kept, changed
+from torchtransient.data.recipes.kept_scene import Kept
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.reach import check_reach
 from torchtransient.data.recipes.specification import Specification
-from torchtransient.data.recipes.streams import Extreme
+from torchtransient.data.recipes.streams import Draw, Extreme, Fixed, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.errors import SceneError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.render.physics import is_singular, level_of_user, outside_message, singular_message
@@ -36,7 +36,8 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
         kept.check_labels()
         _check_names(named.setdefault(structure.name, kept.named()), kept)
         draws = list(_draws(recipe, kept, indices))
-        _check_device(recipe, kept, [drawn for _, drawn in draws])
+        for _, drawn in draws if kept.device_keys else draws[:1]:
+            kept.check_device(drawn)
         with active_variant(recipe.variant):
             built = kept.renderer.scene.built(kept.renderer._options)
             for where, drawn in draws:
@@ -67,6 +68,10 @@ def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[S
     ``STRUCTURES`` of them.
     """
     found: dict[str, tuple[Structure, list[int]]] = {}
+    # Every scene, however seldom it comes.
+    for name in recipe.scenes.names if len(recipe.scenes.names) > 1 else ():
+        structure = Structure(name, name, recipe.structure(0).entries)
+        found[structure.key] = (structure, [])
     for index in indices:
         structure = recipe.structure(index)
         if structure.key in found or len(found) < STRUCTURES:
@@ -82,6 +87,13 @@ def _draws(recipe: Specification, kept: Kept, indices: Iterable[int]) -> Iterato
             yield f"at the {words} end", kept.drawn({key: Extreme(upper) for key in recipe.vary})
     for index in indices:
         yield f"of sample {index}", kept.draw(index)
+    # Of what seldom comes too.
+    for key in (*kept.keys, *kept.device_keys):
+        choices = recipe.vary[key]
+        if isinstance(choices, Choice):
+            streams: dict[str, Draw] = {other: Stream(recipe.seed, 0, other) for other in recipe.vary}
+            for number in range(len(choices.values)):
+                yield f"with choice {number} of {key!r}", kept.drawn(streams | {key: Fixed(choices.share(number))})
 
 
 def _check_names(expected: Mapping[str, list[str]], kept: Kept) -> None:
@@ -110,21 +122,6 @@ def _check_ranges(built: Any, kept: Kept, where: str, drawn: Mapping[str, Any]) 
             raise UnitError(f"recipe: vary: {where}, {first[0]}{wanted}. Choose a smaller range, or cut it off.")
         if place.kind == POSE and is_singular(value):
             raise UnitError(f"recipe: vary: {where}: {singular_message(key)}")
-
-
-def _check_device(recipe: Specification, kept: Kept, draws: Iterable[Mapping[str, Any]]) -> None:
-    if recipe.device is None:
-        return
-    if kept.renderer.axis is None:
-        raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
-    for drawn in list(draws)[:4] if kept.device_keys else []:
-        device = recipe.device
-        try:
-            for key in kept.device_keys:
-                device = changed(device, key, drawn[key])
-            device.sensor(kept.renderer.axis)
-        except TorchTransientError as error:
-            raise type(error)(f"recipe: vary: {', '.join(kept.device_keys)}: {error}") from error
 
 
 def _check_light(built: Any, kept: Kept, draws: Sequence[Mapping[str, Any]]) -> None:

@@ -14,6 +14,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import Specification
+from torchtransient.files.scan_data import scan_from_data
 from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
 from torchtransient.vis.tone_mapping import tone_map
@@ -33,24 +34,33 @@ def contact_sheet(
 
         wanted = tqdm(wanted, desc="preview", unit="sample")
     samples = sorted((maker.sample(index) for index in wanted), key=lambda sample: sample.index)
-    return sheet_of(samples, path, maker.about().get("axis"), repr(recipe))
+    about = maker.about()
+    return sheet_of(samples, path, about.get("axis"), repr(recipe), behind_time(about))
 
 
 def sheet_of(
-    samples: Iterable[Sample], path: str | Path | None, axis: Mapping[str, Any] | None, title: str = ""
+    samples: Iterable[Sample], path: str | Path | None, axis: Mapping[str, Any] | None, title: str = "", behind: int = 2
 ) -> Any:
-    """A sheet of samples that are there. ``axis``: that of the transients, as its numbers."""
+    """A sheet of samples that are there. ``axis``: that of the transients, as its numbers; ``behind``: dimensions that
+    come after it.
+    """
     times = None if axis is None else TimeAxis(**axis).edges_opl.numpy()
-    return draw([cell_of(sample) for sample in samples], path, times=times, title=title)
+    return draw([cell_of(sample, behind) for sample in samples], path, times=times, title=title)
 
 
-def cell_of(sample: Sample) -> Cell:
+def behind_time(about: Mapping[str, Any]) -> int:
+    """Dimensions of a transient behind its bins: rows and columns, or those of a scan."""
+    scan = about.get("scan")
+    return 2 if scan is None else len(scan_from_data(scan).shape)
+
+
+def cell_of(sample: Sample, behind: int = 2) -> Cell:
     """A sample as a picture and a curve."""
     words = [f"{_name(key)} {_short(value)}" for key, value in sample.values.items() if _fits(value)]
     names = ", ".join(words[:_MOST_VALUES])
-    images = {"light": _picture(sample.arrays)}
+    images = {"light": _picture(sample.arrays, behind)}
     images |= {name: image for name, array in sample.arrays.items() if (image := _label(name, array)) is not None}
-    return Cell(f"{sample.index}  {names}", images, _curve(sample.arrays))
+    return Cell(f"{sample.index}  {names}", images, _curve(sample.arrays, behind))
 
 
 def _fits(value: Any) -> bool:
@@ -75,14 +85,18 @@ def _last(array: NDArray[Any], dimensions: int) -> NDArray[Any]:
     return array
 
 
-def _picture(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    if "steady" in arrays:
+def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
+    if "steady" in arrays and behind == 2:
         light = _last(arrays["steady"], 3)
     else:
         name = next((name for name in (*_MEASURED, "measurement") if name in arrays), None)
         if name is None:
             return np.zeros((1, 1, 3))
-        light = np.abs(_last(arrays[name], 4)).sum(1)
+        light = np.abs(_last(arrays[name], 2 + behind)).sum(1)
+        # Of pairs of points a table of all of them, of a list of points a row.
+        while light.ndim > 3:
+            light = light.reshape(light.shape[0], light.shape[1] * light.shape[2], -1)
+        light = light if light.ndim == 3 else light[:, None]
     channels = light if light.shape[0] == 3 else np.repeat(light.mean(0, keepdims=True), 3, 0)
     shown = tone_map(torch.from_numpy(np.ascontiguousarray(channels, dtype=np.float32)))
     return np.asarray(shown)
@@ -106,9 +120,11 @@ def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
     return numbers
 
 
-def _curve(arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any] | None:
-    name = next((name for name in ("transient", "measurement") if name in arrays and arrays[name].ndim >= 4), None)
+def _curve(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any] | None:
+    least = 2 + behind
+    name = next((name for name in ("transient", "measurement") if name in arrays and arrays[name].ndim >= least), None)
     if name is None:
         return None
-    curve: NDArray[Any] = _last(arrays[name], 4).sum((0, 2, 3), dtype=np.float64)
+    light = _last(arrays[name], least)
+    curve: NDArray[Any] = light.sum((0, *range(2, light.ndim)), dtype=np.float64)
     return curve

@@ -118,6 +118,9 @@ def bounds(who: str, low: Any, high: Any, *, least: float = -np.inf) -> tuple[An
         raise ShapeError(
             f"{who}: expected low and high of one shape, got {first.shape} and {second.shape}."
         ) from None
+    with np.errstate(over="ignore"):
+        if not np.isfinite(second - first).all():
+            raise UnitError(f"{who}: between low={shown(low)} and high={shown(high)} lies more than floats hold.")
     if wrong.any():
         raise UnitError(f"{who}: expected low <= high, got low={shown(low)} and high={shown(high)}.")
     if (first < least).any():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Distribution, Place, bounds, spread
 from torchtransient.data.recipes.streams import Draw
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import as_number, flag, positive, real_array, shown
+from torchtransient.quantities import as_number, flag, positive, real_array, shown, transform
 
 # A truncated normal distribution keeps at least this share of the untruncated one: beyond, digits of it are lost.
 _LEAST_MASS = 1e-9
@@ -79,8 +79,9 @@ class LogUniform(Distribution):
         """Float64, of the place's shape."""
         _numbers_only("LogUniform", place)
         u, low, high = spread("LogUniform", place, random, self.same, self.low, self.high)
-        # Not beyond the ends by rounding.
-        return np.clip(low * (high / low) ** u, low, high)
+        # Not beyond the ends by rounding, nor beyond what floats hold in between.
+        drawn: NDArray[np.float64] = np.clip(np.exp((1 - u) * np.log(low) + u * np.log(high)), low, high)
+        return drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +117,9 @@ class Normal(Distribution):
             # An end at infinity is none.
             object.__setattr__(self, name, number if number is not None and math.isfinite(number) else None)
         low, high = self._ends()
+        means, stds = np.broadcast_arrays(np.asarray(self.mean, np.float64), np.asarray(self.std, np.float64))
+        if ((stds == 0) & ((means < low) | (means > high))).any():
+            raise UnitError(f"Normal: the mean {shown(self.mean)} is outside of [{low:g}, {high:g}], and std is 0.")
         if low > high:
             raise UnitError(f"Normal: expected low <= high, got {low:g} and {high:g}.")
         first, last = self._shares(np.asarray(self.mean, np.float64), np.asarray(self.std, np.float64))
@@ -198,12 +202,17 @@ class Choice(Distribution):
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "weights", weights)
 
+    def share(self, number: int) -> float:
+        """A number in [0, 1) that draws the value of that ``number``; any, for one of weight zero."""
+        weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
+        return float((weights[:number].sum() + weights[number] / 2) / weights.sum())
+
     def draw(self, random: Draw, place: Place) -> Any:
         """Float64 of the place's shape for a parameter, and the value itself for other keys."""
         value = self.values[pick(random, len(self.values), self.weights)]
         if place.kind == ANYTHING:
             return value
-        array = real_array(getattr(value, "matrix", value))
+        array = real_array(value)
         fits = array is not None and (array.shape == place.shape or (array.shape == () and place.kind != POSE))
         if array is None or not fits:
             got = shown(value) if array is None else f"shape {array.shape}"
@@ -215,7 +224,7 @@ def checked_choices(who: str, values: Any, weights: Any) -> tuple[list[Any], lis
     """Values and their weights as lists. Raises SceneError, UnitError."""
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Sequence | np.ndarray | range):
         raise SceneError(f"{who}: expected a list of values, got {shown(values)}.")
-    plain = list(values)
+    plain = [_plain(value) for value in values]
     if not plain:
         raise SceneError(f"{who}: expected at least one value, got an empty list.")
     if weights is None:
@@ -225,6 +234,23 @@ def checked_choices(who: str, values: Any, weights: Any) -> tuple[list[Any], lis
         raise UnitError(f"{who}: expected {len(plain)} weights of at least 0, got {shown(weights)}.")
     positive(f"{who}: sum of the weights", float(array.sum()))
     return plain, [float(weight) for weight in array]
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of numpy and torch as Python's, so that a recipe is the same one after it was written and read; arrays
+    and nodes as copies of their own, transforms of Mitsuba as matrices.
+    """
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return transform("Choice", value) if hasattr(value, "matrix") else value
 
 
 def pick(random: Draw, count: int, weights: Sequence[float] | None) -> int:

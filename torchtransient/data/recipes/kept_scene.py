@@ -29,7 +29,7 @@ from torchtransient.render.parameters import ParameterTable, unknown_key
 from torchtransient.render.renderer import TransientRenderer
 from torchtransient.render.scene_handle import Scene, load
 from torchtransient.render.variant import active_variant, stokes_components
-from torchtransient.sensing import Compose, Device
+from torchtransient.sensing import Analysers, Compose, Device, PolarizationMosaic
 
 if TYPE_CHECKING:
     from torchtransient.axes import TimeAxis
@@ -264,8 +264,20 @@ class Kept:
         transient = tensors.get("transient")
         if transient is None:
             raise SceneError("recipe: device: a device measures transients; give time_axis= instead of another film.")
+        if stokes_components(self.recipe.variant) > 1 and not _is_polarized(chain):
+            # A detector that takes no notice of polarization counts all light.
+            transient = transient.select(-5, 0)
         generator = torch.Generator().manual_seed(Stream(self.recipe.seed, index, NOISE).seed())
         return chain.sample(transient, generator)
+
+    def check_device(self, drawn: Mapping[str, Any]) -> None:
+        """Raise what is wrong with the device, as a draw makes it: with no light, nothing is rendered."""
+        if self.recipe.device is not None:
+            renderer = self.renderer
+            rows, columns, bins = renderer._cube_shape[0], renderer._cube_shape[1], renderer.film.count
+            stokes = (4,) if stokes_components(self.recipe.variant) > 1 else ()
+            dark = torch.zeros(*stokes, len(renderer._channels), bins, rows, columns)
+            self._measured(0, drawn, {"transient": dark} if renderer.axis is not None else {})
 
     def _chain_of(self, device: Device) -> Compose:
         axis = self.renderer.axis
@@ -325,7 +337,14 @@ def changed(device: Device, key: str, value: Any) -> Device:
         raise SceneError(f"recipe: vary: expected 'device.STAGE.ARGUMENT', got {key!r}.")
     stage, argument = parts[1], ".".join(parts[2:])
     plain = value.tolist() if isinstance(value, np.ndarray) else value
+    if stage.isdigit() and int(stage) >= len(device.stages):
+        raise SceneError(f"recipe: vary: {key!r}: the device has {len(device.stages)} stages, numbered from 0.")
     return device.changed(int(stage) if stage.isdigit() else stage, **{argument: plain})
+
+
+def _is_polarized(chain: Compose) -> bool:
+    """Whether a stage looks at the Stokes components."""
+    return any(isinstance(module, Analysers | PolarizationMosaic) for module in chain.modules())
 
 
 def versions() -> dict[str, str]:

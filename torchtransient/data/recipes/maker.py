@@ -23,6 +23,7 @@ from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import SCAN, Structure
 from torchtransient.errors import UnitError
 from torchtransient.files.scan_data import scan_data
+from torchtransient.quantities import real_array
 
 # Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
 # Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.
@@ -131,9 +132,11 @@ class Maker:
             found["scene"] = structure.name
         exchanged = dict(structure.entries)
         for key in self.recipe.vary:
-            value = exchanged.get(key, varied.get(key))
-            is_number = not isinstance(value, bool) and isinstance(value, int | float | np.ndarray)
-            text = label_of(self.recipe.vary[key], value) if not is_number else ""
+            value, distribution = exchanged.get(key, varied.get(key)), self.recipe.vary[key]
+            # Of one kind in all samples.
+            kinds = distribution.values if isinstance(distribution, Choice) else [value]
+            is_number = not any(isinstance(one, bool) or not _is_number(one) for one in kinds)
+            text = label_of(distribution, value) if not is_number else ""
             # As the renderer takes them.
             found[key] = text if text else np.asarray(value, dtype=np.float32)
         return found
@@ -143,3 +146,7 @@ class Maker:
         for name in (measured, "steady", "measurement"):
             if name in arrays and not np.isfinite(arrays[name]).all():
                 raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.ndarray) or (isinstance(value, list) and real_array(value) is not None)

@@ -104,8 +104,8 @@ class Offset(Distribution):
 @dataclass(frozen=True, eq=False)
 class LookAt(Distribution):
     """A pose at ``origin`` that looks at ``target``, for sensors, spots and projectors: points [x, y, z], or
-    distributions of points. ``up``: a direction that is up in the picture. A draw that puts both in one place, or looks
-    along ``up``, raises SceneError.
+    distributions of points (an Offset starts at the world's origin). ``up``: a direction that is up in the picture.
+    A draw that puts both in one place, or looks along ``up``, raises SceneError.
     """
 
     name: ClassVar[str] = "look_at"
@@ -134,7 +134,8 @@ class LookAt(Distribution):
     @staticmethod
     def _point(given: Any, random: Draw, place: Place) -> NDArray[np.float64]:
         if isinstance(given, Distribution):
-            return np.asarray(given.draw(random, Place(f"{place.key} (LookAt)", NUMBERS, (3,))), dtype=np.float64)
+            at = Place(f"{place.key} (LookAt)", NUMBERS, (3,), np.zeros(3))
+            return np.asarray(given.draw(random, at), dtype=np.float64)
         return np.asarray(given, dtype=np.float64)
 
 

@@ -22,7 +22,8 @@ def check_reach(built: Any, kept: Kept, draws: Iterable[tuple[str, Mapping[str, 
     films without a time axis are not looked at.
     """
     axis = kept.renderer.axis
-    if axis is None or not kept.places:
+    # A pulse that is centred elsewhere brings light at other times.
+    if axis is None or not kept.places or kept.renderer._pulsed:
         return
     boxes = {shape.id(): _box(shape.bbox()) for shape in built.scene.shapes() if shape.bbox().valid()}
     for where, drawn in draws:

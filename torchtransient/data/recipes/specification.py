@@ -7,6 +7,7 @@ import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -105,14 +106,15 @@ class Specification:
         self.settings = Settings(
             labels=labels, keep=keep, time_axis=time_axis, frequencies=frequencies,
             gates=None if gates is None else tuple(gates), temporal_filter=temporal_filter,
-            spp=None if spp is None else count("recipe: spp", spp), max_depth=max_depth,
+            spp=None if spp is None else count("recipe: spp", spp),
+            max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
             sensors=_counts("sensors", sensors, 0), pulse=pulse, irf=irf, bounces=_counts("bounces", bounces),
             energy=energy, physics=physics,
         )  # fmt: skip
         self.scan = scan
         self.device = _device(device)
         self.scenes = Scenes(scene, self.variant, scan, parameters)
-        self.vary = {str(key): read_distribution(f"recipe: {key!r}", given) for key, given in (vary or {}).items()}
+        self._vary = {str(key): read_distribution(f"recipe: {key!r}", given) for key, given in (vary or {}).items()}
         self._check_settings()
 
     def _check_settings(self) -> None:
@@ -124,6 +126,11 @@ class Specification:
         of_device = [key for key in self.vary if key.split(".")[0] == DEVICE and not self.scenes.has_entry(key)]
         if self.device is None and of_device:
             raise SceneError("recipe: keys of 'device.' vary a device; give device= too.")
+
+    @property
+    def vary(self) -> Mapping[str, Distribution]:
+        """Distributions by key. A recipe does not change: make another one."""
+        return MappingProxyType(self._vary)
 
     # ----------------------------------------------------------------------------------------------- structures
 
@@ -208,7 +215,9 @@ def label_of(distribution: Distribution, value: Any) -> str:
     """A short text for a drawn entry: texts and numbers themselves, others by their number among the choices."""
     if isinstance(value, str | int | float):
         # Of a file its name: a data set is the same wherever its files are.
-        return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else str(value)
+        if isinstance(value, str):
+            return Path(value).name if Path(value).is_absolute() else value
+        return repr(value.item() if isinstance(value, np.generic) else value)
     if isinstance(distribution, Choice):
         return f"#{next(i for i, one in enumerate(distribution.values) if one is value)}"
     return f"#{content_key(value)[:12]}"

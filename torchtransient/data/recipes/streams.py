@@ -40,6 +40,17 @@ class Stream:
         return int(self._generator.integers(_SEEDS))
 
 
+class Fixed:
+    """Instead of a stream: one number always."""
+
+    def __init__(self, number: float) -> None:
+        self._number = number
+
+    def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+        """The number throughout."""
+        return np.full(shape, self._number)
+
+
 class Extreme:
     """Instead of a stream: numbers at the lower or the upper end, for what a distribution can reach. After some calls
     it is a stream: one that draws until something fits has to come to an end.

@@ -14,6 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from torchtransient.capture import Scan
 from torchtransient.data.recipes.distributions import checked_choices
 from torchtransient.errors import SceneError
@@ -91,7 +93,8 @@ class Scenes:
     def build(self, structure: Structure) -> tuple[Any, Scan | None]:
         """The scene of a structure as ``tt.load`` takes it (hidden shapes for a capture), and its scan."""
         description, scan = self.descriptions[structure.name], self.scan
-        for key, value in structure.entries:
+        # Nodes before what is in them.
+        for key, value in sorted(structure.entries, key=lambda entry: entry[0].count(".")):
             if key == SCAN and self.scan is not None:
                 scan = _checked_scan(value)
             else:
@@ -136,9 +139,14 @@ def _exchanged(description: Description, key: str, value: Any) -> Description:
     fresh = describe_dict({"type": "scene", "entry": {"type": "entry", "value": value}}).tree["entry"]["value"]
     tree = copy.deepcopy(description.tree)
     *above, last = key.split(".")
-    node = tree
+    node: Any = tree
     for name in above:
-        node = node[name]
+        node = node.get(name) if isinstance(node, dict) else None
+    if not isinstance(node, dict) or last not in node:
+        raise SceneError(
+            f"recipe: vary: {key!r} is no entry of the scene any more, where another node stands in its place. Give "
+            "that entry to all nodes to choose from."
+        )
     if isinstance(node[last], dict) and not above and not isinstance(fresh, dict):
         raise SceneError(
             f"recipe: vary: {key!r} is a whole {node[last].get('type', 'node')!r}: expected a Choice of dictionaries, "
@@ -151,7 +159,7 @@ def _exchanged(description: Description, key: str, value: Any) -> Description:
 def _plain(value: Any) -> Any:
     if isinstance(value, bool):
         return str(value).lower()
-    if hasattr(value, "item"):
+    if hasattr(value, "item") and np.size(value) == 1:
         return value.item()
     if not isinstance(value, str | int | float):
         raise SceneError(f"recipe: $names of XML files take texts and numbers, got {shown(value)}.")
