@@ -76,8 +76,8 @@ def tal_scene(
 ) -> str:
     """A confocal capture of the letter as `tal render` takes it: a wall of one metre, light of three bounces.
 
-    The laser is far away, and sees the wall past the letter: y-tal's is a projector, whose light on a spot falls off with
-    the distance, where a beam brings the same energy everywhere.
+    The laser is far away, and sees the wall past the letter: y-tal's is a projector, whose light on a spot falls off
+    with the distance, where a beam brings the same energy everywhere.
     """
     x, y, z = place
     return f"""

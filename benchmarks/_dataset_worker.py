@@ -1,7 +1,7 @@
 """Parts of `dataset.py` in processes of their own, one thread each; driven by one JSON object per line.
 
 Every request answers with lists of one number a round. CPU milliseconds of the whole process unless it is said.
-  {"do": "samples", "film": [resolution, bins, spp], "count", "repeats"}   shards as a worker makes them, and bare kernels
+  {"do": "samples", "film": [resolution, bins, spp], "count", "repeats"}   shards of a worker, and bare kernels
   {"do": "views", "views", "film", "count", "repeats"}
   {"do": "new", "film", "count", "repeats"}                   scenes that are kept, and built for every sample
   {"do": "workers", "film", "per_shard", "shards", "repeats"}   seconds of `tt.data.generate` by one and two processes
@@ -20,7 +20,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import torchtransient as tt

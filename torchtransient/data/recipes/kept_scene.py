@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
+from torchtransient.data.recipes.sample import in_order
 from torchtransient.data.recipes.specification import (
     NOISE,
     Specification,
@@ -200,7 +201,7 @@ class Kept:
             tensors[FIRST_RETURN] = self._first_return(tensors)
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
-        return {name: np.ascontiguousarray(tensor.cpu().numpy()) for name, tensor in tensors.items()}, found.outside
+        return {name: in_order(tensor) for name, tensor in tensors.items()}, found.outside
 
     def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
         """What the film measures of a sample."""
