@@ -46,6 +46,17 @@ def moving_boxes(resolution: int, bins: int, spp: int) -> tt.data.Recipe:
     return tt.data.Recipe(room(resolution, bins, spp), vary, variant=VARIANT)
 
 
+def described(film: list[int], drawn: dict[str, Any]) -> dict[str, Any]:
+    """The box with what a sample has drawn, as it would be written down by hand for that sample."""
+    scene = room(*film)
+    for name in COLOURS:
+        value = float(drawn[f"{name}.reflectance.value"])
+        scene[name] = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": value}}
+    for name in BOXES:
+        scene[name] = scene[name] | {"to_world": drawn[f"{name}.to_world"]}
+    return scene
+
+
 def several_views(views: int, resolution: int, bins: int, spp: int) -> tt.data.Recipe:
     """The same with a camera for each view."""
     scene = room(resolution, bins, spp)

@@ -3,9 +3,9 @@
 Every request answers with lists of one number a round. CPU milliseconds of the whole process unless it is said.
   {"do": "samples", "film": [resolution, bins, spp], "count", "repeats"}   shards of a worker, and bare kernels
   {"do": "views", "views", "film", "count", "repeats"}
-  {"do": "new", "film", "count", "repeats"}                   scenes that are kept, and built for every sample
+  {"do": "new", "film", "count", "repeats"}                   a kept scene, and one described anew for each
   {"do": "workers", "film", "per_shard", "shards", "repeats"}   seconds of `tt.data.generate` by one and two processes
-  {"do": "reading", "film", "count", "repeats", "window"}     samples from a shard, whole and in part
+  {"do": "reading", "film", "count", "repeats", "windows"}    samples from a shard, whole and in part
   {"do": "loader", "film", "count", "batch", "steps", "width"}   training beside a `DataLoader` with one worker
   {"do": "captures", "file", "count"}                         captures of a scene file of y-tal
   {"do": "capture", "index", "out"}                           one of them -> {"place"}, the transient as .npy
@@ -27,7 +27,7 @@ import torchtransient as tt
 import drjit as dr  # isort: skip
 import numpy as np
 import torch
-from _dataset_cases import NoOne, captures, moving_boxes, several_views
+from _dataset_cases import NoOne, captures, described, moving_boxes, several_views
 
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker
@@ -142,13 +142,14 @@ def new(film: list[int], count: int, repeats: int) -> dict[str, Any]:
     kept = recipe.maker()
 
     def anew(index: int) -> None:
-        maker = recipe.maker()
-        maker.sample(index)
-        maker.close()
+        description = described(film, recipe.draw(index))
+        renderer = tt.TransientRenderer(tt.load(description, variant=recipe.variant), physics="ignore")
+        with torch.no_grad():
+            renderer(seed=index).transient.contiguous().numpy()
 
     found: dict[str, list[float]] = {"kept": [], "new": []}
     for turn in range(-1, repeats):
-        times = {"kept": mean(kept.sample, 10 * count), "new": mean(anew, count)}
+        times = {"kept": mean(kept.sample, 10 * count), "new": mean(anew, count, first=100 * (turn + 2))}
         if turn >= 0:
             for name, value in times.items():
                 found[name].append(value)
@@ -173,21 +174,20 @@ def workers(film: list[int], per_shard: int, shards: int, repeats: int) -> dict[
     return {**found, "load": os.getloadavg()[0]}
 
 
-def reading(film: list[int], count: int, repeats: int, window: list[int]) -> dict[str, Any]:
-    part = slice(*window)
+def reading(film: list[int], count: int, repeats: int, windows: dict[str, list[int]]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         shards = Shards(moving_boxes(*film), folder, count)
         shards.make()
         data = tt.data.TransientDataset(folder)
-        cut = tt.data.TransientDataset(folder, window=part)
-        found: dict[str, list[float]] = {"whole": [], "window": []}
+        sets = {name: tt.data.TransientDataset(folder, window=slice(*bins)) for name, bins in windows.items()}
+        found: dict[str, list[float]] = {name: [] for name in ("whole", *windows)}
         for turn in range(-1, repeats):
-            times = {"whole": mean(data.__getitem__, count), "window": mean(cut.__getitem__, count)}
+            times = {"whole": mean(data.__getitem__, count)}
+            times |= {name: mean(each.__getitem__, count) for name, each in sets.items()}
             if turn >= 0:
                 for name, value in times.items():
                     found[name].append(value)
-        shape = list(cut[0]["transient"].shape)
-    return {**found, "megabytes": shards.megabytes, "window_shape": shape}
+    return {**found, "megabytes": shards.megabytes}
 
 
 class Net(torch.nn.Module):
