@@ -59,3 +59,21 @@ def test_ways_to_store(tmp_path):
         rows = {row["way"]: row for row in data["rows"]}
         assert {"exact", "rounded", "counts", "WebDataset"} < set(rows) and 0 < data["not_zero"] < 1
         assert rows["counts"]["smaller"] > rows["rounded"]["smaller"] > rows["exact"]["smaller"] > 1
+
+
+def test_data_sets(tmp_path):
+    report, printed = run("dataset.py", tmp_path, "--only", "samples", "views", "captures", "reading", "loader", "new")
+    rows = {row["name"]: row for row in report["rows"]}
+    # Of what takes time at any size, so that a part that measured nothing would be seen.
+    own = ["4^2 x 8, 1 spp: a sample", "4^2 x 8, 1 spp: its bare kernels", "4^2 x 8, 1 spp, 2 cameras: a view"]
+    own += ["confocal, 2^2 points x 64 bins, 16 spp: a capture of 2", "4^2 x 16, 1 spp: reading a MB of whole samples"]
+    assert all(rows[name]["min"] > 0 for name in own)
+    assert rows["4^2 x 8, 1 spp, 2 cameras: a view"]["calls"] == ["launched"]
+    assert rows["4^2 x 8, 1 spp: over one of a kept scene"]["min"] > 1
+    assert 0 < rows["4^2 x 16, 1 spp: waits of a training loop"]["median"] < 1
+    assert "within" not in json.dumps(report["rows"]) and "bar:" not in printed
+
+
+def test_data_sets_by_two_workers(tmp_path):
+    report, _ = run("dataset.py", tmp_path, "--only", "workers")
+    assert [row["unit"] for row in report["rows"]] == ["x", "x"] and report["rows"][0]["load"] >= 0

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
+from torchtransient.data.recipes.sample import in_order
 from torchtransient.data.recipes.specification import (
     NOISE,
     Specification,
@@ -209,7 +210,7 @@ class Kept:
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
         kept = self._names(tensors)
-        return {name: np.ascontiguousarray(tensors[name].cpu().numpy()) for name in kept}, found.outside
+        return {name: in_order(tensors[name]) for name in kept}, found.outside
 
     def _names(self, there: Iterable[str]) -> list[str]:
         """Of what a sample has, what it keeps. Raises SceneError."""

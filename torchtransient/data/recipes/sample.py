@@ -1,4 +1,4 @@
-"""What a recipe's sample is."""
+"""What a recipe's sample is, and its arrays in the order that they are stored in."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+# Numbers from which on arrays are turned in blocks, and pixels of a block.
+_LARGE, _BLOCK = 2**15, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,3 +38,23 @@ class Sample:
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in self.arrays.items())
         return f"Sample({self.index}: {shapes}; drawn: {', '.join(self.values) or 'nothing'})"
+
+
+def in_order(tensor: torch.Tensor) -> NDArray[Any]:
+    """A tensor as an array in C order. Films have the pixels first in memory and torch has them last: a copy from end
+    to end would meet one line of the cache again and again where bins are a power of two.
+    """
+    array: NDArray[Any] = tensor.cpu().numpy()
+    pixels = array.shape[-1] * array.shape[-2] if array.ndim > 2 else 0
+    if array.flags.c_contiguous or array.size < _LARGE or pixels < _BLOCK:
+        return np.ascontiguousarray(array)
+    found = np.empty(array.shape, array.dtype)
+    target = found.reshape(*array.shape[:-2], pixels)
+    try:
+        source = tensor.view(target.shape).cpu().numpy()
+    except RuntimeError:
+        # Rows and columns are no single axis in memory.
+        return np.ascontiguousarray(array)
+    for first in range(0, pixels, _BLOCK):
+        target[..., first : first + _BLOCK] = source[..., first : first + _BLOCK]
+    return found
