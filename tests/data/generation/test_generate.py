@@ -64,15 +64,20 @@ def test_what_is_there(calm):
     assert json.loads((calm / "recipe.json").read_text())["standard_error"] == 0.25
 
 
-def test_equal_bytes_of_many_workers_and_of_shares(calm, tmp_path):
-    generate(RECIPE, tmp_path / "many", workers=3, **QUICK)
-    assert data_files(tmp_path / "many") == data_files(calm)
-    first = generate(RECIPE, tmp_path / "shares", shard=(1, 2), **QUICK)
+def test_equal_bytes_of_many_workers(calm, tmp_path):
+    generate(RECIPE, tmp_path, workers=2, **QUICK)
+    assert data_files(tmp_path) == data_files(calm)
+
+
+@pytest.mark.slow
+def test_equal_bytes_of_shares(calm, tmp_path):
+    first = generate(RECIPE, tmp_path, workers=3, shard=(1, 2), **QUICK)
     assert (first.samples, first.shards) == (11, 3)
-    second = generate(RECIPE, tmp_path / "shares", shard=(0, 2), **QUICK)
-    assert second.samples == 12 and data_files(tmp_path / "shares") == data_files(calm)
+    second = generate(RECIPE, tmp_path, shard=(0, 2), **QUICK)
+    assert second.samples == 12 and data_files(tmp_path) == data_files(calm)
 
 
+@pytest.mark.slow
 def test_going_on(calm, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, workers=1, **QUICK)
@@ -113,6 +118,7 @@ def test_the_folder_of_another_data_set(calm, recipe, changes, words):
     assert data_files(calm) == before
 
 
+@pytest.mark.slow
 def test_shards_without_their_recipe(calm, tmp_path):
     """What the shards say counts where recipe.json was lost."""
     folder = tmp_path / "set"
@@ -129,6 +135,7 @@ def test_shards_without_their_recipe(calm, tmp_path):
         generate(RECIPE, folder, **QUICK)
 
 
+@pytest.mark.slow
 def test_other_versions_of_packages(calm, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, workers=1, **QUICK)
@@ -141,6 +148,7 @@ def test_other_versions_of_packages(calm, tmp_path):
 # ------------------------------------------------------------------------------------------------- samples that fail
 
 
+@pytest.mark.slow
 def test_what_fails_is_named(tmp_path, calm):
     """Every kind of failure in one run; all other samples are there."""
     recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,), late=(21,))
@@ -164,6 +172,7 @@ def test_what_fails_is_named(tmp_path, calm):
     assert (again.kept, again.samples, again.failed) == (18, 0, 0)
 
 
+@pytest.mark.slow
 def test_what_passes_leaves_no_trace(tmp_path, calm):
     """What goes wrong once is tried again: the bytes are those of an undisturbed run."""
     notes = tmp_path / "notes"
@@ -174,11 +183,13 @@ def test_what_passes_leaves_no_trace(tmp_path, calm):
     assert data_files(tmp_path / "set") == data_files(calm)
 
 
+@pytest.mark.slow
 def test_the_first_samples_fail(tmp_path):
     done = generate(FakeRecipe(raising=(0,), crashing=(1,)), tmp_path, retries=0, workers=1, **QUICK)
     assert (done.samples, done.failed) == (21, 2)
 
 
+@pytest.mark.slow
 def test_no_sample_can_be_made(tmp_path):
     with pytest.raises(SceneError, match=r"none of the samples 0 to 15 .* The last one: SceneError: sample 15"):
         generate(FakeRecipe(raising=tuple(range(23))), tmp_path, **QUICK)
@@ -229,6 +240,7 @@ def test_a_folder_that_is_a_file(tmp_path):
         generate(RECIPE, tmp_path / "a", **QUICK)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard(tmp_path):
     """Its workers import it; they may not begin runs of their own without end."""
     script = tmp_path / "script.py"
@@ -244,6 +256,7 @@ def test_a_script_without_a_guard(tmp_path):
 # ------------------------------------------------------------------------------------------------------- full disks
 
 
+@pytest.mark.slow
 def test_a_full_disk(tmp_path):
     """A typed error, finished shards whole, nothing half-written, no worker left; the same call goes on."""
     recipe = FakeRecipe(shape=(1, 64, 16, 16))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -18,9 +19,7 @@ def nearest(value, bits, least):
     if not np.isfinite(value) or value == 0:
         return value
     x = abs(Fraction(float(value)))
-    exponent = least
-    while x >= Fraction(2) ** (exponent + 1):
-        exponent += 1
+    exponent = max(least, math.frexp(float(value))[1] - 1)
     step = Fraction(2) ** (exponent - bits)
     return float(np.copysign(float(round(x / step) * step), value))  # round of fractions is half to even
 

@@ -106,18 +106,23 @@ class Producers:
                 self._listen(0.0)
                 if not self.schedule.can_draw():
                     self._wait()
-                slot = self.schedule.draw()
+                sample = self._copy(self.schedule.draw())
+                # Not before it is copied: its place may be the oldest, which the next order goes to.
                 self._give_orders()
             except BaseException as error:
                 # An interrupt too: it may have cut a message in two.
                 self._failure = error if isinstance(error, Exception) else None
                 self.close()
                 raise
-            index, values = self._beside[slot]
-            sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
-            sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
-            sample["index"] = index
             return sample
+
+    def _copy(self, slot: int) -> dict[str, Any]:
+        """What stands at a place of the ring, as the caller's own."""
+        index, values = self._beside[slot]
+        sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
+        sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
+        sample["index"] = index
+        return sample
 
     def _check(self) -> None:
         if os.getpid() != self._pid:
