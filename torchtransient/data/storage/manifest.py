@@ -78,7 +78,7 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     if not paths:
         raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({_PATTERN}).")
     entries = [_Entry.read(path) for path in paths]
-    faults = _faults_between(entries, None)
+    faults = _faults_between(entries, {})
     if faults:
         name, said = next(iter(faults.items()))
         raise StorageError(f"{_WHAT}: '{folder}': {name}: {said[0]}. Use verify, which tells of every shard.")
@@ -88,8 +88,8 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
 def verify(folder: str | Path, progress: bool = False) -> Verified:
     """Read every byte of a data set and compare it with its checksums; make the manifest of the sound shards again.
 
-    Found are shards that are damaged, that stand under the name of another one, of another recipe or doubled samples,
-    a manifest that differs from the shards, and samples that are missing: of those that ``recipe.json`` counts, without
+    Found are shards that are damaged, that stand under the name of another one, of another recipe, other versions of
+    packages or plugins, with other arrays or values, or doubled samples, a manifest that differs from the shards, and samples that are missing: of those that ``recipe.json`` counts, without
     it of those between the first and the last one. ``progress``: a bar. Raises StorageError for what is no folder.
     """
     paths = shards_of(folder)
@@ -103,7 +103,7 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
             faults[path.name] = [str(error)]
             continue
         entries.append(entry)
-    between = _faults_between(entries, expected.get("key"))
+    between = _faults_between(entries, expected)
     sound = [entry for entry in entries if entry.name not in between]
     faults |= between
     before = _text_of(Path(folder) / MANIFEST)
@@ -165,13 +165,16 @@ def _kind(shard: Shard, name: str) -> dict[str, Any]:
     return {"shape": list(shard.shape(name)), "dtype": shard.dtype(name), "encoding": shard.encoding(name)}
 
 
-def _faults_between(entries: Sequence[_Entry], key: Any) -> dict[str, list[str]]:
-    """What is wrong with shards beside each other, by name: of another recipe than `key`, or than most of them."""
+def _faults_between(entries: Sequence[_Entry], expected: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What is wrong with shards beside each other, by name: not as ``recipe.json`` says, or, without it, as the others:
+    of another recipe, rendered by other code, with other arrays.
+    """
     faults: dict[str, list[str]] = {}
+    key = expected.get("key")
     if key is None and entries:
         key = Counter(json.dumps(entry.key) for entry in entries).most_common(1)[0][0]
         key = json.loads(key)
-    kind: dict[str, Any] | None = None
+    kinds = {"about": expected["about"]} if "about" in expected else {}
     owners: dict[int, str] = {}
     for entry in entries:
         said = []
@@ -181,16 +184,30 @@ def _faults_between(entries: Sequence[_Entry], key: Any) -> dict[str, list[str]]
         if isinstance(number, int) and entry.name != f"shard-{number:06d}.h5":
             said.append(f"is shard {number} under another name")
         if not said:
-            same = {k: v for k, v in entry.about.items() if k in ("store", "compression")}
-            kind = kind or same
-            if kind != same:
-                said.append(f"is stored otherwise than the shards before: {same}, they {kind}")
+            kind = _must_be_alike(entry)
+            other = [name for name in kind if name in kinds and kinds[name] != kind[name]]
+            said += [_difference(name, kinds[name], kind[name]) for name in other]
+            if not said:
+                kinds = kind | kinds
             doubled = [i for i in (*entry.index, *entry.failed) if owners.setdefault(i, entry.name) != entry.name]
             if doubled:
                 said.append(f"holds the samples {ranges_text(doubled)}, which {owners[doubled[0]]} holds too")
         if said:
             faults[entry.name] = said
     return faults
+
+
+def _must_be_alike(entry: _Entry) -> dict[str, Any]:
+    """What a shard has in common with all of its data set; one whose samples all failed has no arrays."""
+    told = {"about": entry.header.get("about"), **entry.about}
+    return told if entry.index else {name: told[name] for name in ("about", "store", "compression")}
+
+
+def _difference(name: str, expected: Any, found: Any) -> str:
+    while isinstance(expected, dict) and isinstance(found, dict):
+        part = next(k for k in sorted({*expected, *found}, key=str) if expected.get(k) != found.get(k))
+        name, expected, found = f"{name}: {part}", expected.get(part), found.get(part)
+    return f"differs from the data set in {name}: {shown(found)}, expected {shown(expected)}"
 
 
 def _expected(folder: Path) -> dict[str, Any]:
