@@ -90,7 +90,7 @@ def test_a_killed_supervisor(tmp_path, calm):
     assert leftovers(tmp_path) == []
     kept = len(list(tmp_path.glob("shard-*.h5")))
     assert 2 <= kept < 8
-    done = generate(RECIPE, tmp_path, progress=False, **ASKED)
+    done = generate(RECIPE, tmp_path, progress=False, **ASKED | {"workers": 1})
     assert done.kept == 6 * kept and data_files(tmp_path) == calm
 
 

@@ -255,6 +255,7 @@ def test_threads_draw_together():
 # ---------------------------------------------------------------------------------------------------- what goes wrong
 
 
+@pytest.mark.slow
 def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
     data = OnlineDataset(OnlineRecipe(bug=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
     for _ in range(2):

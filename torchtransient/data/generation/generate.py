@@ -25,6 +25,7 @@ from torchtransient.data.generation.settings import (
     shard_header,
     write_description,
 )
+from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.quantities import shown
 
@@ -115,7 +116,7 @@ def generate(
     _check_numbers(n, workers, shard, per_shard, timeout_s, retries, max_outside)
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
-    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries)
+    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries, plugins_here())
     wanted = description(settings, per_shard or 0, {}, None)
     if per_shard is None:
         del wanted["per_shard"]

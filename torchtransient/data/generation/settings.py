@@ -13,6 +13,7 @@ from typing import Any
 
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
+from torchtransient.data.recipes.plugin_modules import PluginNames
 from torchtransient.errors import StorageError
 
 RECIPE_FILE = "recipe.json"
@@ -33,6 +34,8 @@ class Settings:
     compression: str
     max_outside: float | None
     retries: int
+    # Plugin modules of others, which every process has to add.
+    plugins: PluginNames = ()
 
 
 def shard_header(settings: Settings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:

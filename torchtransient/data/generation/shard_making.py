@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from torchtransient.data.generation.latest_picture import LatestPicture
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.generation.settings import Settings, check_same, plain, shard_header
+from torchtransient.data.recipes.plugin_modules import add_plugins
 from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Words of a reason at most: it stands in the file for every sample that failed.
@@ -56,6 +57,7 @@ class ShardMaker:
         from torchtransient.render.threads import threads
 
         threads(1)
+        add_plugins(settings.plugins, "generate")
         self.settings = settings
         self._kept: Any = settings.recipe.maker()
         self._picture = LatestPicture(Path(settings.folder))

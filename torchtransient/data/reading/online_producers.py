@@ -23,6 +23,7 @@ import torch.multiprocessing  # teaches connections to hand over shared tensors
 
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
+from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
 from torchtransient.render.physics import level_of_user
 
@@ -85,7 +86,7 @@ class Producers:
     def _started(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        process = context.Process(target=produce, args=(there, self._recipe), name=WHAT, daemon=True)
+        process = context.Process(target=produce, args=(there, self._recipe, plugins_here()), name=WHAT, daemon=True)
         try:
             with _interrupts_held_back():
                 process.start()

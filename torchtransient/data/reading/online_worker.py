@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.data.recipes.plugin_modules import PluginNames, add_plugins
 from torchtransient.errors import ShapeError, TorchTransientError
 
 Layout = dict[str, tuple[tuple[int, ...], str]]
@@ -26,13 +27,14 @@ class _NobodyListensError(Exception):
     pass
 
 
-def produce(connection: Connection, recipe: Any) -> None:
+def produce(connection: Connection, recipe: Any, plugins: PluginNames) -> None:
     """The body of the process."""
     # Ctrl-C reaches the whole group of processes; the trainer ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     maker = None
     try:
         _one_thread()
+        add_plugins(plugins, "OnlineDataset")
         maker = recipe.maker()
         line = _Line(connection)
         line.say("ready")
