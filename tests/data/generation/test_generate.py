@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, finish, leftovers, start
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.generation.latest_picture import LatestPicture
 from torchtransient.data.generation.ledger import DIED
+from torchtransient.data.generation.settings import Settings
+from torchtransient.data.generation.shard_making import ShardMaker
 from torchtransient.data.storage.manifest import verify
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import SceneError, StorageError, UnitError
@@ -193,10 +196,44 @@ def test_the_first_samples_fail(tmp_path):
 def test_no_sample_can_be_made(tmp_path):
     with pytest.raises(SceneError, match=r"none of the samples 0 to 15 .* The last one: SceneError: sample 15"):
         generate(FakeRecipe(raising=tuple(range(23))), tmp_path, **QUICK)
-    with pytest.raises(SceneError, match="no light in it"):
+    first = next(e for e in events(tmp_path) if e["event"] == "traceback")
+    assert first["sample"] == 0 and 'fake_recipe.py", line' in first["trace"]
+    with pytest.raises(SceneError, match="no light in it") as caught:
         generate(FakeRecipe(unbuilt="no light in it"), tmp_path, **QUICK)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.jsonl"]
     assert [e["event"] for e in events(tmp_path)].count("stopped") == 2
+    # File and line, where it is raised and in the log.
+    (said,) = (e["trace"] for e in events(tmp_path) if e["event"] == "error" and "no light" in e["error"])
+    assert 'fake_recipe.py", line' in said and said in str(caught.value.__cause__)
+
+
+class Told:
+    """Hears of samples."""
+
+    def __init__(self):
+        self.heard = []
+
+    def begin(self, shard, index):
+        return None
+
+    def __getattr__(self, name):
+        return lambda *facts: self.heard.append((name, *facts))
+
+
+@dataclass(frozen=True)
+class Checked(FakeRecipe):
+    def check(self, maker=None):
+        assert maker is not None and maker.recipe is self
+
+
+def test_measuring_checks_with_its_own_scenes_and_says_where_samples_fail(tmp_path):
+    told = Told()
+    recipe = Checked(raising=(0,))
+    with tt.threads(1):
+        found = ShardMaker(Settings(recipe, str(tmp_path), 4, "exact", "blosc2", None, 2)).measure(range(4), told)
+    assert found.standard_error == 0.25
+    traces = [facts for name, *facts in told.heard if name == "traced"]
+    assert [facts[:2] for facts in traces] == [[-1, 0]] and 'fake_recipe.py", line' in traces[0][2]
 
 
 def test_no_sample_has_its_light_in_the_window(tmp_path):
@@ -251,6 +288,23 @@ def test_a_script_without_a_guard(tmp_path):
     )
     found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
     assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", ["generate(Mine(), FOLDER, 4, progress=False)", "OnlineDataset(Mine(), 4).draw()"])
+def test_a_class_that_workers_do_not_find(tmp_path, call):
+    """It is no missing guard."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
+        "from torchtransient.data import OnlineDataset, generate\n"
+        f"FOLDER = {str(tmp_path / 'set')!r}\n"
+        f"if __name__ == '__main__':\n    class Mine(FakeRecipe):\n        pass\n    {call}\n"
+    )
+    found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
+    last = found.stderr.rstrip().splitlines()[-1]
+    assert found.returncode == 1 and last.startswith("torchtransient.errors.SceneError") and "attribute 'Mine'" in last
+    assert "outside of `if __name__ == '__main__':`" in last
 
 
 # ------------------------------------------------------------------------------------------------------- full disks

@@ -14,6 +14,7 @@ from torchtransient.data.generation.crew import LOOK_S, PATIENCE_S, Crew, Member
 from torchtransient.data.generation.ledger import Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
+from torchtransient.data.generation.telling import Telling
 from torchtransient.errors import StorageError, TorchTransientError
 
 
@@ -31,34 +32,6 @@ class Board:
         """What was said since the last call."""
         said, self._said = self._said, []
         return said
-
-
-class RayTelling:
-    """Says it to the board; see :class:`Told`."""
-
-    def __init__(self, board: Any, worker: int, skip: dict[int, str]) -> None:
-        self._board, self._worker, self._skip = board, worker, skip
-
-    def _say(self, *message: Any) -> None:
-        import ray
-
-        # Waited for, so that the board knows where a worker was when it died.
-        ray.get(self._board.say.remote(self._worker, *message))
-
-    def begin(self, shard: int, index: int) -> str | None:
-        if index in self._skip:
-            return self._skip[index]
-        self._say("begin", shard, index)
-        return None
-
-    def end(self, shard: int, index: int, failed: str | None) -> None:
-        self._say("end", shard, index, failed)
-
-    def retry(self, shard: int, index: int, reason: str) -> None:
-        self._say("retry", shard, index, reason)
-
-    def closing(self, shard: int) -> None:
-        self._say("closing", shard)
 
 
 class Worker:
@@ -83,12 +56,17 @@ class Worker:
         try:
             if kind == "measure":
                 indices, skip = rest
-                return "measured", self._maker.measure(indices, RayTelling(self._board, self._number, skip))
+                return "measured", self._maker.measure(indices, Telling(self._say, skip))
             shard, described, skip, first = rest
-            told = RayTelling(self._board, self._number, skip)
-            return "wrote", shard, *self._maker.make(shard, described, told, first)
+            return "wrote", shard, *self._maker.make(shard, described, Telling(self._say, skip), first)
         except Exception as error:  # noqa: BLE001  told, and raised by the run
             return "fatal", *fatal(error)
+
+    def _say(self, message: tuple[Any, ...]) -> None:
+        import ray
+
+        # Waited for, so that the board knows where a worker was when it died.
+        ray.get(self._board.say.remote(self._number, *message))
 
 
 class RayWorker(Member):

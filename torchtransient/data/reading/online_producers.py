@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import threading
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 import torch.multiprocessing  # teaches connections to hand over shared tensors
 
+from torchtransient.data.generation.told_errors import ToldError
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
 from torchtransient.data.recipes.plugin_modules import plugins_here
@@ -53,19 +55,13 @@ class _EndedError(Exception):
     """A producer is gone without having said why."""
 
 
-class _ToldError(Exception):
-    """What a producer has raised, as it printed it there: the cause of the error that the trainer sees."""
-
-    def __str__(self) -> str:
-        return f"\n{self.args[0]}"
-
-
 class Producers:
     """What producers say is heard when a sample is drawn. A lock keeps threads apart."""
 
     def __init__(self, recipe: Any, schedule: Schedule, capacity: int, workers: int, timeout_s: float) -> None:
         self.schedule, self.waited_s = schedule, 0.0
-        self._recipe, self._capacity, self._count, self._timeout_s = recipe, capacity, workers, timeout_s
+        self._packed = pickle.dumps((recipe, plugins_here()))
+        self._capacity, self._count, self._timeout_s = capacity, workers, timeout_s
         self._pid, self._lock = os.getpid(), threading.Lock()
         self._workers: list[_Worker] = []
         self._ring: dict[str, torch.Tensor] = {}
@@ -86,7 +82,7 @@ class Producers:
     def _started(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        process = context.Process(target=produce, args=(there, self._recipe, plugins_here()), name=WHAT, daemon=True)
+        process = context.Process(target=produce, args=(there, self._packed), name=WHAT, daemon=True)
         try:
             with _interrupts_held_back():
                 process.start()
@@ -271,8 +267,8 @@ def _own_tensor(value: Any) -> torch.Tensor:
 def _raise(error: BaseException | None, text: str) -> NoReturn:
     """The exception of a producer, with what was printed of it there."""
     if isinstance(error, Exception):
-        raise error from _ToldError(text)
-    raise TorchTransientError(f"{WHAT}: a producer failed: {text.strip().splitlines()[-1]}") from _ToldError(text)
+        raise error from ToldError(text)
+    raise TorchTransientError(f"{WHAT}: a producer failed: {text.strip().splitlines()[-1]}") from ToldError(text)
 
 
 def _end(workers: list[_Worker]) -> None:

@@ -89,8 +89,9 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
     """Read every byte of a data set and compare it with its checksums; make the manifest of the sound shards again.
 
     Found are shards that are damaged, that stand under the name of another one, of another recipe, other versions of
-    packages or plugins, with other arrays or values, or doubled samples, a manifest that differs from the shards, and samples that are missing: of those that ``recipe.json`` counts, without
-    it of those between the first and the last one. ``progress``: a bar. Raises StorageError for what is no folder.
+    packages or plugins, with other arrays or values, or doubled samples, a manifest that differs from the shards, and
+    samples that are missing: of those that ``recipe.json`` counts, without it of those between the first and the last
+    one. ``progress``: a bar. Raises StorageError for what is no folder.
     """
     paths = shards_of(folder)
     expected = _expected(Path(folder))
