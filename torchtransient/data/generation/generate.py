@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import os
 import pickle
+import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from torchtransient.data.generation.settings import (
     write_description,
 )
 from torchtransient.data.recipes.plugin_modules import plugins_here
+from torchtransient.data.storage.part_files import check_system
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.quantities import shown
 
@@ -109,6 +111,7 @@ def generate(
     workers stopped. Scripts that call it need ``if __name__ == "__main__"``: workers import them.
     """
     start = time.monotonic()
+    check_system(_WHAT)
     _check_process()
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
@@ -124,7 +127,7 @@ def generate(
     log = RunLog(place)
     _sweep(place)
     ledger = Ledger(retries, log, SampleBar(0, 0, shown=False))
-    log("begin", n=n, workers=workers, engine=engine, shard=shard, host=os.uname().nodename)
+    log("begin", n=n, workers=workers, engine=engine, shard=shard, host=platform.node())
     kept = 0
     try:
         with _engine(engine, settings, workers, ledger, timeout_s, address) as crew:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from typing import Any
 
 from torchtransient.data.generation.crew import LOOK_S, PATIENCE_S, Crew, Member
@@ -15,7 +16,8 @@ from torchtransient.data.generation.ledger import Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
 from torchtransient.data.generation.telling import Telling
-from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.errors import StorageError, TorchTransientError, TorchTransientWarning
+from torchtransient.render.physics import level_of_user
 
 
 class Board:
@@ -102,10 +104,23 @@ class RayCrew(Crew[RayWorker]):
         super().__init__(settings, workers, ledger, timeout_s)
         self._ray = ray_package()
         self._own = not self._ray.is_initialized()
+        self._board: Any = None
         if self._own:
             self._connect(address)
+        try:
+            self._prepare()
+        except BaseException:
+            self.close(stopped=True)
+            raise
+
+    def _prepare(self) -> None:
+        """Everything after the connection."""
         self._cpus = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-        self.wanted = min(workers, self._cpus)
+        if self.wanted > self._cpus:
+            told = f"generate: the cluster has {self._cpus} processors, and {self.wanted} workers were asked for; "
+            warnings.warn(f"{told}{self._cpus} are started.", TorchTransientWarning, level_of_user())
+            self.ledger.log("fewer workers", asked=self.wanted, workers=self._cpus)
+            self.wanted = self._cpus
         self._count = 0
         restarts = {"max_restarts": -1, "max_task_retries": -1}
         self._board = self._ray.remote(num_cpus=0, **restarts)(Board).remote()
@@ -161,8 +176,9 @@ class RayCrew(Crew[RayWorker]):
         for worker in self.workers:
             worker.end()
         self.workers.clear()
-        with contextlib.suppress(Exception):
-            self._ray.kill(self._board)
+        if self._board is not None:
+            with contextlib.suppress(Exception):
+                self._ray.kill(self._board)
         if self._own:
             self._ray.shutdown()
 
