@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.storage.chunks import LIBVER, Compressor, check_compression
-from torchtransient.data.storage.encodings import check_store, encoded, encoding_of
+from torchtransient.data.storage.encodings import check_store, encoded, encoding_of, measured_names
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import check_folder, path_of
@@ -56,8 +56,9 @@ class ShardWriter:
     """A shard that is written as its samples come, in any order of rows, and takes its place when the block ends.
 
     ``rows``: how many samples it has, those that fail included. ``header``: plain data, JSON. ``store``: "exact",
-    "rounded" (10 bits of mantissa for what was measured, labels as they are) or "counts" (``measurement`` as whole
-    numbers, everything else as it is). ``compression``: "blosc2", "gzip" or "none".
+    "rounded" (10 bits of mantissa for what was measured, which ``header["about"]["measures"]`` names, labels as they
+    are) or "counts" (``measurement`` as whole numbers, everything else as it is). ``compression``: "blosc2", "gzip" or
+    "none".
 
     Compressed samples are kept in memory until the block ends. Where the block raises, or was killed, nothing appears.
     Raises StorageError for arguments that cannot be used, a folder that is missing, a full disk, samples that are
@@ -116,8 +117,10 @@ class ShardWriter:
                     f"{WHAT}: store='counts' is for the measurement of a sensor, and the samples have "
                     f"{', '.join(arrays)}. Give the recipe a sensing chain, or store='rounded'."
                 )
+            measured = measured_names(self._header.get("about"))
             for name, array in arrays.items():
-                self._arrays[name] = _Column(name, array, self.store, self.compression)
+                encoding = encoding_of(name, array.dtype, self.store, measured)
+                self._arrays[name] = _Column(array, name, encoding, self.compression)
             self._values = kinds
         what = f"{WHAT}: sample {sample.index}"
         _check_same("arrays", list(self._arrays), list(arrays), what)
@@ -206,10 +209,9 @@ class _Row:
 class _Column:
     """One array of all samples, as compressed chunks by row."""
 
-    def __init__(self, name: str, first: NDArray[Any], store: str, compression: str) -> None:
+    def __init__(self, first: NDArray[Any], name: str, encoding: str, compression: str) -> None:
         self.name, self.shape, self.dtype = name, first.shape, first.dtype
-        self.encoding = encoding_of(name, first.dtype, store)
-        self.compression = compression
+        self.encoding, self.compression = encoding, compression
         self.rows: dict[int, tuple[np.dtype[Any], list[bytes]]] = {}
         self._compressors: dict[np.dtype[Any], Compressor] = {}
 

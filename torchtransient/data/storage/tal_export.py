@@ -17,6 +17,7 @@ from torchtransient.quantities import shown
 from torchtransient.render.progress import with_bar
 
 _WHAT = "TAL export"
+# What captures can hold.
 _MEASURED = ("transient", "phasor", "measurement")
 
 
