@@ -68,7 +68,9 @@ def test_what_is_there(calm):
 
 
 def test_equal_bytes_of_many_workers(calm, tmp_path):
-    generate(RECIPE, tmp_path, workers=2, **QUICK)
+    """Whole numbers of any library count."""
+    numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
+    generate(RECIPE, tmp_path, workers=np.int64(2), progress=False, **numbers)
     assert data_files(tmp_path) == data_files(calm)
 
 
@@ -253,10 +255,12 @@ class Unpicklable(FakeRecipe):
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"n": 0}, UnitError, "n to be"), ({"n": 2.5}, UnitError, "n to be"), ({"n": None}, UnitError, "how many"),
+        ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"), ({"n": None}, UnitError, "how many"),
         ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
-        ({"shard": "0/2"}, UnitError, "shard"), ({"timeout_s": 0}, UnitError, "timeout_s"),
+        ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
+        ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
+        ({"timeout_s": 0}, UnitError, "timeout_s"),
         ({"max_outside": -0.1}, UnitError, "max_outside"), ({"max_outside": float("nan")}, UnitError, "max_outside"),
         ({"engine": "dask"}, UnitError, "engine"), ({"address": "auto"}, UnitError, "ray"),
         ({"store": "half"}, StorageError, "store"), ({"compression": "lzma"}, StorageError, "compression"),

@@ -11,10 +11,10 @@ from typing import Any
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
 from torchtransient.data.recipes.plugin_modules import PluginNames
+from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 
-RECIPE_FILE = "recipe.json"
 FORMAT = "torchtransient data set"
 _WHAT = "generate"
 # What decides about the bytes of shards, in the order in which differences are told.

@@ -15,6 +15,7 @@ from torchtransient.data.generation.plan import Plan
 from torchtransient.data.generation.settings import Settings, check_same, plain, shard_header
 from torchtransient.data.generation.told_errors import traced
 from torchtransient.data.recipes.plugin_modules import add_plugins
+from torchtransient.data.storage.file_names import shard_file_name
 from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Words of a reason at most: it stands in the file for every sample that failed.
@@ -117,7 +118,7 @@ class ShardMaker:
             self._compared = True
         plan = Plan(settings.n, described["per_shard"])
         indices, failed = plan.indices(shard), 0
-        path = Path(settings.folder) / plan.name(shard)
+        path = Path(settings.folder) / shard_file_name(shard)
         header = shard_header(settings, described, shard)
         with ShardWriter(
             path, len(indices), header, store=settings.store, compression=settings.compression

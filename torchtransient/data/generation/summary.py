@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.data.generation.settings import RECIPE_FILE, read_description
+from torchtransient.data.generation.settings import read_description
 from torchtransient.data.recipes.contact_sheet import sheet_of
 from torchtransient.data.recipes.sample import Sample
+from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.data.storage.manifest import shards_of
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError

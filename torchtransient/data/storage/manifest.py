@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.data.storage.part_files import sweep_parts as sweep_parts
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
@@ -21,8 +22,6 @@ from torchtransient.quantities import shown
 from torchtransient.render.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
-MANIFEST, RECIPE = "manifest.json", "recipe.json"
-_PATTERN = "shard-*.h5"
 _WHAT = "data set"
 
 
@@ -45,7 +44,7 @@ class Verified:
     @property
     def damaged(self) -> tuple[str, ...]:
         """Names of the shards with faults, which have to be made again."""
-        return tuple(name for name in self.faults if name != MANIFEST)
+        return tuple(name for name in self.faults if name != MANIFEST_FILE)
 
     @property
     def complete(self) -> bool:
@@ -65,7 +64,7 @@ def shards_of(folder: str | Path) -> list[Path]:
     place = path_of(folder, _WHAT)
     if not place.is_dir():
         raise StorageError(f"{_WHAT}: expected the folder of a data set, got '{place}'.")
-    return sorted(path for path in place.glob(_PATTERN) if path.is_file())
+    return sorted(path for path in place.glob(SHARD_FILES) if path.is_file())
 
 
 def build_manifest(folder: str | Path) -> dict[str, Any]:
@@ -76,7 +75,7 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     """
     paths = shards_of(folder)
     if not paths:
-        raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({_PATTERN}).")
+        raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({SHARD_FILES}).")
     entries = [_Entry.read(path) for path in paths]
     faults = _faults_between(entries, {})
     if faults:
@@ -107,11 +106,11 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
     between = _faults_between(entries, expected)
     sound = [entry for entry in entries if entry.name not in between]
     faults |= between
-    before = _text_of(Path(folder) / MANIFEST)
+    before = _text_of(Path(folder) / MANIFEST_FILE)
     if sound:
         _write(Path(folder), sound)
-        if before is not None and before != _text_of(Path(folder) / MANIFEST):
-            faults[MANIFEST] = ["did not tell what the shards hold; it was made again"]
+        if before is not None and before != _text_of(Path(folder) / MANIFEST_FILE):
+            faults[MANIFEST_FILE] = ["did not tell what the shards hold; it was made again"]
     have = {number for entry in sound for number in (*entry.index, *entry.failed)}
     n = expected.get("n")
     missing = sorted(set(range(n if isinstance(n, int) else max(have, default=-1) + 1)) - have)
@@ -182,7 +181,7 @@ def _faults_between(entries: Sequence[_Entry], expected: Mapping[str, Any]) -> d
         if entry.key != key:
             said.append(f"belongs to another recipe (key {shown(entry.key)}, expected {shown(key)})")
         number = entry.header.get("shard")
-        if isinstance(number, int) and entry.name != f"shard-{number:06d}.h5":
+        if isinstance(number, int) and entry.name != shard_file_name(number):
             said.append(f"is shard {number} under another name")
         if not said:
             kind = _must_be_alike(entry)
@@ -213,11 +212,11 @@ def _difference(name: str, expected: Any, found: Any) -> str:
 
 def _expected(folder: Path) -> dict[str, Any]:
     """What ``recipe.json`` says, nothing where it is missing or no such file."""
-    text = _text_of(folder / RECIPE)
+    text = _text_of(folder / RECIPE_FILE)
     try:
         found = json.loads(text) if text is not None else {}
     except ValueError:
-        raise StorageError(f"{_WHAT}: '{folder / RECIPE}' is no JSON: it was cut or changed.") from None
+        raise StorageError(f"{_WHAT}: '{folder / RECIPE_FILE}' is no JSON: it was cut or changed.") from None
     return found if isinstance(found, dict) else {}
 
 
@@ -227,7 +226,7 @@ def _expected(folder: Path) -> dict[str, Any]:
 def _write(folder: Path, entries: Sequence[_Entry]) -> dict[str, Any]:
     manifest = _manifest(entries)
     text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
-    target = folder / MANIFEST
+    target = folder / MANIFEST_FILE
     if text != _text_of(target):
         with whole_file(target, _WHAT) as unfinished, writing_said(target, _WHAT):
             unfinished.write_text(text, encoding="utf-8")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import operator
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +25,7 @@ from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import check_folder, path_of
 from torchtransient.files.hdf5_writing import new_hdf5
-from torchtransient.quantities import shown
+from torchtransient.quantities import count, shown
 
 FORMAT = "torchtransient shard 1"
 WHAT = "shard"
@@ -76,7 +75,7 @@ class ShardWriter:
         self.path = path_of(path, WHAT)
         check_folder(self.path, WHAT)
         self.store, self.compression = check_store(store, WHAT), check_compression(compression, WHAT)
-        self.rows = _whole(rows, "rows", 1)
+        self.rows = count(f"{WHAT}: rows", rows, 1, StorageError)
         self._header = json.loads(_json(dict(header), "header"))
         self._samples: dict[int, _Row] = {}
         self._failed: dict[int, tuple[int, str]] = {}
@@ -141,7 +140,7 @@ class ShardWriter:
         self._failed[self._free(row)] = (int(index), str(reason))
 
     def _free(self, row: int) -> int:
-        row = _whole(row, "row", 0)
+        row = count(f"{WHAT}: row", row, 0, StorageError)
         if row >= self.rows:
             raise StorageError(f"{WHAT}: expected a row below {self.rows}, got {row}.")
         if row in self._samples or row in self._failed:
@@ -294,16 +293,6 @@ def _check_same(what: str, expected: list[str], found: list[str], where: str) ->
 def _kinds_text(kinds: Mapping[str, Any]) -> str:
     each = (f"{key} {'text' if kind is None else f'{kind[1]} {kind[0]}'}" for key, kind in kinds.items())
     return ", ".join(each) or "none"
-
-
-def _whole(value: Any, name: str, least: int) -> int:
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = least - 1
-    if number < least:
-        raise StorageError(f"{WHAT}: expected {name} as a whole number from {least} on, got {shown(value)}.")
-    return number
 
 
 def _json(value: Any, what: str) -> str:
