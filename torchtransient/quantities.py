@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnitError
 
 
 def finite(name: str, value: Any) -> float:
@@ -51,15 +51,15 @@ def shares(name: str, values: Any) -> float | tuple[float, float, float]:
     return red, green, blue
 
 
-def count(name: str, value: Any, least: int = 1) -> int:
-    """``value`` as an int. Raises SceneError unless it is a whole number of at least ``least``."""
+def count(name: str, value: Any, least: int = 1, error: type[TorchTransientError] = SceneError) -> int:
+    """``value`` as an int. Raises ``error`` unless it is a whole number of at least ``least``."""
     try:
         number = None if _is_truth(value) else operator.index(value)
     except TypeError:
         whole = _number(value)
         number = int(whole) if math.isfinite(whole) and whole == round(whole) else None
     if number is None or number < least:
-        raise SceneError(f"{name}: expected a whole number of at least {least}, got {shown(value)}.")
+        raise error(f"{name}: expected a whole number of at least {least}, got {shown(value)}.")
     return number
 
 

@@ -84,6 +84,7 @@ def test_show_and_preview(made):
         assert (made / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_cost(made):
     result = run(made, "cost", "box.yaml", "--samples", 2, "--quiet")
     assert result.exit_code == 0 and "seconds" in result.stdout and "bytes a sample" in result.stdout
@@ -100,6 +101,7 @@ def test_export(made):
     assert result.exit_code == 2 and "cannot be made" in result.stderr
 
 
+@pytest.mark.slow
 def test_shares_of_machines(made, tmp_path):
     """The same bytes, from two commands that take every other file."""
     for part in ("0/2", "1/2"):
@@ -125,6 +127,7 @@ def test_what_is_wrong_is_one_line(made):
     assert result.exit_code == 0 and "verify" in result.stdout
 
 
+@pytest.mark.slow
 def test_ctrl_c_and_on_again(made, tmp_path):
     command = ("dataset", str(made / "box.yaml"), "--out", "set", "--n", "4000", "--per-shard", "20", "--quiet")
     child = start_command(tmp_path, *command)

@@ -25,12 +25,14 @@ How to write a plugin module::
 The last line says what its parameters move; without it they count as values such as colours, and an `eta` as an index
 whose derivative is not known to be right. A module looks up variant types when it uses them (`mi.Float`) and never
 keeps one at module level. To add a module of this
-library, add a line to `PLUGIN_MODULES`; a module of someone else's is added with `register_module("their.module")`.
+library, add a line to `PLUGIN_MODULES`; a module of someone else's is added with `register_module("their.module")`, and
+so it is in the processes that make data sets. A plugin that was registered without a module is in its own process only.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import sys
@@ -39,6 +41,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import mitsuba as mi
 
@@ -177,6 +180,28 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
         except PluginRegistrationError:
             _state.third_party = before  # one bad module must not block all later scene loads
             raise
+
+
+def modules_of_others() -> tuple[PluginModule, ...]:
+    """The modules that were added with :func:`register_module`, in the order in which they were."""
+    with _state.lock:
+        return tuple(_state.third_party)
+
+
+def versions_of_others() -> dict[str, str]:
+    """What each module that was added is, by its name: a hash of its source, of a module without one the version of its
+    package.
+    """
+    return {entry.module: _version(entry.module) for entry in modules_of_others()}
+
+
+def _version(module: str) -> str:
+    found = importlib.util.find_spec(module)
+    source = Path(found.origin) if found is not None and found.origin is not None else None
+    if source is not None and source.suffix == ".py" and source.is_file():
+        return f"sha256 {hashlib.sha256(source.read_bytes()).hexdigest()[:16]}"
+    loaded = sys.modules.get(module.split(".")[0])
+    return str(getattr(loaded, "__version__", "unknown"))
 
 
 def kind_of(name: str) -> str | None:

@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, finish, leftovers, start
 from torchtransient.data.generation.generate import generate
 from torchtransient.data.generation.latest_picture import LatestPicture
 from torchtransient.data.generation.ledger import DIED
+from torchtransient.data.generation.settings import Settings
+from torchtransient.data.generation.shard_making import ShardMaker
 from torchtransient.data.storage.manifest import verify
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import SceneError, StorageError, UnitError
@@ -64,15 +67,22 @@ def test_what_is_there(calm):
     assert json.loads((calm / "recipe.json").read_text())["standard_error"] == 0.25
 
 
-def test_equal_bytes_of_many_workers_and_of_shares(calm, tmp_path):
-    generate(RECIPE, tmp_path / "many", workers=3, **QUICK)
-    assert data_files(tmp_path / "many") == data_files(calm)
-    first = generate(RECIPE, tmp_path / "shares", shard=(1, 2), **QUICK)
+def test_equal_bytes_of_many_workers(calm, tmp_path):
+    """Whole numbers of any library count."""
+    numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
+    generate(RECIPE, tmp_path, workers=np.int64(2), progress=False, **numbers)
+    assert data_files(tmp_path) == data_files(calm)
+
+
+@pytest.mark.slow
+def test_equal_bytes_of_shares(calm, tmp_path):
+    first = generate(RECIPE, tmp_path, workers=3, shard=(1, 2), **QUICK)
     assert (first.samples, first.shards) == (11, 3)
-    second = generate(RECIPE, tmp_path / "shares", shard=(0, 2), **QUICK)
-    assert second.samples == 12 and data_files(tmp_path / "shares") == data_files(calm)
+    second = generate(RECIPE, tmp_path, shard=(0, 2), **QUICK)
+    assert second.samples == 12 and data_files(tmp_path) == data_files(calm)
 
 
+@pytest.mark.slow
 def test_going_on(calm, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, workers=1, **QUICK)
@@ -113,6 +123,7 @@ def test_the_folder_of_another_data_set(calm, recipe, changes, words):
     assert data_files(calm) == before
 
 
+@pytest.mark.slow
 def test_shards_without_their_recipe(calm, tmp_path):
     """What the shards say counts where recipe.json was lost."""
     folder = tmp_path / "set"
@@ -129,6 +140,7 @@ def test_shards_without_their_recipe(calm, tmp_path):
         generate(RECIPE, folder, **QUICK)
 
 
+@pytest.mark.slow
 def test_other_versions_of_packages(calm, tmp_path):
     folder = tmp_path / "set"
     generate(RECIPE, folder, workers=1, **QUICK)
@@ -141,6 +153,7 @@ def test_other_versions_of_packages(calm, tmp_path):
 # ------------------------------------------------------------------------------------------------- samples that fail
 
 
+@pytest.mark.slow
 def test_what_fails_is_named(tmp_path, calm):
     """Every kind of failure in one run; all other samples are there."""
     recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,), late=(21,))
@@ -164,6 +177,7 @@ def test_what_fails_is_named(tmp_path, calm):
     assert (again.kept, again.samples, again.failed) == (18, 0, 0)
 
 
+@pytest.mark.slow
 def test_what_passes_leaves_no_trace(tmp_path, calm):
     """What goes wrong once is tried again: the bytes are those of an undisturbed run."""
     notes = tmp_path / "notes"
@@ -174,18 +188,54 @@ def test_what_passes_leaves_no_trace(tmp_path, calm):
     assert data_files(tmp_path / "set") == data_files(calm)
 
 
+@pytest.mark.slow
 def test_the_first_samples_fail(tmp_path):
     done = generate(FakeRecipe(raising=(0,), crashing=(1,)), tmp_path, retries=0, workers=1, **QUICK)
     assert (done.samples, done.failed) == (21, 2)
 
 
+@pytest.mark.slow
 def test_no_sample_can_be_made(tmp_path):
     with pytest.raises(SceneError, match=r"none of the samples 0 to 15 .* The last one: SceneError: sample 15"):
         generate(FakeRecipe(raising=tuple(range(23))), tmp_path, **QUICK)
-    with pytest.raises(SceneError, match="no light in it"):
+    first = next(e for e in events(tmp_path) if e["event"] == "traceback")
+    assert first["sample"] == 0 and 'fake_recipe.py", line' in first["trace"]
+    with pytest.raises(SceneError, match="no light in it") as caught:
         generate(FakeRecipe(unbuilt="no light in it"), tmp_path, **QUICK)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.jsonl"]
     assert [e["event"] for e in events(tmp_path)].count("stopped") == 2
+    # File and line, where it is raised and in the log.
+    (said,) = (e["trace"] for e in events(tmp_path) if e["event"] == "error" and "no light" in e["error"])
+    assert 'fake_recipe.py", line' in said and said in str(caught.value.__cause__)
+
+
+class Told:
+    """Hears of samples."""
+
+    def __init__(self):
+        self.heard = []
+
+    def begin(self, shard, index):
+        return None
+
+    def __getattr__(self, name):
+        return lambda *facts: self.heard.append((name, *facts))
+
+
+@dataclass(frozen=True)
+class Checked(FakeRecipe):
+    def check(self, maker=None):
+        assert maker is not None and maker.recipe is self
+
+
+def test_measuring_checks_with_its_own_scenes_and_says_where_samples_fail(tmp_path):
+    told = Told()
+    recipe = Checked(raising=(0,))
+    with tt.threads(1):
+        found = ShardMaker(Settings(recipe, str(tmp_path), 4, "exact", "blosc2", None, 2)).measure(range(4), told)
+    assert found.standard_error == 0.25
+    traces = [facts for name, *facts in told.heard if name == "traced"]
+    assert [facts[:2] for facts in traces] == [[-1, 0]] and 'fake_recipe.py", line' in traces[0][2]
 
 
 def test_no_sample_has_its_light_in_the_window(tmp_path):
@@ -205,10 +255,12 @@ class Unpicklable(FakeRecipe):
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"n": 0}, UnitError, "n to be"), ({"n": 2.5}, UnitError, "n to be"), ({"n": None}, UnitError, "how many"),
+        ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"), ({"n": None}, UnitError, "how many"),
         ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
-        ({"shard": "0/2"}, UnitError, "shard"), ({"timeout_s": 0}, UnitError, "timeout_s"),
+        ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
+        ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
+        ({"timeout_s": 0}, UnitError, "timeout_s"),
         ({"max_outside": -0.1}, UnitError, "max_outside"), ({"max_outside": float("nan")}, UnitError, "max_outside"),
         ({"engine": "dask"}, UnitError, "engine"), ({"address": "auto"}, UnitError, "ray"),
         ({"store": "half"}, StorageError, "store"), ({"compression": "lzma"}, StorageError, "compression"),
@@ -229,6 +281,7 @@ def test_a_folder_that_is_a_file(tmp_path):
         generate(RECIPE, tmp_path / "a", **QUICK)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard(tmp_path):
     """Its workers import it; they may not begin runs of their own without end."""
     script = tmp_path / "script.py"
@@ -241,9 +294,27 @@ def test_a_script_without_a_guard(tmp_path):
     assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("call", ["generate(Mine(), FOLDER, 4, progress=False)", "OnlineDataset(Mine(), 4).draw()"])
+def test_a_class_that_workers_do_not_find(tmp_path, call):
+    """It is no missing guard."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
+        "from torchtransient.data import OnlineDataset, generate\n"
+        f"FOLDER = {str(tmp_path / 'set')!r}\n"
+        f"if __name__ == '__main__':\n    class Mine(FakeRecipe):\n        pass\n    {call}\n"
+    )
+    found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
+    last = found.stderr.rstrip().splitlines()[-1]
+    assert found.returncode == 1 and last.startswith("torchtransient.errors.SceneError") and "attribute 'Mine'" in last
+    assert "outside of `if __name__ == '__main__':`" in last
+
+
 # ------------------------------------------------------------------------------------------------------- full disks
 
 
+@pytest.mark.slow
 def test_a_full_disk(tmp_path):
     """A typed error, finished shards whole, nothing half-written, no worker left; the same call goes on."""
     recipe = FakeRecipe(shape=(1, 64, 16, 16))

@@ -62,6 +62,7 @@ def written_by(pid):
     return found
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced(tmp_path, calm):
     """One while it makes samples, one while it writes."""
     child = start(RECIPE, tmp_path, **ASKED)
@@ -89,10 +90,11 @@ def test_a_killed_supervisor(tmp_path, calm):
     assert leftovers(tmp_path) == []
     kept = len(list(tmp_path.glob("shard-*.h5")))
     assert 2 <= kept < 8
-    done = generate(RECIPE, tmp_path, progress=False, **ASKED)
+    done = generate(RECIPE, tmp_path, progress=False, **ASKED | {"workers": 1})
     assert done.kept == 6 * kept and data_files(tmp_path) == calm
 
 
+@pytest.mark.slow
 def test_a_killed_supervisor_of_a_worker_that_hangs(tmp_path):
     child = start(FakeRecipe(hanging=(0,)), tmp_path, **ASKED)
     (worker,) = wait_until(lambda: workers_of(child.pid)[:1])
@@ -103,6 +105,7 @@ def test_a_killed_supervisor_of_a_worker_that_hangs(tmp_path):
     wait_until(lambda: not alive(worker), 15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [False, True])
 def test_ctrl_c(tmp_path, calm, group):
     """At a terminal it reaches the workers too."""
@@ -117,6 +120,7 @@ def test_ctrl_c(tmp_path, calm, group):
     assert data_files(tmp_path) == calm
 
 
+@pytest.mark.slow
 def test_a_supervisor_that_was_stopped_for_a_while(tmp_path, calm):
     """Its workers are not taken for hung ones when it comes back."""
     child = start(RECIPE, tmp_path, timeout_s=2.5, **ASKED)
@@ -129,6 +133,7 @@ def test_a_supervisor_that_was_stopped_for_a_while(tmp_path, calm):
     assert data_files(tmp_path) == calm
 
 
+@pytest.mark.slow
 def test_two_runs_at_once(tmp_path, calm):
     """On one folder, from its beginning on: both end, and nothing is lost or doubled."""
     both = [start(RECIPE, tmp_path, **ASKED) for _ in range(2)]

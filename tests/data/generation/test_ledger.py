@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchtransient.data.generation.ledger import DIED, MOST_IN_A_ROW, MOST_OF_A_SHARD, Ledger
+from torchtransient.data.generation.ledger import DIED, MEASURING, MOST_IN_A_ROW, MOST_OF_A_SHARD, Ledger
 from torchtransient.data.generation.run_log import RunLog, SampleBar
 from torchtransient.errors import TorchTransientError
 
@@ -47,6 +47,16 @@ def test_deaths_without_end(ledger):
         ledger.lost(0, None, "by test", own_fault=True)
     with pytest.raises(TorchTransientError, match=rf"{MOST_OF_A_SHARD + 1} workers died over shard 0.*the same call"):
         ledger.lost(0, None, "by test", own_fault=True)
+
+
+def test_few_deaths_before_the_first_samples_are_enough(ledger):
+    """Nothing says that the recipe can be rendered at all; where a sample is to blame, it is given up first."""
+    ledger.add([MEASURING])
+    for _ in range(2):
+        ledger.take()
+        ledger.lost(MEASURING, None, "by test", own_fault=True)
+    with pytest.raises(TorchTransientError, match="3 workers died before the first samples were made, the last one by"):
+        ledger.lost(MEASURING, None, "by test", own_fault=True)
 
 
 def test_workers_that_die_with_nothing_to_do(ledger):

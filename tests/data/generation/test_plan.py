@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from torchtransient.data.generation.plan import Plan, samples_per_shard
+from torchtransient.data.storage.file_names import shard_file_name
 
 MB = 2**20
 
@@ -33,4 +34,4 @@ def test_every_sample_once(n, per_shard):
     assert [index for k in range(plan.shards) for index in plan.indices(k)] == list(range(n))
     for parts in (1, 2, 5):
         assert sorted(k for part in range(parts) for k in plan.share(part, parts)) == list(range(plan.shards))
-    assert plan.name(3) == "shard-000003.h5"
+    assert shard_file_name(3) == "shard-000003.h5"

@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 
 from support.online_recipe import SHAPE, OnlineRecipe
 from torchtransient.data.reading.online import OnlineDataset
+from torchtransient.data.reading.online_producers import Producers
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError
 
@@ -137,6 +138,7 @@ def test_orders_of_a_lost_producer_come_again():
 # -------------------------------------------------------------------------------------------------- whole data sets
 
 
+@pytest.mark.slow
 def test_samples_are_whole_and_come_from_the_recipe(tmp_path):
     before = shared()
     recipe = OnlineRecipe(pids=str(tmp_path), group=3)
@@ -157,6 +159,7 @@ def test_samples_are_whole_and_come_from_the_recipe(tmp_path):
     assert index_of(sample) >= 100
 
 
+@pytest.mark.slow
 def test_every_sample_is_made_once():
     with OnlineDataset(OnlineRecipe(), capacity=8, workers=3, uses=1.0, warm=1) as data:
         seen = Counter(index_of(data.draw()) for _ in range(300))
@@ -164,6 +167,25 @@ def test_every_sample_is_made_once():
     assert max(seen) < 300 + 8 + 3
 
 
+def test_a_place_is_ordered_anew_only_when_what_was_drawn_there_is_copied(monkeypatch):
+    """A producer may write as soon as it is told: here it has written before it is."""
+    say = Producers._say
+
+    def written_at_once(self, worker, *message):
+        if message[0] == "make" and self._ring:
+            for array in self._ring.values():
+                array[message[2]] = -1
+        say(self, worker, *message)
+
+    monkeypatch.setattr(Producers, "_say", written_at_once)
+    with OnlineDataset(OnlineRecipe(), capacity=2, uses=1.0, warm=2) as data:
+        for _ in range(40):
+            index_of(data.draw())
+            # Then the ring is full, and only a draw makes room.
+            time.sleep(0.01)
+
+
+@pytest.mark.slow
 def test_tensors_are_the_callers_own():
     with OnlineDataset(OnlineRecipe(), capacity=4, uses=1.0, warm=1) as data:
         kept = [data.draw() for _ in range(60)]
@@ -174,6 +196,7 @@ def test_tensors_are_the_callers_own():
     assert not kept[0]["transient"].is_shared()
 
 
+@pytest.mark.slow
 def test_loader_makes_batches():
     recipe = OnlineRecipe()
     with OnlineDataset(recipe, capacity=16, warm=4, transform=lambda x: x.sum(1)) as data:
@@ -190,6 +213,7 @@ def test_loader_makes_batches():
             pickle.dumps(data)
 
 
+@pytest.mark.slow
 def test_a_slow_producer_makes_the_trainer_wait():
     with OnlineDataset(OnlineRecipe(seconds=0.02), capacity=16, uses=2.0, warm=2) as data:
         for _ in range(60):
@@ -198,6 +222,7 @@ def test_a_slow_producer_makes_the_trainer_wait():
         assert data.waited_s > 0.2
 
 
+@pytest.mark.slow
 def test_a_slow_trainer_makes_producers_wait():
     with OnlineDataset(OnlineRecipe(), capacity=16, uses=4.0, warm=2) as data:
         for _ in range(40):
@@ -208,6 +233,7 @@ def test_a_slow_trainer_makes_producers_wait():
         assert data.made <= 41 / 4 + 16 + 2
 
 
+@pytest.mark.slow
 def test_threads_draw_together():
     wrong = []
     with OnlineDataset(OnlineRecipe(), capacity=8, workers=2, uses=3.0, warm=2) as data:
@@ -229,6 +255,7 @@ def test_threads_draw_together():
 # ---------------------------------------------------------------------------------------------------- what goes wrong
 
 
+@pytest.mark.slow
 def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
     data = OnlineDataset(OnlineRecipe(bug=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
     for _ in range(2):
@@ -238,6 +265,7 @@ def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
     assert gone(tmp_path)
 
 
+@pytest.mark.slow
 def test_samples_that_fail_are_left_out():
     recipe = OnlineRecipe(fail=(2, 3, 7))
     with OnlineDataset(recipe, capacity=8, workers=2, uses=1.0, warm=1) as data:
@@ -246,6 +274,7 @@ def test_samples_that_fail_are_left_out():
         assert data.failed == 3 and not seen & {2, 3, 7} and len(seen) > 20
 
 
+@pytest.mark.slow
 def test_nothing_but_failures_is_an_error():
     data = OnlineDataset(OnlineRecipe(fail=tuple(range(100))), capacity=8, warm=1)
     with data, warnings.catch_warnings():
@@ -254,24 +283,28 @@ def test_nothing_but_failures_is_an_error():
             data.draw()
 
 
+@pytest.mark.slow
 def test_error_that_cannot_be_sent_is_told():
     data = OnlineDataset(OnlineRecipe(unpicklable=(0,)), capacity=4)
     with data, pytest.raises(TorchTransientError, match="UnpicklableError: cannot be sent"):
         data.draw()
 
 
+@pytest.mark.slow
 def test_error_of_the_recipe_is_raised():
     data = OnlineDataset(OnlineRecipe(broken="no such mesh"), capacity=4)
     with data, pytest.raises(SceneError, match="no such mesh"):
         data.draw()
 
 
+@pytest.mark.slow
 def test_samples_of_another_kind_are_an_error():
     data = OnlineDataset(OnlineRecipe(odd=(3,)), capacity=8, uses=1.0, warm=1)
     with data, pytest.raises(ShapeError, match="same names, shapes and types"):
         draws(data, 100)
 
 
+@pytest.mark.slow
 def test_a_killed_producer_is_started_again(tmp_path):
     recipe = OnlineRecipe(die=(6,), once=str(tmp_path))
     data = OnlineDataset(recipe, capacity=8, workers=2, uses=1.0, warm=1)
@@ -280,6 +313,7 @@ def test_a_killed_producer_is_started_again(tmp_path):
     assert len(set(seen)) > 150 and max(seen) < 320
 
 
+@pytest.mark.slow
 def test_producers_killed_from_outside_are_started_again(tmp_path):
     recipe = OnlineRecipe(seconds=0.005, pids=str(tmp_path))
     with OnlineDataset(recipe, capacity=16, workers=2, uses=1.0, warm=4) as data:
@@ -295,6 +329,7 @@ def test_producers_killed_from_outside_are_started_again(tmp_path):
     assert gone(tmp_path) and len(set(seen)) > 80
 
 
+@pytest.mark.slow
 def test_a_sample_that_ends_its_producer_twice_is_an_error(tmp_path):
     data = OnlineDataset(OnlineRecipe(die=(2,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
     twice = pytest.raises(TorchTransientError, match="rendered sample 2, 2 times now")
@@ -303,6 +338,7 @@ def test_a_sample_that_ends_its_producer_twice_is_an_error(tmp_path):
     assert gone(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_producer_that_hangs_is_an_error(tmp_path):
     data = OnlineDataset(OnlineRecipe(hang=(1,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1, timeout_s=120.0)
     data.draw()
@@ -313,6 +349,7 @@ def test_a_producer_that_hangs_is_an_error(tmp_path):
     assert gone(tmp_path)
 
 
+@pytest.mark.slow
 def test_more_than_the_shared_memory_is_an_error(monkeypatch):
     from torchtransient.data.reading import online_producers
 
@@ -340,6 +377,7 @@ def test_mistakes_start_nothing(wrong, tmp_path):
 # ---------------------------------------------------------------------------------------------------- nothing is left
 
 
+@pytest.mark.slow
 def test_forgotten_data_sets_leave_nothing(tmp_path):
     data = OnlineDataset(OnlineRecipe(pids=str(tmp_path)), capacity=8, warm=1)
     loader = iter(DataLoader(data, batch_size=2))
@@ -369,6 +407,7 @@ ENDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ENDS)
 def test_the_end_of_the_interpreter_leaves_nothing(end, tmp_path):
     before = shared()
@@ -396,6 +435,7 @@ def test_the_end_of_the_interpreter_leaves_nothing(end, tmp_path):
     assert shared() <= before
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_is_told(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(

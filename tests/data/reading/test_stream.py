@@ -76,6 +76,7 @@ def test_ranks(data, world_size, even):
         assert together == list(range(N)) and max(counts) - min(counts) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_workers(data, context):
     """Workers that stay learn of the epoch; each sample comes once, over two ranks of two workers."""

@@ -24,6 +24,7 @@ def recipe():
     return D.Recipe(scene, vary, variant="llvm_ad_rgb", spp=4, labels=("depth", "normals"), n=1000)
 
 
+@pytest.mark.slow
 def test_cost(recipe):
     cost = recipe.cost(2)
     assert cost.values == ("red.reflectance.value", "small-box.to_world") and cost.exchanged == ("small-box.type",)

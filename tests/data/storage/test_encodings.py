@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import tarfile
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from support.stored_samples import sample, write
+from support.stored_samples import AXIS, sample, write
+from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.storage.encodings import counts_of, rounded_mantissa
 from torchtransient.data.storage.shard_file import Shard
+from torchtransient.data.storage.web_dataset import export_web_dataset
 from torchtransient.errors import StorageError
 
 
@@ -18,9 +22,7 @@ def nearest(value, bits, least):
     if not np.isfinite(value) or value == 0:
         return value
     x = abs(Fraction(float(value)))
-    exponent = least
-    while x >= Fraction(2) ** (exponent + 1):
-        exponent += 1
+    exponent = max(least, math.frexp(float(value))[1] - 1)
     step = Fraction(2) ** (exponent - bits)
     return float(np.copysign(float(round(x / step) * step), value))  # round of fractions is half to even
 
@@ -94,6 +96,22 @@ def test_labels_are_never_rounded(tmp_path):
             assert np.array_equal(found, rounded_mantissa(array) if measured else array)
             assert shard.encoding(name) == ("rounded" if measured else "exact")
             assert found.dtype == array.dtype and np.array_equal(found, array) != measured
+
+
+def test_what_a_film_of_ones_own_measures_is_rounded(tmp_path):
+    """Under the name that the header says, and nothing that only sounds like it."""
+    made = sample(0)
+    made.arrays["moments"], made.arrays["phasor"] = made.arrays.pop("transient"), made.arrays["depth"] * 1.7
+    about = {"measures": "moments", "axis": {**AXIS, "num_bins": 256}}
+    path = write(tmp_path / "a.h5", [made], "rounded", about=about)
+    with Shard(path) as shard:
+        assert {name for name in shard.names if shard.encoding(name) == "rounded"} == {"moments"}
+        assert np.array_equal(shard.read("moments", 0), rounded_mantissa(made.arrays["moments"]))
+    data = TransientDataset(path, window=slice(3, 9), pixels=(slice(0, 2), slice(0, 3)))
+    assert data[0]["moments"].shape == (1, 6, 2, 3) and data[0]["phasor"].shape == (2, 3)
+    (tar,) = export_web_dataset(path, tmp_path, progress=False)
+    with tarfile.open(tar) as file:
+        assert [name for name in file.getnames() if name.endswith(".zst")] == ["00000000.moments.npy.zst"]
 
 
 def test_counts_of_a_shard(tmp_path):

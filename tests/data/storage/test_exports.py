@@ -9,6 +9,7 @@ import sys
 import tarfile
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -16,6 +17,7 @@ import torch
 import torchtransient as tt
 from support.capture_files import grids, made
 from support.stored_samples import AXIS, cube, folder, header, sample, write
+from torchtransient.data.generation.summary import drawn_sheet, summary
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.recipes.written import written_frequencies
 from torchtransient.data.storage.shard_writing import ShardWriter
@@ -190,6 +192,47 @@ def test_phasors_of_a_recipe(tmp_path):
     found = tt.nlos.read_capture(export_tal(tmp_path, tmp_path / "out", progress=False)[0])
     assert found.frequencies == recipe.settings.frequencies
     assert np.array_equal(found.phasor, made.arrays["phasor"])
+
+
+def rendered(place, samples=3, **settings):
+    """A shard of a recipe's captures."""
+    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
+    scan = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal")
+    turned = tt.scenes.transforms.rotate([0, 1, 0], 180) @ np.diag([0.3, 0.3, 1, 1])
+    hidden = {"letter": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0]) @ turned}}
+    vary = {"letter.to_world": tt.data.Offset([-0.2, -0.2, 0], [0.2, 0.2, 0.3]), **settings.pop("vary", {})}
+    recipe = tt.data.Recipe(hidden, vary, scan=scan, variant="llvm_ad_mono", spp=4, **settings)
+    maker = recipe.maker()
+    about = json.loads(json.dumps(maker.about()))
+    write(place / "shard-000000.h5", [maker.sample(i) for i in range(samples)], about=about)
+    (place / "out").mkdir()
+
+
+def test_what_a_summary_says_of_phasors(tmp_path):
+    rendered(tmp_path, samples=1, frequencies=[1.0, 2.0, 3.0])
+    assert "3 frequencies, 1 to 3 cycles per metre" in summary(tmp_path)
+    assert drawn_sheet(tmp_path, tmp_path / "sheet.png", 1, 0) == [0]
+
+
+def test_each_capture_has_its_own_scan(tmp_path):
+    scans = [
+        tt.nlos.Scan.grid(tt.nlos.Wall.plane(width=width, height=width), (3, 2), kind="confocal")
+        for width in (1.0, 2.0)
+    ]
+    axis = tt.TimeAxis(0, 0.02, 100)
+    rendered(tmp_path, samples=8, time_axis=axis, vary={"scan": tt.data.Choice(scans)})
+    paths = export_tal(tmp_path, tmp_path / "out", progress=False)
+    told = [int(one["values"]["scan"].removeprefix("#")) for one in TransientDataset(tmp_path, ["values"])]
+    assert set(told) == {0, 1}
+    for path, number in zip(paths, told, strict=True):
+        found = tt.nlos.read_capture(path).scan
+        assert torch.allclose(torch.as_tensor(found.sensor_points), torch.as_tensor(scans[number].sensor_points))
+    with h5py.File(tmp_path / "shard-000000.h5") as file:
+        about = json.loads(file["about"][:].tobytes())["header"]["about"]
+    samples = [replace(sample(0), values={"scan": "#2"}, arrays={"transient": np.ones((1, 100, 2, 3), np.float32)})]
+    write(tmp_path / "shard-000000.h5", samples, about=about)
+    with pytest.raises(StorageError, match="sample 0: expected the value 'scan' as one of #0 to #1, got '#2'"):
+        export_tal(tmp_path, tmp_path / "out", progress=False)
 
 
 def test_scans_as_plain_data():

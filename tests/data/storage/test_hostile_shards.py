@@ -59,6 +59,7 @@ def read_mutants(folder, seeds):
     return good, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
 
 
+@pytest.mark.slow
 def test_mutated_files(tmp_path):
     """In a process of its own, which survives."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:

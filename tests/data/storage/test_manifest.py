@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
+import numpy as np
 import pytest
 
-from support.stored_samples import folder, sample, write
+from support.stored_samples import folder, header, sample, write
 from torchtransient.data.storage.manifest import build_manifest, ranges, ranges_text, verify
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
@@ -64,6 +66,7 @@ def test_one_bit(data, place):
     assert verify(data).damaged == ("shard-000001.h5",)
 
 
+@pytest.mark.slow
 def test_every_byte_counts(tmp_path):
     """A change of any byte of a small shard is found."""
     path = write(tmp_path / "shard-000000.h5", [sample(0, (1, 4, 2, 2))])
@@ -115,10 +118,50 @@ def test_missing_shards_and_other_names(data):
 
 def test_other_stores_and_manifests(data):
     write(data / "shard-000001.h5", [sample(i) for i in range(4, 8)], "rounded", shard=1)
-    assert "stored otherwise" in verify(data).faults["shard-000001.h5"][0]
+    fault = verify(data).faults["shard-000001.h5"][0]
+    assert "differs from the data set in store: 'rounded', expected 'exact'" in fault
     (data / "manifest.json").write_text("{}\n")
     assert "manifest.json" in verify(data).faults
     assert "manifest.json" not in verify(data).faults
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda one: one.arrays.pop("normals"), "arrays: normals: None, expected"),
+        (lambda one: one.arrays.update(depth=np.ones((16, 16))), "arrays: depth: dtype: 'float64', expected 'float32'"),
+        (lambda one: one.arrays.update(steady=one.arrays["steady"][..., :8]), r"arrays: steady: shape: \[1, 16, 8\]"),
+        (lambda one: one.values.update(more=1.0), "values: .*more"),
+    ],
+)
+def test_shards_of_other_samples(data, change, words):
+    """Of one key, and not of one kind."""
+    samples = [sample(i) for i in range(4, 8)]
+    for one in samples:
+        change(one)
+    write(data / "shard-000001.h5", samples, shard=1)
+    found = verify(data)
+    assert not found.complete and found.damaged == ("shard-000001.h5",) and found.missing == (4, 5, 6, 7)
+    assert re.search(f"differs from the data set in {words}", found.faults["shard-000001.h5"][0])
+    with pytest.raises(StorageError, match="differs from the data set"):
+        build_manifest(data)
+
+
+def test_shards_of_other_code(data):
+    """The first shard is the one that differs: what recipe.json says counts."""
+    about = header()["about"]
+    write(data / "shard-000000.h5", [sample(i) for i in range(4)], shard=0, about=about | {"versions": {"torch": "3"}})
+    found = verify(data)
+    assert not found.complete and "about: versions: torch: '2', expected '3'" in found.faults["shard-000001.h5"][0]
+    (data / "recipe.json").write_text(json.dumps({"key": "abc123", "n": 10, "about": about}))
+    found = verify(data)
+    assert found.damaged == ("shard-000000.h5",) and "versions: torch: '3'" in found.faults["shard-000000.h5"][0]
+
+
+def test_shards_without_samples_belong_to_all(data):
+    write(data / "shard-000000.h5", [StorageError("no light")] * 4, shard=0)
+    found = verify(data)
+    assert found.complete and found.samples == 6 and sorted(found.failed) == [0, 1, 2, 3]
 
 
 def test_folders(tmp_path, capsys):

@@ -156,6 +156,7 @@ def killed_while_writing(path):
         time.sleep(60)
 
 
+@pytest.mark.slow
 def test_parts_of_the_dead_are_swept_and_those_of_the_living_stay(tmp_path):
     tests = Path(__file__).parents[2]
     code = f"import sys; sys.path[:0] = {sys.path!r}; from data.storage.test_shards import killed_while_writing as k; "

@@ -13,6 +13,7 @@ from typing import Any, Generic, Self, TypeVar
 from torchtransient.data.generation.ledger import MEASURING, Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import Measured, raised
+from torchtransient.data.generation.told_errors import ToldError
 from torchtransient.errors import TorchTransientError
 
 # Seconds without a sign of life: while a worker starts or finishes a file, and in its first sample, which compiles; in
@@ -183,5 +184,9 @@ class Crew(ABC, Generic[Worker]):
         worker.shard = worker.sample = None
         self._measured = measured
 
-    def _on_fatal(self, _worker: Worker, kind: str, message: str) -> None:
-        raise raised(kind, message)
+    def _on_traced(self, _worker: Worker, shard: int, index: int, trace: str) -> None:
+        self.ledger.log("traceback", shard=shard, sample=index, trace=trace)
+
+    def _on_fatal(self, worker: Worker, kind: str, message: str, trace: str) -> None:
+        self.ledger.log("error", shard=worker.shard, sample=worker.sample, error=f"{kind}: {message}", trace=trace)
+        raise raised(kind, message) from ToldError(trace)

@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import os
 import pickle
+import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,6 @@ from torchtransient.data.generation.ledger import Ledger, facts
 from torchtransient.data.generation.plan import Plan, samples_per_shard
 from torchtransient.data.generation.run_log import RunLog, SampleBar
 from torchtransient.data.generation.settings import (
-    RECIPE_FILE,
     Settings,
     check_same,
     description,
@@ -25,8 +25,11 @@ from torchtransient.data.generation.settings import (
     shard_header,
     write_description,
 )
+from torchtransient.data.recipes.plugin_modules import plugins_here
+from torchtransient.data.storage.file_names import RECIPE_FILE, SHARD_FILES, shard_file_name
+from torchtransient.data.storage.part_files import check_system
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.quantities import count, shown
 
 ENGINES = ("local", "ray")
 # Samples that are tried until one tells how large all are.
@@ -108,14 +111,18 @@ def generate(
     workers stopped. Scripts that call it need ``if __name__ == "__main__"``: workers import them.
     """
     start = time.monotonic()
+    check_system(_WHAT)
     _check_process()
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
         raise UnitError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
-    _check_numbers(n, workers, shard, per_shard, timeout_s, retries, max_outside)
+    n, workers, retries = _whole("n", n, 1), _whole("workers", workers, 1), _whole("retries", retries, 0)
+    per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
+    shard = None if shard is None else _whole_pair(shard)
+    _check_limits(timeout_s, max_outside)
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
-    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries)
+    settings = Settings(recipe, str(place), n, store, compression, max_outside, retries, plugins_here())
     wanted = description(settings, per_shard or 0, {}, None)
     if per_shard is None:
         del wanted["per_shard"]
@@ -123,7 +130,7 @@ def generate(
     log = RunLog(place)
     _sweep(place)
     ledger = Ledger(retries, log, SampleBar(0, 0, shown=False))
-    log("begin", n=n, workers=workers, engine=engine, shard=shard, host=os.uname().nodename)
+    log("begin", n=n, workers=workers, engine=engine, shard=shard, host=platform.node())
     kept = 0
     try:
         with _engine(engine, settings, workers, ledger, timeout_s, address) as crew:
@@ -167,7 +174,7 @@ def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] 
     from torchtransient.data.storage.shard_file import Shard
 
     found = read_description(place)
-    first = next(iter(sorted(place.glob("shard-*.h5"))), None)
+    first = next(iter(sorted(place.glob(SHARD_FILES))), None)
     if not resume and (found is not None or first is not None):
         raise StorageError(
             f"{_WHAT}: '{place}' has a data set, and resume=False was asked for. Choose another folder, or delete it."
@@ -193,7 +200,7 @@ def _survey(
 
     left, kept = [], 0
     for number in share:
-        path = place / Plan.name(number)
+        path = place / shard_file_name(number)
         if not path.exists():
             left.append(number)
             continue
@@ -218,10 +225,10 @@ def _survey(
 
 
 def _check_made(place: Path, made: list[int], engine: str) -> None:
-    missing = next((k for k in made if not (place / Plan.name(k)).exists()), None)
+    missing = next((k for k in made if not (place / shard_file_name(k)).exists()), None)
     if missing is not None:
         more = " All machines of the cluster have to see this folder under this name." if engine == "ray" else ""
-        path = place / Plan.name(missing)
+        path = place / shard_file_name(missing)
         raise StorageError(f"{_WHAT}: shard {missing} was written, and '{path}' is not there.{more}")
 
 
@@ -230,7 +237,7 @@ def _write_manifest(place: Path) -> None:
     from torchtransient.data.storage.manifest import build_manifest
 
     seen: set[str] | None = None
-    while (now := {path.name for path in place.glob("shard-*.h5")}) != seen:
+    while (now := {path.name for path in place.glob(SHARD_FILES)}) != seen:
         seen = now
         if now:
             build_manifest(place)
@@ -265,29 +272,26 @@ def _check_process() -> None:
         )
 
 
-def _check_numbers(
-    n: Any, workers: Any, shard: Any, per_shard: Any, timeout_s: Any, retries: Any, max_outside: Any
-) -> None:
-    _check_whole(n, "n", 1)
-    _check_whole(workers, "workers", 1)
-    _check_whole(retries, "retries", 0)
-    if per_shard is not None:
-        _check_whole(per_shard, "per_shard", 1)
-    if shard is not None:
-        pair: Any = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
-        if not all(isinstance(k, int) and not isinstance(k, bool) for k in pair) or not 0 <= pair[0] < pair[1]:
-            raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
+def _whole(name: str, value: Any, least: int) -> int:
+    return count(f"{_WHAT}: {name}", value, least, UnitError)
+
+
+def _whole_pair(shard: Any) -> tuple[int, int]:
+    pair = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
+    with contextlib.suppress(UnitError):
+        part, parts = _whole("shard", pair[0], 0), _whole("shard", pair[1], 1)
+        if part < parts:
+            return part, parts
+    raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
+
+
+def _check_limits(timeout_s: Any, max_outside: Any) -> None:
     limits: tuple[tuple[str, Any, float], ...] = (("timeout_s", timeout_s, math.inf), ("max_outside", max_outside, 1.0))
     for name, value, most in limits:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if value is not None and not (number and 0 <= value <= most and (value > 0 or name == "max_outside")):
             wanted = "in [0, 1]" if name == "max_outside" else "above 0"
             raise UnitError(f"{_WHAT}: expected {name} to be a number {wanted}, or None, got {shown(value)}.")
-
-
-def _check_whole(value: Any, name: str, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise UnitError(f"{_WHAT}: expected {name} to be a whole number of at least {least}, got {shown(value)}.")
 
 
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:

@@ -17,6 +17,8 @@ MEASURING = -1
 _OWN_FAULT, _KILLED = 2, 1
 # Deaths without an end of it: of one shard, and of all workers without a sample in between.
 MOST_OF_A_SHARD, MOST_IN_A_ROW = 20, 30
+# And before the first samples: nothing says that the recipe can be rendered at all.
+MOST_BEFORE_ANY = 3
 
 
 @dataclass
@@ -104,8 +106,12 @@ class Ledger:
             self._deaths[shard] += 1
             if index is not None:
                 self._charge(shard, index, own_fault)
-            if self._deaths[shard] > MOST_OF_A_SHARD:
-                self._give_up(f"{self._deaths[shard]} workers died over shard {shard}, the last one {how}")
+            deaths = self._deaths[shard]
+            if shard == MEASURING and index is None and deaths >= MOST_BEFORE_ANY:
+                self._give_up(f"{deaths} workers died before the first samples were made, the last one {how}")
+            if deaths > MOST_OF_A_SHARD:
+                where = "the first samples" if shard == MEASURING else f"shard {shard}"
+                self._give_up(f"{deaths} workers died over {where}, the last one {how}")
         if self._in_a_row > MOST_IN_A_ROW:
             self._give_up(f"{self._in_a_row} workers died one after another without a sample, the last one {how}")
 

@@ -31,11 +31,6 @@ class Plan:
         """Shards of one of several runs that divide the work: every ``parts``-th one, beginning with ``part``."""
         return range(part, self.shards, parts)
 
-    @staticmethod
-    def name(shard: int) -> str:
-        """The name of a shard's file."""
-        return f"shard-{shard:06d}.h5"
-
 
 def samples_per_shard(n: int, sample_bytes: int) -> int:
     """Samples in a shard of ``n`` samples that have ``sample_bytes`` bytes each before compression.

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from typing import Any
 
 from torchtransient.data.generation.crew import LOOK_S, PATIENCE_S, Crew, Member
 from torchtransient.data.generation.ledger import Ledger
 from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
-from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.data.generation.telling import Telling
+from torchtransient.errors import StorageError, TorchTransientError, TorchTransientWarning
+from torchtransient.render.physics import level_of_user
 
 
 class Board:
@@ -31,34 +34,6 @@ class Board:
         """What was said since the last call."""
         said, self._said = self._said, []
         return said
-
-
-class RayTelling:
-    """Says it to the board; see :class:`Told`."""
-
-    def __init__(self, board: Any, worker: int, skip: dict[int, str]) -> None:
-        self._board, self._worker, self._skip = board, worker, skip
-
-    def _say(self, *message: Any) -> None:
-        import ray
-
-        # Waited for, so that the board knows where a worker was when it died.
-        ray.get(self._board.say.remote(self._worker, *message))
-
-    def begin(self, shard: int, index: int) -> str | None:
-        if index in self._skip:
-            return self._skip[index]
-        self._say("begin", shard, index)
-        return None
-
-    def end(self, shard: int, index: int, failed: str | None) -> None:
-        self._say("end", shard, index, failed)
-
-    def retry(self, shard: int, index: int, reason: str) -> None:
-        self._say("retry", shard, index, reason)
-
-    def closing(self, shard: int) -> None:
-        self._say("closing", shard)
 
 
 class Worker:
@@ -83,12 +58,17 @@ class Worker:
         try:
             if kind == "measure":
                 indices, skip = rest
-                return "measured", self._maker.measure(indices, RayTelling(self._board, self._number, skip))
+                return "measured", self._maker.measure(indices, Telling(self._say, skip))
             shard, described, skip, first = rest
-            told = RayTelling(self._board, self._number, skip)
-            return "wrote", shard, *self._maker.make(shard, described, told, first)
+            return "wrote", shard, *self._maker.make(shard, described, Telling(self._say, skip), first)
         except Exception as error:  # noqa: BLE001  told, and raised by the run
             return "fatal", *fatal(error)
+
+    def _say(self, message: tuple[Any, ...]) -> None:
+        import ray
+
+        # Waited for, so that the board knows where a worker was when it died.
+        ray.get(self._board.say.remote(self._number, *message))
 
 
 class RayWorker(Member):
@@ -124,10 +104,23 @@ class RayCrew(Crew[RayWorker]):
         super().__init__(settings, workers, ledger, timeout_s)
         self._ray = ray_package()
         self._own = not self._ray.is_initialized()
+        self._board: Any = None
         if self._own:
             self._connect(address)
+        try:
+            self._prepare()
+        except BaseException:
+            self.close(stopped=True)
+            raise
+
+    def _prepare(self) -> None:
+        """Everything after the connection."""
         self._cpus = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-        self.wanted = min(workers, self._cpus)
+        if self.wanted > self._cpus:
+            told = f"generate: the cluster has {self._cpus} processors, and {self.wanted} workers were asked for; "
+            warnings.warn(f"{told}{self._cpus} are started.", TorchTransientWarning, level_of_user())
+            self.ledger.log("fewer workers", asked=self.wanted, workers=self._cpus)
+            self.wanted = self._cpus
         self._count = 0
         restarts = {"max_restarts": -1, "max_task_retries": -1}
         self._board = self._ray.remote(num_cpus=0, **restarts)(Board).remote()
@@ -183,8 +176,9 @@ class RayCrew(Crew[RayWorker]):
         for worker in self.workers:
             worker.end()
         self.workers.clear()
-        with contextlib.suppress(Exception):
-            self._ray.kill(self._board)
+        if self._board is not None:
+            with contextlib.suppress(Exception):
+                self._ray.kill(self._board)
         if self._own:
             self._ray.shutdown()
 

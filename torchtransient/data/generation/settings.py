@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +10,11 @@ from typing import Any
 
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.recipes.places import without_places
+from torchtransient.data.recipes.plugin_modules import PluginNames
+from torchtransient.data.storage.file_names import RECIPE_FILE
+from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 
-RECIPE_FILE = "recipe.json"
 FORMAT = "torchtransient data set"
 _WHAT = "generate"
 # What decides about the bytes of shards, in the order in which differences are told.
@@ -33,6 +32,8 @@ class Settings:
     compression: str
     max_outside: float | None
     retries: int
+    # Plugin modules of others, which every process has to add.
+    plugins: PluginNames = ()
 
 
 def shard_header(settings: Settings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
@@ -97,49 +98,9 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
     """
     place = folder / RECIPE_FILE
     text = json.dumps(described, sort_keys=True, indent=1) + "\n"
-    try:
-        while not _put(place, text):
-            pass
-        sync_folder(folder)
-    except OSError as error:
-        raise StorageError(f"{_WHAT}: '{place}' could not be written: {error}.") from error
+    with whole_file(place, _WHAT, over=False) as unfinished, writing_said(place, _WHAT):
+        unfinished.write_text(text, encoding="utf-8")
     return read_description(folder) or dict(described)
-
-
-def _put(place: Path, text: str) -> bool:
-    """Write a file unless it is there; False where what was being written was swept away before it was locked."""
-    import fcntl
-
-    part = place.with_name(f".{place.name}.{secrets.token_hex(4)}.part")
-    try:
-        with part.open("x", encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-            try:
-                # Not replaced where another run was faster.
-                os.link(part, place)
-            except FileExistsError:
-                return True
-            except FileNotFoundError:
-                return False
-            except OSError:
-                # Disks without hard links.
-                part.replace(place)
-            return True
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-
-
-def sync_folder(folder: Path) -> None:
-    """Names of new files reach the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def check_same(

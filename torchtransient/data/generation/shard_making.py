@@ -13,6 +13,9 @@ from typing import Any, Protocol
 from torchtransient.data.generation.latest_picture import LatestPicture
 from torchtransient.data.generation.plan import Plan
 from torchtransient.data.generation.settings import Settings, check_same, plain, shard_header
+from torchtransient.data.generation.told_errors import traced
+from torchtransient.data.recipes.plugin_modules import add_plugins
+from torchtransient.data.storage.file_names import shard_file_name
 from torchtransient.errors import SceneError, StorageError, TorchTransientError
 
 # Words of a reason at most: it stands in the file for every sample that failed.
@@ -33,6 +36,9 @@ class Told(Protocol):
 
     def retry(self, shard: int, index: int, reason: str) -> None:
         """It failed, and is tried again."""
+
+    def traced(self, shard: int, index: int, trace: str) -> None:
+        """Where it has failed first."""
 
     def closing(self, shard: int) -> None:
         """All samples are there, the file is finished."""
@@ -56,22 +62,23 @@ class ShardMaker:
         from torchtransient.render.threads import threads
 
         threads(1)
+        add_plugins(settings.plugins, "generate")
         self.settings = settings
-        self._kept: Any = settings.recipe.maker()
+        self._made: Any = settings.recipe.maker()
         self._picture = LatestPicture(Path(settings.folder))
         self._compared = False
 
     @property
     def _maker(self) -> Any:
-        if self._kept is None:
-            self._kept = self.settings.recipe.maker()
-        return self._kept
+        if self._made is None:
+            self._made = self.settings.recipe.maker()
+        return self._made
 
     def close(self) -> None:
         """Let go of the scenes."""
-        kept, self._kept = self._kept, None
-        if kept is not None:
-            kept.close()
+        made, self._made = self._made, None
+        if made is not None:
+            made.close()
 
     def measure(self, indices: range, told: Told) -> Measured:
         """Check the recipe, and make samples until one can be made. Raises what is wrong with the recipe, SceneError
@@ -79,7 +86,7 @@ class ShardMaker:
         """
         check = getattr(self.settings.recipe, "check", None)
         if check is not None:
-            check()
+            check(self._maker)
         reason = ""
         for index in indices:
             reason = told.begin(-1, index) or ""
@@ -111,7 +118,7 @@ class ShardMaker:
             self._compared = True
         plan = Plan(settings.n, described["per_shard"])
         indices, failed = plan.indices(shard), 0
-        path = Path(settings.folder) / plan.name(shard)
+        path = Path(settings.folder) / shard_file_name(shard)
         header = shard_header(settings, described, shard)
         with ShardWriter(
             path, len(indices), header, store=settings.store, compression=settings.compression
@@ -143,6 +150,8 @@ class ShardMaker:
                     raise TorchTransientError(f"the maker was asked for sample {index} and made {found.index}.")
             except Exception as error:  # noqa: BLE001  one sample that fails must not end the night
                 reason = reason_of(error)
+                if attempt == 0:
+                    told.traced(shard, index, traced(error))
                 # What it may have left behind in kept scenes must not decide about other samples.
                 with contextlib.suppress(Exception):
                     self.close()
@@ -179,9 +188,9 @@ def reason_of(error: BaseException) -> str:
     return text if len(text) <= MOST_CHARACTERS else f"{text[: MOST_CHARACTERS - 3]}..."
 
 
-def fatal(error: BaseException) -> tuple[str, str]:
-    """An error as plain texts, since not all errors pickle: name of its class, message."""
-    return type(error).__name__, str(error)
+def fatal(error: BaseException) -> tuple[str, str, str]:
+    """An error as plain texts, since not all errors pickle: name of its class, message, files and lines."""
+    return type(error).__name__, str(error), traced(error)
 
 
 def raised(kind: str, message: str) -> Exception:

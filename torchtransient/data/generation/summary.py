@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.data.generation.settings import RECIPE_FILE, read_description
+from torchtransient.data.generation.settings import read_description
 from torchtransient.data.recipes.contact_sheet import sheet_of
 from torchtransient.data.recipes.sample import Sample
+from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.data.storage.manifest import shards_of
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
@@ -46,9 +47,10 @@ def summary(folder: str | Path) -> str:
     lines += [f"  values: {', '.join(keys)}"] if keys else []
     lines += [f"  stored: {header.get('store')}, {header.get('compression')}"]
     lines += [f"  {_axis(about['axis'])}"] if about.get("axis") else []
+    lines += [f"  {_frequencies(about['frequencies'])}"] if about.get("frequencies") else []
     spp, error = about.get("spp"), header.get("standard_error")
     lines += [f"  {spp} samples per pixel" + (f", standard error {error:.3g}" if error else "")] if spp else []
-    lines += [f"  {line}" for line in about.get("plan", [])]
+    lines += [f"  {line}" for line in _plan(about.get("plan", []))]
     lines += ["  made with " + ", ".join(f"{k} {v}" for k, v in about.get("versions", {}).items())]
     return "\n".join(lines)
 
@@ -79,6 +81,18 @@ def _samples(owners: dict[int, Shard], drawn: list[int]) -> Iterator[Sample]:
 
 def _array(name: str, array: Any) -> str:
     return f"{name}: {' x '.join(map(str, array.shape))} {array.dtype}"
+
+
+def _plan(plan: Any) -> list[str]:
+    """Lines; of several scenes those of each under its name."""
+    if not isinstance(plan, dict):
+        return list(plan)
+    return [f"{name}: {line}" for name, lines in plan.items() for line in lines]
+
+
+def _frequencies(told: dict[str, Any]) -> str:
+    numbers = told["per_metre"]
+    return f"{len(numbers)} frequencies, {min(numbers):g} to {max(numbers):g} cycles per metre"
 
 
 def _axis(axis: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import pickle
 import signal
 import time
 from collections.abc import Iterator
@@ -25,7 +26,7 @@ class LocalWorker(Member):
         super().__init__()
         context = multiprocessing.get_context("spawn")
         self.link, theirs = context.Pipe()
-        self.process = context.Process(target=work, args=(theirs, settings), daemon=True)
+        self.process = context.Process(target=work, args=(theirs, pickle.dumps(settings)), daemon=True)
         # The child inherits this: Ctrl-C at a terminal reaches it before it can say that it does not want any.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

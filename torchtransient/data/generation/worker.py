@@ -11,24 +11,25 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
-from torchtransient.data.generation.settings import Settings
 from torchtransient.data.generation.shard_making import ShardMaker, fatal
+from torchtransient.data.generation.telling import Telling
+from torchtransient.data.generation.told_errors import unpacked
 
 # A render that is under way is waited for so long when the supervisor is gone.
 LAST_SECONDS = 10.0
 _GONE = 3
 
 
-def work(link: Connection, settings: Settings) -> None:
-    """The whole life of a worker. Messages: see the functions of :class:`Telling`."""
+def work(link: Connection, packed: bytes) -> None:
+    """The whole life of a worker, with its pickled settings. Messages: see the functions of :class:`Telling`."""
     # Ctrl-C reaches the whole group; the supervisor has the last word.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     signal.signal(signal.SIGTERM, _end)
     _end_with_supervisor()
-    telling = Telling(link)
+    telling = Telling(link.send)
     try:
-        maker = ShardMaker(settings)
+        maker = ShardMaker(unpacked(packed, "generate"))
         telling.say("ready")
         while True:
             task = link.recv()
@@ -55,37 +56,6 @@ def _carry_out(task: tuple[Any, ...], maker: ShardMaker, telling: Telling) -> No
     else:
         shard, described, telling.skip, first = rest
         telling.say("wrote", shard, *maker.make(shard, described, telling, first))
-
-
-class Telling:
-    """Says to the supervisor what becomes of samples."""
-
-    def __init__(self, link: Connection) -> None:
-        self._link = link
-        self.skip: dict[int, str] = {}
-
-    def say(self, *message: Any) -> None:
-        """One message."""
-        self._link.send(message)
-
-    def begin(self, shard: int, index: int) -> str | None:
-        """See :class:`Told`."""
-        if index in self.skip:
-            return self.skip[index]
-        self.say("begin", shard, index)
-        return None
-
-    def end(self, shard: int, index: int, failed: str | None) -> None:
-        """See :class:`Told`."""
-        self.say("end", shard, index, failed)
-
-    def retry(self, shard: int, index: int, reason: str) -> None:
-        """See :class:`Told`."""
-        self.say("retry", shard, index, reason)
-
-    def closing(self, shard: int) -> None:
-        """See :class:`Told`."""
-        self.say("closing", shard)
 
 
 def _end(*_: Any) -> NoReturn:

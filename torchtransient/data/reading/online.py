@@ -6,14 +6,13 @@ import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from torchtransient.data.reading.online_producers import WHAT, Producers
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.errors import ShapeError, TorchTransientError, UnitError
-from torchtransient.quantities import shown
+from torchtransient.quantities import count, shown
 
 
 class OnlineDataset(IterableDataset[dict[str, Any]]):
@@ -56,8 +55,12 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         *, first: int = 0, transform: Callable[[torch.Tensor], Any] | None = None, timeout_s: float = 600.0,
     ) -> None:  # fmt: skip
         super().__init__()
-        capacity, workers = _whole("capacity", capacity, 2), _whole("workers", workers, 1)
-        warm, first, seed = _whole("warm", warm, 1), _whole("first", first, 0), _whole("seed", seed, 0)
+
+        def whole(name: str, value: Any, least: int = 1) -> int:
+            return count(f"{WHAT}: {name}", value, least, UnitError)
+
+        capacity, workers, warm = whole("capacity", capacity, 2), whole("workers", workers), whole("warm", warm)
+        first, seed = whole("first", first, 0), whole("seed", seed, 0)
         for name, value in (("uses", uses), ("timeout_s", timeout_s)):
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
                 raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
@@ -125,9 +128,3 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         raise TorchTransientError(
             f"{WHAT}: processes and shared memory cannot be pickled; make one in each process, or use num_workers=0."
         )
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise UnitError(f"{WHAT}: expected {name} as a whole number of at least {least}, got {shown(value)}.")
-    return int(value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import threading
@@ -21,8 +22,10 @@ import numpy as np
 import torch
 import torch.multiprocessing  # teaches connections to hand over shared tensors
 
+from torchtransient.data.generation.told_errors import ToldError
 from torchtransient.data.reading.online_schedule import Schedule
 from torchtransient.data.reading.online_worker import Layout, empty_ring, produce, said
+from torchtransient.data.recipes.plugin_modules import plugins_here
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning
 from torchtransient.render.physics import level_of_user
 
@@ -52,19 +55,13 @@ class _EndedError(Exception):
     """A producer is gone without having said why."""
 
 
-class _ToldError(Exception):
-    """What a producer has raised, as it printed it there: the cause of the error that the trainer sees."""
-
-    def __str__(self) -> str:
-        return f"\n{self.args[0]}"
-
-
 class Producers:
     """What producers say is heard when a sample is drawn. A lock keeps threads apart."""
 
     def __init__(self, recipe: Any, schedule: Schedule, capacity: int, workers: int, timeout_s: float) -> None:
         self.schedule, self.waited_s = schedule, 0.0
-        self._recipe, self._capacity, self._count, self._timeout_s = recipe, capacity, workers, timeout_s
+        self._packed = pickle.dumps((recipe, plugins_here()))
+        self._capacity, self._count, self._timeout_s = capacity, workers, timeout_s
         self._pid, self._lock = os.getpid(), threading.Lock()
         self._workers: list[_Worker] = []
         self._ring: dict[str, torch.Tensor] = {}
@@ -85,7 +82,7 @@ class Producers:
     def _started(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        process = context.Process(target=produce, args=(there, self._recipe), name=WHAT, daemon=True)
+        process = context.Process(target=produce, args=(there, self._packed), name=WHAT, daemon=True)
         try:
             with _interrupts_held_back():
                 process.start()
@@ -106,18 +103,23 @@ class Producers:
                 self._listen(0.0)
                 if not self.schedule.can_draw():
                     self._wait()
-                slot = self.schedule.draw()
+                sample = self._copy(self.schedule.draw())
+                # Not before it is copied: its place may be the oldest, which the next order goes to.
                 self._give_orders()
             except BaseException as error:
                 # An interrupt too: it may have cut a message in two.
                 self._failure = error if isinstance(error, Exception) else None
                 self.close()
                 raise
-            index, values = self._beside[slot]
-            sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
-            sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
-            sample["index"] = index
             return sample
+
+    def _copy(self, slot: int) -> dict[str, Any]:
+        """What stands at a place of the ring, as the caller's own."""
+        index, values = self._beside[slot]
+        sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
+        sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
+        sample["index"] = index
+        return sample
 
     def _check(self) -> None:
         if os.getpid() != self._pid:
@@ -265,8 +267,8 @@ def _own_tensor(value: Any) -> torch.Tensor:
 def _raise(error: BaseException | None, text: str) -> NoReturn:
     """The exception of a producer, with what was printed of it there."""
     if isinstance(error, Exception):
-        raise error from _ToldError(text)
-    raise TorchTransientError(f"{WHAT}: a producer failed: {text.strip().splitlines()[-1]}") from _ToldError(text)
+        raise error from ToldError(text)
+    raise TorchTransientError(f"{WHAT}: a producer failed: {text.strip().splitlines()[-1]}") from ToldError(text)
 
 
 def _end(workers: list[_Worker]) -> None:

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient.data.generation.told_errors import unpacked
+from torchtransient.data.recipes.plugin_modules import add_plugins
 from torchtransient.errors import ShapeError, TorchTransientError
 
 Layout = dict[str, tuple[tuple[int, ...], str]]
@@ -26,13 +28,15 @@ class _NobodyListensError(Exception):
     pass
 
 
-def produce(connection: Connection, recipe: Any) -> None:
-    """The body of the process."""
+def produce(connection: Connection, packed: bytes) -> None:
+    """The body of the process. ``packed``: a recipe and plugin modules, pickled."""
     # Ctrl-C reaches the whole group of processes; the trainer ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     maker = None
     try:
+        recipe, plugins = unpacked(packed, "OnlineDataset")
         _one_thread()
+        add_plugins(plugins, "OnlineDataset")
         maker = recipe.maker()
         line = _Line(connection)
         line.say("ready")

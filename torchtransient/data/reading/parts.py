@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchtransient.axes import TimeAxis
@@ -13,8 +13,6 @@ from torchtransient.quantities import as_number, shown
 _WHAT = "data set"
 # Borders that differ from a bin's by less, in bins, are that bin's.
 _SAME_EDGE = 1e-6
-# In this order, an array tells how large the image is.
-_IMAGES = ("transient", "phasor", "gated", "steady", "depth", "normals", "shape", "measurement")
 
 
 def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
@@ -67,9 +65,12 @@ def cut_axis(axis: TimeAxis | None, bins: slice | None) -> TimeAxis | None:
     return TimeAxis(axis.start_opl + bins.start * axis.bin_width_opl, axis.bin_width_opl, bins.stop - bins.start)
 
 
-def image_size(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """Rows and columns of the images of samples, by the shapes of their arrays."""
-    return next((shapes[name][-2:] for name in _IMAGES if len(shapes.get(name, ())) >= 2), ())
+def image_size(shapes: Mapping[str, tuple[int, ...]], measured: Sequence[str]) -> tuple[int, ...]:
+    """Rows and columns of the images of samples, by the shapes of their arrays: of the steady image and labels, which
+    are images in any case, else of what was ``measured``, in that order.
+    """
+    order = ["steady", *(name for name in shapes if name not in measured), *measured]
+    return next((shapes[name][-2:] for name in order if len(shapes.get(name, ())) >= 2), ())
 
 
 def pixels_of(pixels: Any, size: tuple[int, ...]) -> tuple[slice, slice] | None:

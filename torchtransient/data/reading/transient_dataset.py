@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
+from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import tensor_in
@@ -21,8 +22,6 @@ from torchtransient.quantities import shown
 
 _MEASURED = "measurement"
 _VALUES, _INDEX, _TRANSIENT = "values", "index", "transient"
-# On the time axis of the film, if they have as many bins.
-_TIMED = (_TRANSIENT, _MEASURED)
 
 
 class TransientDataset(Dataset[dict[str, Any]]):
@@ -55,7 +54,9 @@ class TransientDataset(Dataset[dict[str, Any]]):
         whole = axis_of(self.about)
         self._bins = bins_of(window, whole)
         self.axis: TimeAxis | None = cut_axis(whole, self._bins)
-        self._size = image_size(shapes)
+        # What was measured is on the time axis of the film, if it has as many bins.
+        self._timed = measured_names(self.about)
+        self._size = image_size(shapes, self._timed)
         self._pixels = pixels_of(pixels, self._size)
         self.transform, self.as_stored, self.seed = transform, bool(as_stored), seed
         self._fields = self._read_fields(fields, shapes)
@@ -132,7 +133,7 @@ class TransientDataset(Dataset[dict[str, Any]]):
 
     def _read(self, shard: Shard, name: str, row: int) -> Tensor:
         shape = self._table.arrays[name]
-        bins = self._bins if name in _TIMED and self._table.time_axes[name] is not None else None
+        bins = self._bins if name in self._timed and self._table.time_axes[name] is not None else None
         pixels = self._pixels if shape[-2:] == self._size else None
         array = shard.read(name, row, bins, pixels, as_stored=self.as_stored)
         return torch.from_numpy(array) if array.dtype.isnative else tensor_in(array)

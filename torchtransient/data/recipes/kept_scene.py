@@ -23,6 +23,7 @@ from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
 from torchtransient.errors import GradientError, SceneError, ShapeError, TorchTransientError
 from torchtransient.files.scan_data import scan_data
+from torchtransient.plugins import versions_of_others
 from torchtransient.quantities import shown
 from torchtransient.render.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.render.output import RenderOutput
@@ -349,8 +350,9 @@ def _is_polarized(chain: Compose) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that decide about the numbers."""
-    return {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
+    """Of the packages that decide about the numbers, and of plugins that others have added."""
+    found = {name: metadata.version(name) for name in ("torchtransient", "mitsuba", "drjit", "torch", "numpy")}
+    return found | versions_of_others()
 
 
 def _outside(out: RenderOutput) -> tuple[float, float]:

@@ -48,6 +48,9 @@ class Recipe(Specification):
     be made in any order, anywhere, and another key leaves the others' draws as they were. ``parameters`` fill the
     $names of an XML scene. ``n``: how many samples a data set has unless :func:`generate` is told otherwise.
 
+    ``plugins``: names of modules with Mitsuba plugins of one's own, which are added
+    (:func:`torchtransient.plugins.register_module`) wherever the recipe is made, read or unpickled.
+
     What is wrong with a recipe is said before anything is rendered: by :meth:`check`, which :func:`generate` and
     :meth:`preview` call first. Raises SceneError, ShapeError, UnitError. Not supported: gradients, and samples of
     different shapes.

@@ -43,7 +43,7 @@ FORMAT = "torchtransient recipe 1"
 # Entries that are the constructor's arguments as they are.
 _PLAIN = (
     "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "variant",
-    "seed", "n",
+    "seed", "n", "plugins",
 )  # fmt: skip
 _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
@@ -82,6 +82,8 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
         "seed": recipe.seed,
         "n": recipe.n,
     }
+    if recipe.plugins:
+        found["plugins"] = list(recipe.plugins)
     # Of JSON: no tuples, and nothing that is not plain.
     try:
         plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))

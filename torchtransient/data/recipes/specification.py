@@ -16,6 +16,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.data.recipes.distribution import Distribution, Place
 from torchtransient.data.recipes.distributions import Choice, pick
+from torchtransient.data.recipes.plugin_modules import check_plugins
 from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import Scenes, Structure
 from torchtransient.data.recipes.written import read_distribution
@@ -82,7 +83,10 @@ class Specification:
         seed: int = 0,
         parameters: Mapping[str, Any] | None = None,
         n: int | None = None,
+        plugins: Sequence[str] = (),
     ) -> None:
+        # Before the scene is looked at.
+        self.plugins = check_plugins(plugins)
         labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
         if physics not in ("ignore", "error"):
             raise SceneError(f"recipe: physics: expected 'ignore' or 'error', got {physics!r}.")
@@ -116,6 +120,10 @@ class Specification:
         self.scenes = Scenes(scene, self.variant, scan, parameters)
         self._vary = {str(key): read_distribution(f"recipe: {key!r}", given) for key, given in (vary or {}).items()}
         self._check_settings()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        check_plugins(self.plugins)
 
     def _check_settings(self) -> None:
         if self.scan is not None and self.settings.time_axis is None and self.settings.frequencies is None:

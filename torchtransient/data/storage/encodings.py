@@ -6,6 +6,7 @@ of its noise. ``rounded`` keeps 10 bits of the mantissa: an error of at most 2^-
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,21 @@ from torchtransient.errors import StorageError
 from torchtransient.quantities import shown
 
 STORES = ("exact", "rounded", "counts")
-# What may lose digits. Labels, and the steady image, which is small, never do.
-ROUNDED = ("transient", "phasor", "gated", "measurement")
+# What sensors make of a transient; of it alone there are counts.
 COUNTED = "measurement"
+# What films measure, where a header does not say it.
+_FILMS = ("transient", "phasor", "gated")
 MANTISSA_BITS = 10
 ENCODINGS = ("exact", "rounded", "counts")  # of one array
 _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)
+
+
+def measured_names(about: Any) -> tuple[str, ...]:
+    """Arrays that were measured, by what a header says about the render: what its film measures, under whatever name,
+    and measurements of sensors. Others are labels, and the steady image.
+    """
+    told = about.get("measures") if isinstance(about, Mapping) else None
+    return (*((told,) if isinstance(told, str) else _FILMS), COUNTED)
 
 
 def check_store(store: Any, what: str) -> str:
@@ -84,11 +94,13 @@ def counts_of(array: NDArray[Any], what: str) -> NDArray[Any]:
     return found
 
 
-def encoding_of(name: str, dtype: np.dtype[Any], store: str) -> str:
-    """How the array of a name is stored: "exact", "rounded" or "counts"."""
+def encoding_of(name: str, dtype: np.dtype[Any], store: str, measured: Sequence[str]) -> str:
+    """How the array of a name is stored: "exact", "rounded" or "counts". Only what was ``measured`` may lose digits:
+    labels, and the steady image, which is small, never do.
+    """
     if store == "counts" and name == COUNTED:
         return "counts"
-    return "rounded" if store == "rounded" and name in ROUNDED and dtype.kind in "fc" else "exact"
+    return "rounded" if store == "rounded" and name in measured and dtype.kind in "fc" else "exact"
 
 
 def encoded(array: NDArray[Any], encoding: str, what: str) -> NDArray[Any]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchtransient.data.storage.file_names import MANIFEST_FILE, RECIPE_FILE, SHARD_FILES, shard_file_name
 from torchtransient.data.storage.part_files import sweep_parts as sweep_parts
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.data.storage.shard_file import Shard, stored_checksum
@@ -21,8 +22,6 @@ from torchtransient.quantities import shown
 from torchtransient.render.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
-MANIFEST, RECIPE = "manifest.json", "recipe.json"
-_PATTERN = "shard-*.h5"
 _WHAT = "data set"
 
 
@@ -45,7 +44,7 @@ class Verified:
     @property
     def damaged(self) -> tuple[str, ...]:
         """Names of the shards with faults, which have to be made again."""
-        return tuple(name for name in self.faults if name != MANIFEST)
+        return tuple(name for name in self.faults if name != MANIFEST_FILE)
 
     @property
     def complete(self) -> bool:
@@ -65,7 +64,7 @@ def shards_of(folder: str | Path) -> list[Path]:
     place = path_of(folder, _WHAT)
     if not place.is_dir():
         raise StorageError(f"{_WHAT}: expected the folder of a data set, got '{place}'.")
-    return sorted(path for path in place.glob(_PATTERN) if path.is_file())
+    return sorted(path for path in place.glob(SHARD_FILES) if path.is_file())
 
 
 def build_manifest(folder: str | Path) -> dict[str, Any]:
@@ -76,9 +75,9 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     """
     paths = shards_of(folder)
     if not paths:
-        raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({_PATTERN}).")
+        raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({SHARD_FILES}).")
     entries = [_Entry.read(path) for path in paths]
-    faults = _faults_between(entries, None)
+    faults = _faults_between(entries, {})
     if faults:
         name, said = next(iter(faults.items()))
         raise StorageError(f"{_WHAT}: '{folder}': {name}: {said[0]}. Use verify, which tells of every shard.")
@@ -88,9 +87,10 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
 def verify(folder: str | Path, progress: bool = False) -> Verified:
     """Read every byte of a data set and compare it with its checksums; make the manifest of the sound shards again.
 
-    Found are shards that are damaged, that stand under the name of another one, of another recipe or doubled samples,
-    a manifest that differs from the shards, and samples that are missing: of those that ``recipe.json`` counts, without
-    it of those between the first and the last one. ``progress``: a bar. Raises StorageError for what is no folder.
+    Found are shards that are damaged, that stand under the name of another one, of another recipe, other versions of
+    packages or plugins, with other arrays or values, or doubled samples, a manifest that differs from the shards, and
+    samples that are missing: of those that ``recipe.json`` counts, without it of those between the first and the last
+    one. ``progress``: a bar. Raises StorageError for what is no folder.
     """
     paths = shards_of(folder)
     expected = _expected(Path(folder))
@@ -103,14 +103,14 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
             faults[path.name] = [str(error)]
             continue
         entries.append(entry)
-    between = _faults_between(entries, expected.get("key"))
+    between = _faults_between(entries, expected)
     sound = [entry for entry in entries if entry.name not in between]
     faults |= between
-    before = _text_of(Path(folder) / MANIFEST)
+    before = _text_of(Path(folder) / MANIFEST_FILE)
     if sound:
         _write(Path(folder), sound)
-        if before is not None and before != _text_of(Path(folder) / MANIFEST):
-            faults[MANIFEST] = ["did not tell what the shards hold; it was made again"]
+        if before is not None and before != _text_of(Path(folder) / MANIFEST_FILE):
+            faults[MANIFEST_FILE] = ["did not tell what the shards hold; it was made again"]
     have = {number for entry in sound for number in (*entry.index, *entry.failed)}
     n = expected.get("n")
     missing = sorted(set(range(n if isinstance(n, int) else max(have, default=-1) + 1)) - have)
@@ -165,26 +165,30 @@ def _kind(shard: Shard, name: str) -> dict[str, Any]:
     return {"shape": list(shard.shape(name)), "dtype": shard.dtype(name), "encoding": shard.encoding(name)}
 
 
-def _faults_between(entries: Sequence[_Entry], key: Any) -> dict[str, list[str]]:
-    """What is wrong with shards beside each other, by name: of another recipe than `key`, or than most of them."""
+def _faults_between(entries: Sequence[_Entry], expected: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What is wrong with shards beside each other, by name: not as ``recipe.json`` says, or, without it, as the others:
+    of another recipe, rendered by other code, with other arrays.
+    """
     faults: dict[str, list[str]] = {}
+    key = expected.get("key")
     if key is None and entries:
         key = Counter(json.dumps(entry.key) for entry in entries).most_common(1)[0][0]
         key = json.loads(key)
-    kind: dict[str, Any] | None = None
+    kinds = {"about": expected["about"]} if "about" in expected else {}
     owners: dict[int, str] = {}
     for entry in entries:
         said = []
         if entry.key != key:
             said.append(f"belongs to another recipe (key {shown(entry.key)}, expected {shown(key)})")
         number = entry.header.get("shard")
-        if isinstance(number, int) and entry.name != f"shard-{number:06d}.h5":
+        if isinstance(number, int) and entry.name != shard_file_name(number):
             said.append(f"is shard {number} under another name")
         if not said:
-            same = {k: v for k, v in entry.about.items() if k in ("store", "compression")}
-            kind = kind or same
-            if kind != same:
-                said.append(f"is stored otherwise than the shards before: {same}, they {kind}")
+            kind = _must_be_alike(entry)
+            other = [name for name in kind if name in kinds and kinds[name] != kind[name]]
+            said += [_difference(name, kinds[name], kind[name]) for name in other]
+            if not said:
+                kinds = kind | kinds
             doubled = [i for i in (*entry.index, *entry.failed) if owners.setdefault(i, entry.name) != entry.name]
             if doubled:
                 said.append(f"holds the samples {ranges_text(doubled)}, which {owners[doubled[0]]} holds too")
@@ -193,13 +197,26 @@ def _faults_between(entries: Sequence[_Entry], key: Any) -> dict[str, list[str]]
     return faults
 
 
+def _must_be_alike(entry: _Entry) -> dict[str, Any]:
+    """What a shard has in common with all of its data set; one whose samples all failed has no arrays."""
+    told = {"about": entry.header.get("about"), **entry.about}
+    return told if entry.index else {name: told[name] for name in ("about", "store", "compression")}
+
+
+def _difference(name: str, expected: Any, found: Any) -> str:
+    while isinstance(expected, dict) and isinstance(found, dict):
+        part = next(k for k in sorted({*expected, *found}, key=str) if expected.get(k) != found.get(k))
+        name, expected, found = f"{name}: {part}", expected.get(part), found.get(part)
+    return f"differs from the data set in {name}: {shown(found)}, expected {shown(expected)}"
+
+
 def _expected(folder: Path) -> dict[str, Any]:
     """What ``recipe.json`` says, nothing where it is missing or no such file."""
-    text = _text_of(folder / RECIPE)
+    text = _text_of(folder / RECIPE_FILE)
     try:
         found = json.loads(text) if text is not None else {}
     except ValueError:
-        raise StorageError(f"{_WHAT}: '{folder / RECIPE}' is no JSON: it was cut or changed.") from None
+        raise StorageError(f"{_WHAT}: '{folder / RECIPE_FILE}' is no JSON: it was cut or changed.") from None
     return found if isinstance(found, dict) else {}
 
 
@@ -209,7 +226,7 @@ def _expected(folder: Path) -> dict[str, Any]:
 def _write(folder: Path, entries: Sequence[_Entry]) -> dict[str, Any]:
     manifest = _manifest(entries)
     text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
-    target = folder / MANIFEST
+    target = folder / MANIFEST_FILE
     if text != _text_of(target):
         with whole_file(target, _WHAT) as unfinished, writing_said(target, _WHAT):
             unfinished.write_text(text, encoding="utf-8")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,21 +19,30 @@ _SUFFIX = ".part"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
+def check_system(what: str) -> None:
+    """Raise StorageError where files can be neither locked nor replaced while they are open."""
+    if platform.system() == "Windows":
+        raise StorageError(f"{what}: data sets are generated and written on Linux and macOS, this is Windows.")
+
+
 @contextmanager
-def whole_file(target: Path, what: str) -> Iterator[Path]:
+def whole_file(target: Path, what: str, *, over: bool = True) -> Iterator[Path]:
     """A locked neighbour of `target`, on the disk and in its place when the block has succeeded, removed when it
     failed.
 
+    ``over``: in place of one that is there; otherwise, that one stays.
+
     The file and its folder are synchronized: what is in its place survives a loss of power. Raises StorageError for a
-    disk that is full or closed to us; errors of the block stay what they are.
+    disk that is full or closed to us and on Windows; errors of the block stay what they are.
     """
+    check_system(what)
     with writing_said(target, what):
         unfinished, lock = _locked(target)
     try:
         yield unfinished
         with writing_said(target, what):
             os.fsync(lock)
-            unfinished.replace(target)
+            _put(unfinished, target, over)
             _sync_folder(target.parent)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -67,6 +77,21 @@ def sweep_parts(folder: str | Path) -> list[Path]:
         finally:
             os.close(descriptor)
     return removed
+
+
+def _put(unfinished: Path, target: Path, over: bool) -> None:
+    if not over:
+        try:
+            os.link(unfinished, target)
+        except FileExistsError:
+            return
+        except OSError:
+            # Disks without hard links.
+            if target.exists():
+                return
+        else:
+            return
+    unfinished.replace(target)
 
 
 def _locked(target: Path) -> tuple[Path, int]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import operator
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -21,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.data.storage.chunks import LIBVER, Compressor, check_compression
-from torchtransient.data.storage.encodings import check_store, encoded, encoding_of
+from torchtransient.data.storage.encodings import check_store, encoded, encoding_of, measured_names
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import check_folder, path_of
 from torchtransient.files.hdf5_writing import new_hdf5
-from torchtransient.quantities import shown
+from torchtransient.quantities import count, shown
 
 FORMAT = "torchtransient shard 1"
 WHAT = "shard"
@@ -56,8 +55,9 @@ class ShardWriter:
     """A shard that is written as its samples come, in any order of rows, and takes its place when the block ends.
 
     ``rows``: how many samples it has, those that fail included. ``header``: plain data, JSON. ``store``: "exact",
-    "rounded" (10 bits of mantissa for what was measured, labels as they are) or "counts" (``measurement`` as whole
-    numbers, everything else as it is). ``compression``: "blosc2", "gzip" or "none".
+    "rounded" (10 bits of mantissa for what was measured, which ``header["about"]["measures"]`` names, labels as they
+    are) or "counts" (``measurement`` as whole numbers, everything else as it is). ``compression``: "blosc2", "gzip" or
+    "none".
 
     Compressed samples are kept in memory until the block ends. Where the block raises, or was killed, nothing appears.
     Raises StorageError for arguments that cannot be used, a folder that is missing, a full disk, samples that are
@@ -75,7 +75,7 @@ class ShardWriter:
         self.path = path_of(path, WHAT)
         check_folder(self.path, WHAT)
         self.store, self.compression = check_store(store, WHAT), check_compression(compression, WHAT)
-        self.rows = _whole(rows, "rows", 1)
+        self.rows = count(f"{WHAT}: rows", rows, 1, StorageError)
         self._header = json.loads(_json(dict(header), "header"))
         self._samples: dict[int, _Row] = {}
         self._failed: dict[int, tuple[int, str]] = {}
@@ -116,8 +116,10 @@ class ShardWriter:
                     f"{WHAT}: store='counts' is for the measurement of a sensor, and the samples have "
                     f"{', '.join(arrays)}. Give the recipe a sensing chain, or store='rounded'."
                 )
+            measured = measured_names(self._header.get("about"))
             for name, array in arrays.items():
-                self._arrays[name] = _Column(name, array, self.store, self.compression)
+                encoding = encoding_of(name, array.dtype, self.store, measured)
+                self._arrays[name] = _Column(array, name, encoding, self.compression)
             self._values = kinds
         what = f"{WHAT}: sample {sample.index}"
         _check_same("arrays", list(self._arrays), list(arrays), what)
@@ -138,7 +140,7 @@ class ShardWriter:
         self._failed[self._free(row)] = (int(index), str(reason))
 
     def _free(self, row: int) -> int:
-        row = _whole(row, "row", 0)
+        row = count(f"{WHAT}: row", row, 0, StorageError)
         if row >= self.rows:
             raise StorageError(f"{WHAT}: expected a row below {self.rows}, got {row}.")
         if row in self._samples or row in self._failed:
@@ -206,10 +208,9 @@ class _Row:
 class _Column:
     """One array of all samples, as compressed chunks by row."""
 
-    def __init__(self, name: str, first: NDArray[Any], store: str, compression: str) -> None:
+    def __init__(self, first: NDArray[Any], name: str, encoding: str, compression: str) -> None:
         self.name, self.shape, self.dtype = name, first.shape, first.dtype
-        self.encoding = encoding_of(name, first.dtype, store)
-        self.compression = compression
+        self.encoding, self.compression = encoding, compression
         self.rows: dict[int, tuple[np.dtype[Any], list[bytes]]] = {}
         self._compressors: dict[np.dtype[Any], Compressor] = {}
 
@@ -292,16 +293,6 @@ def _check_same(what: str, expected: list[str], found: list[str], where: str) ->
 def _kinds_text(kinds: Mapping[str, Any]) -> str:
     each = (f"{key} {'text' if kind is None else f'{kind[1]} {kind[0]}'}" for key, kind in kinds.items())
     return ", ".join(each) or "none"
-
-
-def _whole(value: Any, name: str, least: int) -> int:
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = least - 1
-    if number < least:
-        raise StorageError(f"{WHAT}: expected {name} as a whole number from {least} on, got {shown(value)}.")
-    return number
 
 
 def _json(value: Any, what: str) -> str:

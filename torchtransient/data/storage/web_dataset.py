@@ -7,7 +7,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.storage.encodings import COUNTED, ROUNDED
+from torchtransient.data.storage.encodings import COUNTED, measured_names
 from torchtransient.data.storage.part_files import whole_file, writing_said
 from torchtransient.errors import StorageError
 from torchtransient.files.array_file import check_source, damage_said, path_of
@@ -50,7 +50,7 @@ def export_web_dataset(
     numbers = iter(with_bar(range(len(data)), "export", progress))
     _write_about(place / "about.json", data)
     written: list[Path] = []
-    left = len(data)
+    left, measured = len(data), measured_names(data.about)
     while left:
         target = place / f"samples-{len(written):06d}.tar"
         with (
@@ -59,7 +59,7 @@ def export_web_dataset(
             tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
             while left and tar.offset < limit:
-                _add(tar, data[next(numbers)], compressor)
+                _add(tar, data[next(numbers)], compressor, measured)
                 left -= 1
         written.append(target)
     next(numbers, None)  # which ends the bar
@@ -113,7 +113,7 @@ def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[d
 # ------------------------------------------------------------------------------------------------------------- members
 
 
-def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any) -> None:
+def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any, measured: Sequence[str]) -> None:
     key = f"{sample['index']:08d}"
     values = {name: v if isinstance(v, str) else np.asarray(v) for name, v in sample.get("values", {}).items()}
     plain = {
@@ -129,7 +129,7 @@ def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any) -> No
             raise StorageError(f"{_WHAT}: expected '{name}' as a tensor, under a name without points.")
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(sample[name].numpy()), version=(1, 0))
-        packed = name in ROUNDED
+        packed = name in measured
         content = compressor.compress(buffer.getbuffer()) if packed else buffer.getvalue()
         _member(tar, f"{key}.{name}{_PACKED if packed else _NPY}", content)
 
