@@ -22,6 +22,7 @@ from torchtransient.errors import SceneError, StorageError, TorchTransientError
 MOST_CHARACTERS = 500
 # Of a sample that is refused.
 _OUTSIDE = "max_outside="
+_FOLDERS = re.compile(r"(?<![\w.])(?:/[^/\s'\":,;()]+)+/(?=[^/\s])")
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
 
 
@@ -182,9 +183,11 @@ class ShardMaker:
 
 
 def reason_of(error: BaseException) -> str:
-    """One line that says why, the same one in every run: without addresses in memory."""
+    """One line that says why, the same one in every run and place: without addresses in memory, and of files in other
+    folders their names alone.
+    """
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    text = _ADDRESS.sub("0x...", text)
+    text = _FOLDERS.sub("", _ADDRESS.sub("0x...", text))
     return text if len(text) <= MOST_CHARACTERS else f"{text[: MOST_CHARACTERS - 3]}..."
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchtransient.data.generation.settings import read_description
-from torchtransient.data.recipes.contact_sheet import sheet_of
+from torchtransient.data.recipes.contact_sheet import behind_time, sheet_of
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.storage.file_names import RECIPE_FILE
 from torchtransient.data.storage.manifest import shards_of
@@ -65,8 +65,8 @@ def drawn_sheet(folder: str | Path, path: str | Path, count: int, seed: int) -> 
         numbers = sorted(owners)
         chosen = np.random.default_rng(seed).choice(len(numbers), min(count, len(numbers)), replace=False)
         drawn = sorted(numbers[k] for k in chosen)
-        axis = shards[0].header.get("about", {}).get("axis")
-        sheet_of(_samples(owners, drawn), path, axis, str(folder))
+        about = shards[0].header.get("about", {})
+        sheet_of(_samples(owners, drawn), path, about.get("axis"), str(folder), behind_time(about))
     return drawn
 
 

@@ -14,7 +14,6 @@ from torchtransient.axes import TimeAxis
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.data.recipes.sample import Sample
 from torchtransient.data.recipes.specification import Specification
-from torchtransient.files.scan_data import scan_from_data
 from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
 from torchtransient.vis.tone_mapping import tone_map
@@ -50,8 +49,7 @@ def sheet_of(
 
 def behind_time(about: Mapping[str, Any]) -> int:
     """Dimensions of a transient behind its bins: rows and columns, or those of a scan."""
-    scan = about.get("scan")
-    return 2 if scan is None else len(scan_from_data(scan).shape)
+    return int(about.get("behind_time", 2))
 
 
 def cell_of(sample: Sample, behind: int = 2) -> Cell:

@@ -305,6 +305,7 @@ class Kept:
             "frequencies": written_frequencies(renderer.frequencies),
             "gates": None if renderer.gates is None else [written_shape(gate) for gate in renderer.gates],
             "channels": list(renderer._channels),
+            "behind_time": 2 if self.scan is None else len(self.scan.shape),
             "spp": renderer.spp or renderer._scene_spp,
             "variant": self.recipe.variant,
             "temporal_filter": renderer.effective_filter,

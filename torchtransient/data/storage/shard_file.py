@@ -102,7 +102,9 @@ class Shard:
             return self._time_axis(name)
 
     def _time_axis(self, name: str) -> int | None:
-        """Second, behind channels; third, behind the Stokes components, in polarized variants."""
+        """As it is said of what was measured; else second, behind channels, or third, behind the Stokes components, in
+        polarized variants.
+        """
         shape = tuple(self._dataset(name).shape[1:])
         about = self.header.get("about")
         about = about if isinstance(about, dict) else {}
@@ -110,6 +112,11 @@ class Shard:
         bins = axis.get("num_bins") if isinstance(axis, dict) else None
         if bins is None:
             return time_axis(shape)
+        behind = about.get("behind_time")
+        if isinstance(behind, int):
+            place = len(shape) - 1 - behind
+            measured = name in (about.get("measures"), "measurement")
+            return place if measured and place >= 1 and shape[place] == bins else None
         polarized = "polarized" in str(about.get("variant", "")) or len(shape) == 5
         places = (2, 1) if polarized else (1,)
         return next((place for place in places if len(shape) > place + 1 and shape[place] == bins), None)
