@@ -24,7 +24,8 @@ def scans(kind):
 
 
 def plate(scan, **settings):
-    hidden = {"plate": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])}}
+    facing_the_wall = tt.scenes.transforms.translate([0, 0, 0.8]) @ tt.scenes.transforms.rotate([0, 1, 0], 180)
+    hidden = {"plate": {"type": "rectangle", "to_world": facing_the_wall}}
     return D.Recipe(hidden, {}, scan=scan, variant=VARIANT, time_axis=tt.TimeAxis(0, 0.5, 8), spp=4, **settings)
 
 

@@ -310,7 +310,7 @@ def _check_choices(store: Any, compression: Any, engine: Any, address: Any, reci
     if lacking:
         raise SceneError(f"{_WHAT}: expected a recipe, with {lacking[0]}(), got {shown(recipe)}.")
     if store == "counts" and getattr(recipe, "device", ...) is None:
-        raise SceneError(f"{_WHAT}: store='counts' is for recipes with a device, whose measurement it stores; give one.")
+        raise SceneError(f"{_WHAT}: store='counts' stores the measurement of recipes with a device; give one.")
     try:
         pickle.dumps(recipe)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
