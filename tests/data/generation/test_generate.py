@@ -255,7 +255,8 @@ class Unpicklable(FakeRecipe):
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"), ({"n": None}, UnitError, "how many"),
+        ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"),
+        ({"n": None}, UnitError, "how many"),
         ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
         ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
