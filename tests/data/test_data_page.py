@@ -146,6 +146,7 @@ def test_online_and_exports(names, folder):
     assert capture.transient.shape == (1, bins, 4, 4) and capture.scan.kind == "confocal"
 
 
+@pytest.mark.slow
 def test_commands(names, folder, monkeypatch):
     """The data set of the first block is the one that the first command goes on with."""
     monkeypatch.chdir(folder)
@@ -203,7 +204,9 @@ def test_tables_are_those_of_the_code():
     named = {name for cell in re.findall(r"^\| (`.*?) \|", labels, re.M) for name in re.findall(r"`(\w+)`", cell)}
     assert named == {*LABELS, FIRST_RETURN}
     rows = re.findall(r"^\| `(\w+)\([^|]*\| `(\{[^`]*\})`", TEXT.split("## What varies")[1], re.M)
-    assert len(rows) >= len(Distribution.known) - 1
+    # Those of other tests are known too.
+    ours = [kind for kind in Distribution.known.values() if kind.__module__.startswith("torchtransient.")]
+    assert len(rows) >= len(ours) - 1
     import yaml
 
     for name, written in rows:
