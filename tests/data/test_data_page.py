@@ -145,6 +145,7 @@ def test_online_and_exports(names, folder):
     assert capture.transient.shape == (1, bins, 4, 4) and capture.scan.kind == "confocal"
 
 
+@pytest.mark.slow
 def test_commands(names, folder, monkeypatch):
     """The data set of the first block is the one that the first command goes on with."""
     monkeypatch.chdir(folder)

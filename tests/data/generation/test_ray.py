@@ -48,7 +48,7 @@ def actors():
     for place in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             # Ray writes the name of the class and of what it does into the title of the process.
-            if place.read_bytes().startswith(b"ray::Worker"):
+            if place.read_bytes().startswith(b"ray::ShardActor"):
                 found.append(int(place.parent.name))
         except OSError:
             continue

@@ -40,6 +40,7 @@ def test_cost(recipe):
     assert "built when new    small-box.type; 2 structures in 64 samples" in text and "1000 samples" in text
 
 
+@pytest.mark.slow
 def test_cost_is_that_of_workers(recipe, monkeypatch):
     """Which compute with one thread each."""
     used = set()
@@ -55,6 +56,7 @@ def test_cost_is_that_of_workers(recipe, monkeypatch):
         assert used == {(1, 1)} and tt.threads() == before
 
 
+@pytest.mark.slow
 def test_preview_is_a_picture(recipe, tmp_path):
     recipe.preview(4, tmp_path / "sheet.png")
     picture = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))

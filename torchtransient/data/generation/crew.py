@@ -48,15 +48,15 @@ class Member:
         raise NotImplementedError
 
 
-Worker = TypeVar("Worker", bound=Member)
+AnyMember = TypeVar("AnyMember", bound=Member)
 
 
-class Crew(ABC, Generic[Worker]):
+class Crew(ABC, Generic[AnyMember]):
     """Workers over the shards of a ledger. A context manager: on the way out no worker is left."""
 
     def __init__(self, settings: Settings, workers: int, ledger: Ledger, timeout_s: float | None) -> None:
         self.settings, self.wanted, self.ledger, self.timeout_s = settings, workers, ledger, timeout_s
-        self.workers: list[Worker] = []
+        self.workers: list[AnyMember] = []
         self._starts = 0
         self._slowest = 0.0
         self._looked = time.monotonic()
@@ -66,7 +66,7 @@ class Crew(ABC, Generic[Worker]):
     hint = ""
 
     @abstractmethod
-    def start(self) -> Worker:
+    def start(self) -> AnyMember:
         """A new worker."""
 
     @abstractmethod
@@ -112,7 +112,7 @@ class Crew(ABC, Generic[Worker]):
             self.look()
             self._end_hung()
 
-    def bury(self, worker: Worker, how: str, own_fault: bool, for_good: bool = False) -> None:
+    def bury(self, worker: AnyMember, how: str, own_fault: bool, for_good: bool = False) -> None:
         """A worker is gone. ``for_good``: the next one will not start either, if this one did not. Raises
         TorchTransientError where that has no end.
         """
@@ -141,7 +141,7 @@ class Crew(ABC, Generic[Worker]):
         """Seconds that a worker may take until it is ready."""
         return PATIENCE_S
 
-    def _limit(self, worker: Worker) -> float:
+    def _limit(self, worker: AnyMember) -> float:
         if worker.sample is None:
             return PATIENCE_S
         if self.timeout_s is not None:
@@ -150,43 +150,43 @@ class Crew(ABC, Generic[Worker]):
 
     # ---------------------------------------------------------------------------------------------- what workers say
 
-    def heard(self, worker: Worker, kind: str, *facts: Any) -> None:
+    def heard(self, worker: AnyMember, kind: str, *facts: Any) -> None:
         """A message of a worker. Raises the error that it says ends the run."""
         worker.heard = time.monotonic()
         getattr(self, f"_on_{kind}")(worker, *facts)
 
-    def _on_ready(self, worker: Worker) -> None:
+    def _on_ready(self, worker: AnyMember) -> None:
         worker.ready = True
         self._starts = 0
 
-    def _on_begin(self, worker: Worker, _shard: int, index: int) -> None:
+    def _on_begin(self, worker: AnyMember, _shard: int, index: int) -> None:
         worker.sample, worker.began = index, time.monotonic()
 
-    def _on_end(self, worker: Worker, shard: int, index: int, failed: str | None) -> None:
+    def _on_end(self, worker: AnyMember, shard: int, index: int, failed: str | None) -> None:
         if worker.sample == index and worker.warm:
             self._slowest = max(self._slowest, time.monotonic() - worker.began)
         worker.sample, worker.warm = None, True
         self.ledger.ended(shard, index, failed)
 
-    def _on_retry(self, worker: Worker, shard: int, index: int, reason: str) -> None:
+    def _on_retry(self, worker: AnyMember, shard: int, index: int, reason: str) -> None:
         # A fresh maker compiles again.
         worker.warm = False
         self.ledger.log("retry", shard=shard, sample=index, reason=reason)
 
-    def _on_closing(self, worker: Worker, _shard: int) -> None:
+    def _on_closing(self, worker: AnyMember, _shard: int) -> None:
         worker.sample = None
 
-    def _on_wrote(self, worker: Worker, shard: int, samples: int, failed: int, size: int) -> None:
+    def _on_wrote(self, worker: AnyMember, shard: int, samples: int, failed: int, size: int) -> None:
         worker.shard = worker.sample = None
         self.ledger.wrote(shard, samples, failed, size)
 
-    def _on_measured(self, worker: Worker, measured: Measured) -> None:
+    def _on_measured(self, worker: AnyMember, measured: Measured) -> None:
         worker.shard = worker.sample = None
         self._measured = measured
 
-    def _on_traced(self, _worker: Worker, shard: int, index: int, trace: str) -> None:
+    def _on_traced(self, _worker: AnyMember, shard: int, index: int, trace: str) -> None:
         self.ledger.log("traceback", shard=shard, sample=index, trace=trace)
 
-    def _on_fatal(self, worker: Worker, kind: str, message: str, trace: str) -> None:
+    def _on_fatal(self, worker: AnyMember, kind: str, message: str, trace: str) -> None:
         self.ledger.log("error", shard=worker.shard, sample=worker.sample, error=f"{kind}: {message}", trace=trace)
         raise raised(kind, message) from ToldError(trace)

@@ -36,7 +36,7 @@ class Board:
         return said
 
 
-class Worker:
+class ShardActor:
     """The actor. Messages are those of local workers."""
 
     def __init__(self, settings: Settings, board: Any, number: int) -> None:
@@ -124,7 +124,7 @@ class RayCrew(Crew[RayWorker]):
         self._count = 0
         restarts = {"max_restarts": -1, "max_task_retries": -1}
         self._board = self._ray.remote(num_cpus=0, **restarts)(Board).remote()
-        self._actor = self._ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(Worker)
+        self._actor = self._ray.remote(num_cpus=1, max_restarts=0, max_task_retries=0)(ShardActor)
         self._numbers: dict[int, RayWorker] = {}
 
     def _connect(self, address: str | None) -> None:
