@@ -186,8 +186,8 @@ def captured(table: Table, quick: bool, python: str | None, peers: int) -> None:
 
 def reading(table: Table, quick: bool, repeats: int) -> None:
     film = (4, 16, 1) if quick else (32, 1024, 16)
-    # Shards have slabs of 64 bins.
-    windows = {"of one slab": [4, 8] if quick else [448, 512], "of two slabs": [6, 10] if quick else [480, 544]}
+    # Shards have slabs of 32 bins.
+    windows = {"of two slabs": [4, 8] if quick else [448, 512], "of three slabs": [6, 10] if quick else [496, 560]}
     found = ask(do="reading", film=film, count=3 if quick else 24, repeats=repeats, windows=windows)
     per_mb = [value / found["megabytes"] for value in found["whole"]]
     table.add(f"{named(film)}: reading a MB of whole samples", per_mb, "ms", most=2.0)

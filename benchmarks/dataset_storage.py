@@ -27,7 +27,7 @@ from torchtransient.data.storage.manifest import verify
 from torchtransient.data.storage.shard_file import Shard, ShardWriter
 from torchtransient.data.storage.web_dataset import export_web_dataset, read_web_dataset
 
-WINDOW = slice(480, 544)
+WINDOW = slice(496, 560)
 PHOTONS = 500
 BARS = {"write": 4.0, "read": 2.0, "window": 0.2}
 

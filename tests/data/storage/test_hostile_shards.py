@@ -105,7 +105,7 @@ CHUNKS = {"chunks": (1, 1, 256, 16, 16), "fletcher32": True}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (replaced("arrays/transient", shape=(2, 1, 2**30, 2**10, 64), dtype="f4", chunks=(1, 1, 64, 256, 64)), "store"),
+        (replaced("arrays/transient", shape=(2, 1, 2**30, 2**10, 64), dtype="f4", chunks=(1, 1, 32, 512, 64)), "store"),
         (replaced("arrays/transient", shape=(2, 1, 256, 16, 16), dtype="f4", **CHUNKS), "expected 2 chunks"),
         (replaced("arrays/transient", shape=(2, 1, 256, 16, 16), dtype="f4"), "expected chunks of"),
         (replaced("arrays/transient", data=np.zeros((2, 1, 256, 16, 16)), **CHUNKS, compression="lzf"), "filters"),

@@ -24,7 +24,7 @@ from torchtransient.quantities import shown
 COMPRESSIONS = ("blosc2", "gzip", "none")
 # What HDF5 1.10 and later read.
 LIBVER = ("v110", "v110")
-_BINS = 64
+_BINS = 32
 _SMALL_BYTES = 2**18
 _LEAST_BYTES = 2**16
 _MOST_BYTES = 2**22
@@ -45,7 +45,7 @@ def check_compression(compression: Any, what: str) -> str:
 
 
 def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """How an array of one sample is cut, by its shape alone: small ones not at all, larger ones into slabs of 64 bins
+    """How an array of one sample is cut, by its shape alone: small ones not at all, larger ones into slabs of 32 bins
     or 64 KiB of float32, whichever is more, and slabs above 4 MiB into rows of the image.
     """
     cut = list(shape)
