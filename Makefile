@@ -34,14 +34,11 @@ demo: $(READY)
 doctor: $(READY)
 	$(BIN)/torchtransient doctor
 
-# Two processes: most tests compute with one thread or wait for a compiler. A file stays in one of them.
-PARALLEL ?= -n 2 --dist loadfile
-
 test: $(READY)
-	$(BIN)/python -m pytest -q $(PARALLEL)
+	$(BIN)/python -m pytest -q
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -q -m slow $(PARALLEL)
+	$(BIN)/python -m pytest -q -m slow
 
 # Goes on where an earlier run has stopped: remove build/gradient_sweep.jsonl to begin anew.
 sweep: $(READY)
