@@ -69,9 +69,11 @@ def theirs(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(place)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     mi.set_variant("llvm_ad_mono")
+    # Other tests have modules of their own.
+    others, _registry._state.third_party = _registry._state.third_party, []
     yield place / "their_paint_module.py"
     sys.modules.pop("their_paint_module", None)
-    _registry._state.third_party = []
+    _registry._state.third_party = others
     _registry._state.variant = None
 
 
