@@ -316,9 +316,10 @@ EVEN_COMPLEX = (losses.squared_loss, losses.measurement_consistency)
 LEVELS = (-1.0, float("nan"), float("inf"), True, "a", [1.0])
 WRONG_OPTIONS = {
     **dict.fromkeys(("floor", "background", "smoothing", "value_range", "creation_cost_opl"), LEVELS),
-    **dict.fromkeys(("bin_width_opl", "read_noise"), (*LEVELS, 0.0, None)),
+    "bin_width_opl": (*LEVELS, 0.0),
+    "read_noise": (*LEVELS, 0.0, None),
     **dict.fromkeys(("cycles", "periods", "window"), (0, -4, 2.5, float("nan"), True, "a", None)),
-    **dict.fromkeys(("phase_only", "isotropic", "shot_noise", "scale_invariant", "constant"), ("no", 1, None)),
+    **dict.fromkeys(("phase_only", "isotropic", "shot_noise", "scale_invariant", "constant", "per_root_count"), ("no", 1, None)),
     **dict.fromkeys(("axis", "frequencies"), (None, [1.0], FrequencyAxis((1e9,)))),
     **dict.fromkeys(("operator", "compare", "root"), (None, "a", 3)),
     "dead_bins": (-1.0, 0.0, 0.2, float("nan"), float("inf"), "a", True),
