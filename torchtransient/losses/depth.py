@@ -6,9 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.losses.comparison import Reduction, check_mask, check_pair, check_reduction, counted, reduce
+from torchtransient.losses.measured import DEPTH, DepthMap, reads
 
 
-def depth_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
+@reads(input=DEPTH, target=DEPTH)
+def depth_loss(
+    input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
+) -> Tensor:
     """`|input - target|` of each pixel of two depth maps (..., Y, X), in their unit (metres). Symmetric where finite.
 
     Pixels whose target is not finite (NaN or infinite: no surface there) do not count, nor those that `mask` leaves
@@ -31,5 +35,5 @@ class DepthLoss(nn.Module):
         check_reduction(reduction, "DepthLoss")
         self.reduction = reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: DepthMap, target: DepthMap, mask: Tensor | None = None) -> Tensor:
         return depth_loss(input, target, mask=mask, reduction=self.reduction)

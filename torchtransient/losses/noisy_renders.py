@@ -9,10 +9,12 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from torchtransient.losses.comparison import Reduction, check_mask, check_pair, check_reduction, counted, reduce
+from torchtransient.losses.measured import LIGHT, Light, reads
 
 
+@reads(first=LIGHT, second=LIGHT, target=LIGHT)
 def two_render_loss(
-    first: Tensor, second: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean"
+    first: Light, second: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """`Re[(first - target) conj(second - target)]` of each element, real or complex, any shape: a squared error.
 
@@ -39,5 +41,5 @@ class TwoRenderLoss(nn.Module):
         check_reduction(reduction, "TwoRenderLoss")
         self.reduction = reduction
 
-    def forward(self, first: Tensor, second: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, first: Light, second: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return two_render_loss(first, second, target, mask=mask, reduction=self.reduction)
