@@ -11,7 +11,7 @@ import pickle
 import pytest
 import torch
 
-from support.loss_cases import CASES, OTHERS
+from support.loss_cases import CASES, MESHES, OTHERS
 from torchtransient import FrequencyAxis, losses
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 
@@ -46,10 +46,10 @@ def test_every_loss_is_in_the_list():
     """Every function of the room is a case or one of the others, which reduce nothing; every module is a case."""
     functions = public(inspect.isfunction)
     reducing = {function for function in functions if "reduction" in inspect.signature(function).parameters}
-    assert reducing == {case.function for case in CASES}
+    assert reducing == {case.function for case in CASES} | set(MESHES)
     assert functions - reducing == set(OTHERS)
     modules = public(lambda thing: inspect.isclass(thing) and issubclass(thing, torch.nn.Module))
-    assert modules == {case.module for case in CASES}
+    assert modules == {case.module for case in CASES} | set(MESHES.values())
 
 
 @pytest.mark.parametrize("call", OTHERS.values(), ids=[function.__name__ for function in OTHERS])
@@ -325,6 +325,8 @@ WRONG_OPTIONS = {
     "frequencies": (None, [1.0], FrequencyAxis((1e9,))),
     **dict.fromkeys(("operator", "compare", "root"), (None, "a", 3)),
     "dead_bins": (-1.0, 0.0, 0.2, float("nan"), float("inf"), "a", True),
+    "balance": (-0.1, 1.1, float("nan"), True, "a", None),
+    "scales": (0, (), (0,), (1, 2.5), "ab", 3),
     "spacing": (1.0, (1.0, 2.0), (1.0, 0.0, 1.0), "abc"),
     "dim": (1.5, True, "time"),
     "reduction": ("median", None, True),

@@ -16,7 +16,7 @@ from torchtransient.errors import ShapeError, TorchTransientError, UnitError
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
     **dict.fromkeys((losses.phasor_loss,), "phasor"),
-    **dict.fromkeys((losses.depth_loss,), "depth_m"),
+    **dict.fromkeys((losses.depth_loss, losses.scale_invariant_depth_loss), "depth_m"),
     losses.ssim_loss: "steady",
     **dict.fromkeys((losses.projection_ssim_loss, losses.total_variation), "values"),
 }
