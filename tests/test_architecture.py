@@ -25,7 +25,7 @@ LEVEL = {
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "scenes": 2,
     "render": 3,
-    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
+    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip
