@@ -50,6 +50,11 @@ class Ranks:
         dist.all_reduce(total)
         return float(total) / self.size
 
+    def wait(self) -> None:
+        """Go on when all ranks have come here: after the first one has written what the others read."""
+        if self.size > 1:
+            dist.barrier()
+
 
 @contextmanager
 def ranks(
