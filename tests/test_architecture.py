@@ -26,7 +26,7 @@ LEVEL = {
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
     "render": 3,
-    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
+    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip

@@ -37,6 +37,7 @@ _LAZY = {
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
     "threads": "torchtransient.render.threads",
+    "training": "torchtransient.training",
     "vis": "torchtransient.vis",
 }
 

@@ -12,6 +12,7 @@ from torchtransient.data.augmentation.spatial_filter import spatial_filter as sp
 from torchtransient.data.generation.generate import Generated as Generated
 from torchtransient.data.generation.generate import generate as generate
 from torchtransient.data.reading.online import OnlineDataset as OnlineDataset
+from torchtransient.data.reading.recipe_dataset import RecipeDataset as RecipeDataset
 from torchtransient.data.reading.stream import TransientStream as TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset as TransientDataset
 from torchtransient.data.recipes.distribution import Distribution as Distribution
