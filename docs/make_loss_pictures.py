@@ -2,8 +2,8 @@
 picture, four minutes of one core; `--draws 8` a quick look.
 
 One pixel whose pulse is somewhere else: 200 photons in 1000 cycles of a detector without pile-up (of a SPAD with it,
-for the likelihood of first photons), over a background of 0.1 per bin, 256 bins of 2 cm. The model knows the background and
-the shape of the pulse, not its place, nor its light.
+for the likelihood of first photons), over a background of 0.1 per bin, 256 bins of 2 cm. The model knows the background
+and the shape of the pulse, not its place, nor its light.
 """
 
 from __future__ import annotations
