@@ -84,7 +84,10 @@ def first_photon_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`first_photon_nll(target, input, cycles)`: a model's rates per cycle and bin against a histogram of counts."""
+    """`first_photon_nll(target, input, cycles)`: a model's rates per cycle and bin against a histogram of counts.
+
+    Flat beyond the width of a pulse: from farther away take `multiscale_loss` of it (docs/losses.md).
+    """
     options = Options(floor, dim, mask, reduction)
     return _first_photon(target, input, cycles, dead_bins, options, "first_photon_loss")
 

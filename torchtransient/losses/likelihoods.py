@@ -152,7 +152,11 @@ def poisson_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts."""
+    """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts.
+
+    Biased where the mean is a Monte Carlo render, whose noise its logarithm turns into an error of the fit: take
+    `expected_root_loss`, or more samples at the end (docs/losses.md, Noisy renders).
+    """
     return _poisson(target, input, Options(floor, dim, mask, reduction), "poisson_loss")
 
 

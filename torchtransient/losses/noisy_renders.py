@@ -1,7 +1,7 @@
 """Losses of Monte Carlo renders: a loss that is not linear in a render is biased by the noise of that render.
 
 `E[f(render)] = f(E render) + f'' variance / 2 + ...`: a squared error grows by the variance, which the scene's
-parameters change, too. The product of the residuals of two independent renders does not (docs/noisy_renders.md).
+parameters change, too. The product of the residuals of two independent renders does not (docs/losses.md).
 """
 
 from __future__ import annotations
