@@ -40,6 +40,7 @@ SMALLER = {
     r"first=2000": lambda _: "first=6",
     r'"letters", 4': lambda _: '"letters", 2',
     r"num_workers=2": lambda _: "num_workers=1",
+    r"Crop\(\(24, 24\)\)": lambda _: "Crop((6, 6))",
 }
 
 
@@ -124,6 +125,16 @@ def test_what_is_read(names):
     assert names["stream"].num_samples == 6
     assert names["transient"].shape == (1, 64, 8, 8) and names["bins"]["num_bins"] == 160
     assert names["albedo"].shape == names["there"].shape == (1,) and names["there"].all()
+
+
+def test_augmented(names):
+    turned, plain = names["turned"], names["images"][0]
+    assert turned["transient"].shape == (1, 160, 6, 6) and set(turned) == set(plain)
+    assert torch.equal(names["augmented"][0]["depth"].nan_to_num(), turned["depth"].nan_to_num())
+    first, same = names["pair"][1], plain["depth"]
+    assert torch.equal(first, same) or torch.equal(first, same.flip(-1))
+    assert names["smooth"].shape == plain["transient"].shape
+    assert torch.equal(names["filtered"][0]["measurement"], names["smooth"])
 
 
 def test_measurements(names):
