@@ -165,7 +165,7 @@ def train(options: argparse.Namespace, sizes: Sizes, ranks: tt.training.Ranks, s
         kept = tt.training.load_checkpoint(path, parts, random=False)
         losses = kept.values["losses"]
     wrapped = DistributedDataParallel(model) if ranks.size > 1 else model
-    left, loader = range(batches.step, sizes.steps), DataLoader(learnt_from, batch_sampler=batches)
+    left, loader = range(batches.step, sizes.steps), batches.loader(learnt_from)
     bar = tqdm(zip(left, loader, strict=False), f"train_ddp {seed}", len(left), disable=not ranks.is_first)
     for step, batch in bar:
         seen = measured(batch, seeds, step)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 
 import pytest
+import torch
 from torch.utils.data import DataLoader
 
 from torchtransient.errors import StorageError, UnitError
-from torchtransient.training import Batches
+from torchtransient.training import Batches, worker_init
 
 
 def first(batches, count):
@@ -37,7 +38,7 @@ def test_goes_on_where_it_was_stopped(workers):
     data = [float(n) for n in range(10)]
 
     def read(batches, count):
-        loader = DataLoader(data, batch_sampler=batches, num_workers=workers)
+        loader = batches.loader(data, workers=workers)
         return [batch.tolist() for batch in itertools.islice(loader, count)]
 
     expected = read(Batches(10, 4), 7)
@@ -58,6 +59,21 @@ def test_a_state_of_another_order():
             other.load_state_dict(state)
     with pytest.raises(StorageError, match="expected the order"):
         Batches(10, 4).load_state_dict({})
+
+
+def test_its_loader_leaves_random_numbers_alone():
+    batches = Batches(3, 1)
+    before = torch.get_rng_state()
+    first = next(iter(batches.loader([1.0, 2.0, 3.0])))
+    assert torch.equal(torch.get_rng_state(), before)
+    # Another one of torch's does not, which is why it is there.
+    assert next(iter(DataLoader([1.0, 2.0, 3.0], batch_sampler=batches))) == first
+    assert not torch.equal(torch.get_rng_state(), before)
+    apart = batches.loader([1.0, 2.0, 3.0], workers=1, renders=True)
+    assert apart.multiprocessing_context.get_start_method() == "spawn"
+    assert (apart.worker_init_fn, apart.persistent_workers) == (worker_init, True)
+    with pytest.raises(UnitError, match="of 3 samples, the data set has 2"):
+        batches.loader([1.0, 2.0])
 
 
 @pytest.mark.parametrize(

@@ -6,17 +6,19 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from torch.utils.data import Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from torchtransient.errors import StorageError, UnitError
 from torchtransient.quantities import count, flag
+from torchtransient.training.processes import worker_init
 
 _WHAT = "Batches"
 
 
 class Batches(Sampler[list[int]]):
-    """Numbers of the samples of every step, without an end: ``DataLoader(data, batch_sampler=Batches(...))``.
+    """Numbers of the samples of every step, without an end; :meth:`loader` reads them.
 
     Samples come in an order that is shuffled anew in every epoch; a batch may begin in one epoch and end in the next,
     so that all batches have one size and no sample is left out. ``batch_size`` is that of all ranks together: at each
@@ -28,7 +30,7 @@ class Batches(Sampler[list[int]]):
 
         batches = tt.training.Batches(len(data), 32, seed=0, rank=ranks.rank, world_size=ranks.size)
         batches.step = first
-        for step, batch in zip(range(first, last), DataLoader(data, batch_sampler=batches, num_workers=2)):
+        for step, batch in zip(range(first, last), batches.loader(data)):
             ...
 
     ``size``: samples of the data set, which is map-style. ``shuffle=False``: in their order. ``step`` may be set at any
@@ -68,6 +70,23 @@ class Batches(Sampler[list[int]]):
         number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
         first = number * self.batch_size + self.rank * part
         return [self._sample(n) for n in range(first, first + part)]
+
+    def loader(self, data: Dataset[Any], *, workers: int = 0, renders: bool = False, **options: Any) -> DataLoader[Any]:
+        """A DataLoader of these batches, which takes nothing from torch's own generator: an iterator of others draws
+        from it, so that a run that is resumed would have other random numbers than one that was not.
+
+        ``workers``: processes that read. ``renders``: whether the data set renders; they are spawned then, and have one
+        thread each (:func:`worker_init`). What they draw from their own generators begins anew with each iterator: give
+        noise a seed of its own, as ``TransientDataset(seed=)`` does. ``options``: others of the DataLoader.
+        """
+        size = len(data) if hasattr(data, "__len__") else self.size
+        if size != self.size:
+            raise UnitError(f"{_WHAT}: they are of {self.size} samples, the data set has {size}.")
+        apart: dict[str, Any] = {}
+        if workers and renders:
+            apart = {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
+        generator = torch.Generator().manual_seed(self.seed)
+        return DataLoader(data, batch_sampler=self, num_workers=workers, generator=generator, **{**apart, **options})
 
     def epoch(self, step: int) -> float:
         """How many times the data set has been gone through when a step begins."""
