@@ -40,9 +40,10 @@ def _syntax_once(f=None, **options):
 
 dr.syntax = _syntax_once
 
-# Processes that run tests side by side share the cores: threads that wait for work do so by spinning.
-if _workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) - 1:
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // (_workers + 1)))
+# Processes that run tests side by side share the cores: threads that wait for work do so by spinning. Not one alone:
+# Mitsuba 3.9 waits for ever for the second one when it writes an OpenEXR file.
+if (_workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) > 1:
+    dr.set_thread_count(max(2, (os.cpu_count() or 1) // _workers))
 
 
 def pytest_collection_finish(session):
@@ -66,10 +67,11 @@ def _variant_of_module(request):
 @pytest.fixture(autouse=True, scope="module")
 def _no_earlier_modules(request):
     """Scenes of an earlier module that wait for the collector are compiled into the kernels of this one, and what is
-    attached in them stops its forward mode.
+    attached in them stops its forward mode. What is alive now belongs to no test, and no collection looks at it again.
     """
     if {"mi", "VARIANT"} & set(vars(request.module)):
         gc.collect()
+        gc.freeze()
 
 
 @pytest.fixture
