@@ -34,11 +34,15 @@ demo: $(READY)
 doctor: $(READY)
 	$(BIN)/torchtransient doctor
 
+# As many processes as there are cores, up to four: most tests compute with one thread or wait for a compiler. A file
+# stays in one of them. Compiled sources are kept: modules of plugins are executed anew at every change of the variant.
+PARALLEL ?= -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q $(PARALLEL)
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -q -m slow
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m slow $(PARALLEL)
 
 # Goes on where an earlier run has stopped: remove build/gradient_sweep.jsonl to begin anew.
 sweep: $(READY)

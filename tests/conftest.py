@@ -8,7 +8,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import torchtransient as torchtransient  # isort: skip
 
 import gc
+import types
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 import torch
@@ -17,6 +19,31 @@ from torchtransient import plugins
 
 # Tensors of tests are small: a second thread is no faster, and where the cores are busy all wait for it (five-fold).
 torch.set_num_threads(1)
+
+_syntax, _transformed = dr.syntax, {}
+
+
+def _syntax_once(f=None, **options):
+    """``dr.syntax``, which reads and rewrites the source of a function, once for each function: at every change of the
+    variant Mitsuba's integrators and the plugins are executed anew, and two thirds of the time went there.
+    """
+    if f is None:
+        return lambda g: _syntax_once(g, **options)
+    # Equal code objects have the same names, numbers and lines.
+    key = (f.__code__, f.__code__.co_filename, *sorted(options.items()))
+    if key not in _transformed:
+        _transformed[key] = _syntax(f, **options).__code__
+    found = types.FunctionType(_transformed[key], f.__globals__)
+    found.__defaults__ = f.__defaults__
+    return found
+
+
+dr.syntax = _syntax_once
+
+# Processes that run tests side by side share the cores: threads that wait for work do so by spinning. Not one alone:
+# Mitsuba 3.9 waits for ever for the second one when it writes an OpenEXR file.
+if (_workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))) > 1:
+    dr.set_thread_count(max(2, (os.cpu_count() or 1) // _workers))
 
 
 def pytest_collection_finish(session):
@@ -37,15 +64,18 @@ def _variant_of_module(request):
     _activate(request.module)
 
 
-@pytest.fixture(scope="module")
-def _no_earlier_modules():
-    """Before the fixtures of a module are made: what is alive now belongs to no test."""
-    gc.collect()
-    gc.freeze()
+@pytest.fixture(autouse=True, scope="module")
+def _no_earlier_modules(request):
+    """Scenes of an earlier module that wait for the collector are compiled into the kernels of this one, and what is
+    attached in them stops its forward mode. What is alive now belongs to no test, and no collection looks at it again.
+    """
+    if {"mi", "VARIANT"} & set(vars(request.module)):
+        gc.collect()
+        gc.freeze()
 
 
 @pytest.fixture
-def no_leftovers(_no_earlier_modules):
+def no_leftovers():
     """Kernels are those of the test's own objects: a method call is compiled for all that are alive, and what an
     earlier test left to the collector would be freed between two renders.
     """

@@ -70,10 +70,10 @@ def test_stratified_samples_do_better(report):
 def test_the_error_is_the_variance_of_the_renderer():
     renderer = wall_renderer(temporal_filter="tent").variation(sampler="independent")
     runs = (
-        torch.stack([renderer(seed=1000 + k, spp=16).transient.detach() for k in range(200)]).numpy().astype(np.float64)
+        torch.stack([renderer(seed=1000 + k, spp=16).transient.detach() for k in range(80)]).numpy().astype(np.float64)
     )
     expected = runs.var(axis=0, ddof=1).mean()
-    report = tt.cost_of_accuracy(renderer, spp=(16,), repeats=200, samplers=("independent",), progress=False)
+    report = tt.cost_of_accuracy(renderer, spp=(16,), repeats=80, samplers=("independent",), progress=False)
     (point,) = report.points
     assert (
         abs(point.squared_error / expected - 1)
@@ -87,7 +87,7 @@ def test_gradients_against_a_reference():
         spp=(16, 64),
         gradients=[ALBEDO],
         reference_spp=4096,
-        repeats=20,
+        repeats=12,
         samplers=("independent",),
         progress=False,
     )

@@ -6,6 +6,7 @@ import pytest
 
 import torchtransient.plugins.around_corner.launches as launches
 from support.hidden_shapes import mannequin, mesh, scene_of, wall_grid
+from support.marks import long
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError, ShapeError, VariantError
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -122,7 +123,7 @@ def test_legs_are_path_length(body):
     assert moved < 0.01 * cubes[0].sum()
 
 
-@pytest.mark.parametrize("vertex_normals", [False, True])
+@pytest.mark.parametrize("vertex_normals", long([False, True], [True]))
 def test_colours(vertex_normals):
     """Every channel of a single and a confocal capture is one of its own albedo and energy."""
 

@@ -75,6 +75,7 @@ def names(folder):
     return found
 
 
+@pytest.mark.slow
 def test_a_network_was_trained(names, folder):
     assert np.isfinite(names["loss"].item())
     assert names["light"].shape == (2, 160, 8, 8) and names["depth"].shape == (2, 1, 8, 8)
@@ -82,6 +83,7 @@ def test_a_network_was_trained(names, folder):
     assert found.complete and found.samples == 6 and not found.failed
 
 
+@pytest.mark.slow
 def test_the_file_is_the_recipe(names):
     recipe, same = names["recipe"], names["same"]
     for index in range(2):
@@ -94,6 +96,7 @@ def test_the_file_is_the_recipe(names):
     assert np.allclose(stored["values"]["large-box.to_world"], recipe.draw(0)["large-box.to_world"])
 
 
+@pytest.mark.slow
 def test_recipes_are_written_and_read(names, folder):
     assert tt.data.Recipe.read(folder / "written.yaml") == names["recipe"]
     letters = tt.data.Recipe.read(folder / "letters.yaml")
@@ -103,6 +106,7 @@ def test_recipes_are_written_and_read(names, folder):
     assert letters.settings.time_axis == wide
 
 
+@pytest.mark.slow
 def test_costs_and_pictures(names, folder):
     shown = re.search(r"```text\n(.*?)```", TEXT, flags=re.DOTALL)[1]
     # The same lines, with other numbers.
@@ -112,6 +116,7 @@ def test_costs_and_pictures(names, folder):
     assert f"and at {SAMPLES} samples" in TEXT
 
 
+@pytest.mark.slow
 def test_what_is_read(names):
     rooms = names["rooms"]
     assert len(rooms) == 6 and set(names["item"]) == {"transient", "steady", "depth", "values", "index"}
@@ -127,6 +132,7 @@ def test_what_is_read(names):
     assert names["albedo"].shape == names["there"].shape == (1,) and names["there"].all()
 
 
+@pytest.mark.slow
 def test_augmented(names):
     turned, plain = names["turned"], names["images"][0]
     assert turned["transient"].shape == (1, 160, 6, 6) and set(turned) == set(plain)
@@ -137,6 +143,7 @@ def test_augmented(names):
     assert torch.equal(names["filtered"][0]["measurement"], names["smooth"])
 
 
+@pytest.mark.slow
 def test_measurements(names):
     counts = names["counts"]
     assert counts.shape == (1, 160, 8, 8) and np.array_equal(counts, np.round(counts)) and counts.max() > 0
@@ -147,6 +154,7 @@ def test_measurements(names):
     assert set(names["fixed"][0]) == {"depth", "measurement", "index"}
 
 
+@pytest.mark.slow
 def test_online_and_exports(names, folder):
     assert names["online"].drawn >= 12 and names["batch"]["index"].min() >= 6
     assert [path.name for path in names["tars"]] == ["samples-000000.tar"]
@@ -178,6 +186,7 @@ def test_commands(names, folder, monkeypatch):
         assert said in command.commands
 
 
+@pytest.mark.slow
 def test_files_of_a_folder(names, folder):
     table = TEXT.split("## What the folder holds")[1].split("A shard is")[0]
     rows = set(re.findall(r"^\| `([\w.-]+)`[,| ]", table, re.M))
@@ -187,6 +196,7 @@ def test_files_of_a_folder(names, folder):
     assert {"recipe", "key", "n", "per_shard", "store", "compression", "max_outside", "about"} <= set(described)
 
 
+@pytest.mark.slow
 def test_the_table_of_a_shard_is_a_shard(names, folder):
     """Every data set that a file has is in the table, as the table says."""
     import h5py

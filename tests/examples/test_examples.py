@@ -109,6 +109,7 @@ def test_staircase_with_a_floor_in_place_of_the_house(tmp_path: Path, capsys: py
         assert (tmp_path / "pictures" / f"staircase_{name}.png").stat().st_size > 5_000
 
 
+@pytest.mark.slow
 def test_bottle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mi.set_variant("llvm_ad_rgb")
     module = example("bottle")

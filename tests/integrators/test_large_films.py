@@ -40,12 +40,12 @@ def test_direct_sums_lose_nothing(scene, monkeypatch):
     """The transient of lanes that add each by itself is that of lanes that add together, and sums to the image."""
     film = scene.sensors()[0].film()
     assert film.reduce_mode(dr.zeros(mi.Float, SIZE * SIZE * BINS * 3), False, True) == dr.ReduceMode.Direct
-    steady, direct = (np.array(t, dtype=np.float64) for t in scene.integrator().render(scene, seed=1, spp=64))
+    steady, direct = (np.array(t, dtype=np.float64) for t in scene.integrator().render(scene, seed=1, spp=16))
     inside = direct.sum()
     outside = (film.energy_before + film.energy_after) * film.channel_count()
     np.testing.assert_allclose(inside + outside, steady.sum(), rtol=1e-5)
     monkeypatch.setattr(type(film), "knows_crowds", False)
-    together = np.array(scene.integrator().render(scene, seed=1, spp=64)[1], dtype=np.float64)
+    together = np.array(scene.integrator().render(scene, seed=1, spp=16)[1], dtype=np.float64)
     np.testing.assert_allclose(direct, together, rtol=1e-4, atol=1e-6 * together.max())
 
 

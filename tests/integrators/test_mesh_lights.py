@@ -9,6 +9,7 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.cases_curves import file_of
 from support.gradient_cases.scenes import camera, room, transform
+from support.marks import long
 
 VARIANT = "llvm_ad_mono"
 # Normals that stand 45 degrees off those of the faces.
@@ -38,7 +39,7 @@ def lit_by_mesh(face_normals, integrator="transient_path"):
     return scene
 
 
-@pytest.mark.parametrize("integrator", ["transient_path", "transient_prbvolpath"])
+@pytest.mark.parametrize("integrator", long(["transient_path", "transient_prbvolpath"], ["transient_path"]))
 def test_brightness_does_not_depend_on_the_normals(integrator):
     """Its radiance is the same in all directions that the normals do not turn away."""
     found = []

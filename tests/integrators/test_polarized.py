@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient._collection import no_collection
 from torchtransient.testing.statistics import two_sample_z_test
 
@@ -82,7 +83,7 @@ def stokes_of(scene, seed):
     return image[..., :1] if mi.is_monochromatic else image
 
 
-@pytest.mark.parametrize("variant", [VARIANT, "llvm_ad_spectral_polarized"])
+@pytest.mark.parametrize("variant", long([VARIANT, "llvm_ad_spectral_polarized"], [VARIANT]))
 def test_the_sum_over_time_is_mitsubas_stokes_image(variant):
     mi.set_variant(variant)
     scene, reference = ours(everything()), mitsubas(everything())

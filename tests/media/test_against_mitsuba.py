@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from support.media_scenes import block, camera, clouds, homogeneous, load, rgb, volume
 from support.runs import T, runs, steady_runs
 from torchtransient.errors import GradientError, SceneError
@@ -38,7 +39,10 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
+QUICK = ["coloured grid", "grid of albedo", "blended phase", "grid in rough glass", "wall inside"]
+
+
+@pytest.mark.parametrize("name", long(CASES, QUICK))
 def test_steady_sum(name):
     objects = CASES[name]()
     if "diff_" in str(objects):
@@ -83,7 +87,7 @@ def test_sensor_inside_a_medium():
     assert expected.mean() < 0.8 * clear, "the fog must matter"
 
 
-@pytest.mark.parametrize("hide_emitters", [False, True])
+@pytest.mark.parametrize("hide_emitters", long([False, True], [True]))
 def test_hidden_emitters(hide_emitters):
     objects = block(clouds())
     objects["lamp"]["to_world"] = T().translate([0, 0.3, 1.5]).rotate([1, 0, 0], 180).scale(0.5)
@@ -98,7 +102,7 @@ def test_hidden_emitters(hide_emitters):
     assert result.passed, str(result)
 
 
-@pytest.mark.parametrize("max_depth", [1, 2, 3])
+@pytest.mark.parametrize("max_depth", long([1, 2, 3], [1, 3]))
 def test_depth_counts_real_events(max_depth):
     objects = block(homogeneous(1.0, 0.8))
     steady, _ = runs(load(objects, max_depth=max_depth))

@@ -5,6 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb, volume
 from support.runs import T, runs
 from torchtransient.plugins.transport.derivative.wanted import Wanted
@@ -164,7 +165,7 @@ def test_single_scattering(angle):
     assert result.entries > 15 and result.chi2_z < 4
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb"])
+@pytest.mark.parametrize("variant", long(["llvm_ad_mono", "llvm_ad_rgb"], ["llvm_ad_rgb"]))
 def test_furnace(variant):
     """A medium that absorbs nothing cannot be seen before a sky of one radiance. Without connections to the sky every
     single path says so, since colours share their samples in proportion to what they carry.

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient.nlos import Capture, Scan, Wall
 
 VARIANT = "llvm_ad_mono"
 
 
-@pytest.mark.parametrize("kind", ["single", "confocal", "exhaustive"])
+@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["exhaustive"]))
 def test_simulated_captures(tmp_path, kind):
     scan = Scan.grid(Wall.plane(1.0, 1.0), (3, 2), kind=kind, first_and_last_leg=True)
     axis = tt.TimeAxis(1.0, 0.05, 60)

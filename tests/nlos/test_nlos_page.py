@@ -66,6 +66,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_every_block_runs(folder):
     """In one session from top to bottom."""
     names: dict[str, object] = {}
@@ -94,6 +95,7 @@ def test_the_file_holds_all_light_of_its_things(folder):
     assert setup["sensor"].name == "mpd_spad_like"
 
 
+@pytest.mark.slow
 def test_the_commands_are_what_python_does(folder):
     """Sixteen parts and the seed's noise."""
     for line in blocks("sh")[0].splitlines():

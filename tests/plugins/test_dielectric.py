@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.marks import long
 from torchtransient.testing.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
 
 LANES = 4000
@@ -115,7 +116,7 @@ def compare(ours, theirs, ctx, power_alone=False):
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized", "scalar_rgb"]
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"]))
 def test_smooth_equals_mitsuba(variant):
     activate(variant)
     for material, ctx in product(MATERIALS, contexts()):
@@ -124,7 +125,7 @@ def test_smooth_equals_mitsuba(variant):
         )
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", long(VARIANTS, ["llvm_ad_mono_polarized", "scalar_rgb"]))
 def test_rough_equals_mitsuba(variant):
     activate(variant)
     for (material, roughness), ctx in product(zip(MATERIALS, ROUGHNESSES, strict=True), contexts()):
@@ -281,7 +282,7 @@ def test_rough_eval_and_pdf_are_attached(ggx, alphas):
     assert checked == 10
 
 
-@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("side", long([1, -1], [-1]))
 def test_detached_estimator_of_a_rough_lobe(side):
     """What the integrator does: mean of ``weight * relative_grad(pdf) * g(wo)`` over detached samples.
 

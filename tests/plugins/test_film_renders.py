@@ -163,7 +163,7 @@ def test_adjoint_of_every_layout(monkeypatch, what):
     assert abs(loss) > 0.1
 
 
-@pytest.mark.parametrize("lanes, spp", [(54 * 24, 64), (54 * 7, 64), (20, 8)])
+@pytest.mark.parametrize("lanes, spp", [(54 * 24, 64), (54 * 7, 64), pytest.param(20, 8, marks=pytest.mark.slow)])
 def test_many_passes(monkeypatch, lanes, spp):
     full, transient = runs(glowing_wall(film()))
     monkeypatch.setattr(LANES, lanes)

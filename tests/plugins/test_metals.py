@@ -13,6 +13,7 @@ import pytest
 import torchtransient as tt
 from support.gradient_cases.cases_metals import slanted
 from support.gradient_cases.scenes import mirror_room, room
+from support.marks import long_pairs
 from support.surface_samples import activate, directions, interaction
 from torchtransient.errors import GradientError
 from torchtransient.plugins.mitsuba_compat import METALS, loses_slope_of_metal
@@ -43,15 +44,17 @@ ROUGH_METALS = [
 ]
 
 
-LONG = pytest.param("llvm_ad_spectral_polarized", marks=pytest.mark.slow)
+# Of Mueller matrices, which take long to compile, one metal alone is in the default set.
+CHOICES = [(MONO, slice(6)), ("llvm_ad_rgb", slice(6)), ("llvm_ad_spectral", slice(6)), (POLARIZED, slice(1, 2))]
+LONG = [(POLARIZED, slice(2, 4)), ("llvm_ad_spectral_polarized", slice(1, 4))]
 
 
-@pytest.mark.parametrize("variant", [MONO, "llvm_ad_rgb", "llvm_ad_spectral", POLARIZED, LONG])
-def test_rough_metal_equals_mitsubas(variant):
+@pytest.mark.parametrize(("variant", "chosen"), CHOICES + [pytest.param(*c, marks=pytest.mark.slow) for c in LONG])
+def test_rough_metal_equals_mitsubas(variant, chosen):
     activate(variant)
     si, wo = interaction(directions(1, LANES, -0.2)), directions(2, LANES, -0.2)
     u = mi.Point2f(*np.random.default_rng(3).random((2, LANES)).astype(np.float32))
-    for metal in ROUGH_METALS[1:4] if mi.is_polarized else ROUGH_METALS:
+    for metal in ROUGH_METALS[chosen]:
         ours, theirs = (mi.load_dict({"type": name, **metal}) for name in ("diff_rough_conductor", "roughconductor"))
         assert list(mi.traverse(ours).keys()) == list(mi.traverse(theirs).keys())
         assert (ours.flags(), ours.component_count()) == (theirs.flags(), theirs.component_count())
@@ -152,9 +155,13 @@ def test_where_mitsubas_metals_lose_their_slopes(variant, plugin):
         assert not loses_slope_of_metal(slot, (0.2, 0.5), (1.0, 3.0))
 
 
-@pytest.mark.parametrize(("slot", "index"), [("eta", (0.0, 2.0)), ("k", (0.4, 0.0))])
-@pytest.mark.parametrize("plugin", METALS.values())
-def test_a_described_metal_is_built_anew(plugin, slot, index):
+OF_SLOTS = {"eta": (0.0, 2.0), "k": (0.4, 0.0)}
+QUICK = [("conductor", "eta"), ("roughconductor", "k")]
+
+
+@pytest.mark.parametrize(("plugin", "slot"), long_pairs(METALS.values(), OF_SLOTS, QUICK))
+def test_a_described_metal_is_built_anew(plugin, slot):
+    index = OF_SLOTS[slot]
     bsdf = {"type": plugin, "eta": number(index[0]), "k": number(index[1])}
     activate(MONO)
     scene = tt.load(slanted(bsdf) if slot == "k" else mirror_room(bsdf), variant=MONO)

@@ -10,6 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
+from support.marks import long_pairs
 from support.surface_samples import activate, start
 from torchtransient.errors import GradientError
 
@@ -88,8 +89,12 @@ def test_polarized_plastic_is_that_of_mitsuba(settings, variant):
         np.testing.assert_allclose(np.array(other), np.array(one), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic"])
+QUICK = [
+    ("plastic", "specular_reflectance"), ("pplastic", "specular_reflectance"), ("roughplastic", "diffuse_reflectance")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "lobe"), long_pairs(["plastic", "roughplastic", "pplastic"], LOBES, QUICK))
 def test_a_black_lobe_has_its_slope(kind, lobe):
     scene = scene_with(kind, **black(lobe))
     key = f"wall.bsdf.{lobe}.value"

@@ -10,6 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, camera, glass_slab, room
+from support.marks import long
 from support.surface_samples import start
 from torchtransient.errors import GradientError
 
@@ -183,7 +184,7 @@ def arrival(image):
     return float((light * torch.arange(len(light))).sum() / light.sum())
 
 
-@pytest.mark.parametrize("around", ["nothing", "mask", "twosided"])
+@pytest.mark.parametrize("around", long(["nothing", "mask", "twosided"], ["twosided"]))
 def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     """Light behind the surface counts with its index, although the description lacks the lobe."""
 
@@ -208,7 +209,10 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     assert arrival(found.detach()) == pytest.approx(arrival(expected), rel=1e-4)
 
 
-@pytest.mark.parametrize("between", ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"])
+BETWEEN = ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"]
+
+
+@pytest.mark.parametrize("between", long(BETWEEN, ["normalmap", "reference"]))
 def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     """Mitsuba refuses transmission under ``twosided`` unless it is told that it is meant."""
     paint = {"type": "principled", "base_color": 0.6}

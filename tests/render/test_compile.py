@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 import torchtransient as tt
+from support.marks import long
 from support.sensing.all_entries import ENTRIES
 from torchtransient.testing.small_room import COLOUR
 from torchtransient.testing.small_room import VARIANT as VARIANT
@@ -59,7 +60,7 @@ def same(found, expected):
 BACKENDS = ["eager", "aot_eager"]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", long(BACKENDS, ["eager"]))
 def test_a_renderer(room_scene, backend):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     compiled = torch.compile(renderer, backend=backend)
@@ -80,7 +81,7 @@ def test_a_module_around_a_renderer(room_scene, backend):
     same(results(compiled, START, pipeline.code), results(pipeline, START, pipeline.code))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", long(BACKENDS, ["aot_eager"]))
 def test_the_function(room_scene, backend):
     def loss(x):
         return (tt.render(room_scene, {COLOUR: 2 * x}, spp=4, seed=0).steady * 3).square().sum()

@@ -128,7 +128,7 @@ NUMBERS = """
 """
 
 
-@pytest.mark.parametrize("freeze", [True, False])
+@pytest.mark.parametrize("freeze", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_numbers_are_the_same_whatever_the_count(freeze):
     """In a process of its own: memory that is sized for fewer threads than write to it ends the process."""
     done, launched = run(NUMBERS.format(freeze=freeze))
@@ -171,7 +171,13 @@ def test_drjit_computes_with_as_many_threads():
         found = []
         for n in (1, 3, 1, 2):
             tt.threads(n)
-            found.append((busy(), len(ticks())))
+            # Where other processes compute, too, a thread may come late: those that have worked in one of a few tries.
+            most = 0
+            for _ in range(8):
+                most = max(most, busy())
+                if most >= n:
+                    break
+            found.append((most, len(ticks())))
         others = found[0][1] - 1
         print(*[b for b, _ in found], *[total - others for _, total in found])
     """

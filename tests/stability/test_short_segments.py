@@ -10,6 +10,7 @@ import pytest
 from support.gradient_cases.cases_gaps import corner, lamp, plates
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.unknowns import move
+from support.marks import long
 from torchtransient.plugins.transport import contents
 
 SCENES = {"plates": (plates, (0, 0, 1)), "corner": (corner, (1, 0, 0)), "lamp": (lamp, (0, 0, 1))}
@@ -39,14 +40,14 @@ def test_variance_is_bounded(name):
     assert max(widths[1e-3], widths[1e-4]) < 2.0 * widths[1e-2]
 
 
-@pytest.mark.parametrize("name", list(SCENES))
+@pytest.mark.parametrize("name", long(SCENES, ["plates", "lamp"]))
 def test_a_tenth_of_the_variance_at_a_millimetre(name, monkeypatch):
     damped = damped_gradients(name, 1e-3).var(ddof=1)
     monkeypatch.setattr(contents, "DAMPING", 0.0)
     assert 10 * damped < gradients(name, 1e-3).var(ddof=1)
 
 
-@pytest.mark.parametrize("name", ["plates", "corner"])
+@pytest.mark.parametrize("name", long(["plates", "corner"], ["corner"]))
 def test_mean_at_a_millimetre(name):
     """Guards against distances measured from the surface where the ray starts 2e-4 m off it, a fifth of the gap."""
     posed = problem(name, 1e-3, spp=8192)

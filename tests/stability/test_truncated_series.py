@@ -40,7 +40,10 @@ def test_truncated_series(depth):
     assert total == pytest.approx(steady.sum(), rel=2e-5)
 
 
-@pytest.mark.parametrize("depth, rr_depth", [(64, 1), (64, 5), (-1, 1), (-1, 10)])
+LONG = [pytest.param(*pair, marks=pytest.mark.slow) for pair in [(64, 1), (-1, 10)]]
+
+
+@pytest.mark.parametrize("depth, rr_depth", [(64, 5), (-1, 1), *LONG])
 def test_roulette_is_unbiased(depth, rr_depth):
     """Guards against survivors that are not weighted up (or are, twice): the mean is that of the series, with or
     without a bound.

@@ -75,30 +75,36 @@ class MovedCapture:
     def difference(self, h, seed, spp):
         return (self.loss(h, seed, spp) - self.loss(-h, seed, spp)) / (2 * h)
 
-    def reverse(self, seed, spp):
+    @contextmanager
+    def _attached(self):
+        """The parameter, attached. Nothing is so afterwards: kernels are traced through the objects of every scene that
+        is alive, and forward mode runs into what is attached there.
+        """
         θ = mi.Float(0)
         dr.enable_grad(θ)
         self.install(θ)
-        self._backward(seed, spp)
-        return float(dr.grad(θ)[0])
+        try:
+            yield θ
+        finally:
+            self.install(mi.Float(0))
+
+    def reverse(self, seed, spp):
+        with self._attached() as θ:
+            self._backward(seed, spp)
+            return float(dr.grad(θ)[0])
 
     def _backward(self, seed, spp):
         adjoints = (self.adjoint, None) if self.steady else (None, self.adjoint)
         self.scene.integrator().render_backward(self.scene, self.parameters, adjoints, seed=seed, spp=spp)
 
     def forward(self, seed, spp):
-        θ = mi.Float(0)
-        dr.enable_grad(θ)
-        self.install(θ)
-        dr.set_grad(θ, 1.0)
-        return self.weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp))
+        with self._attached() as θ:
+            dr.set_grad(θ, 1.0)
+            return self.weighed(self.scene.integrator().render_forward(self.scene, self.parameters, seed=seed, spp=spp))
 
     def boundary(self, spp=64):
         """The boundary term that a job of derivatives has, None for none."""
-        θ = mi.Float(0)
-        dr.enable_grad(θ)
-        self.install(θ)
-        with noted() as found:
+        with self._attached(), noted() as found:
             self._backward(0, spp)
         return found[0] if found else None
 

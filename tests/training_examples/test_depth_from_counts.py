@@ -14,7 +14,9 @@ SCRIPT = Path(__file__).parents[2] / "training_examples" / "depth_from_counts.py
 METHODS = ("highest bin", "matched filter", "untrained", "network")
 
 
-@pytest.mark.parametrize("way", [[], ["--online"]], ids=["on disk", "online"])
+@pytest.mark.parametrize(
+    "way", [pytest.param([], id="on disk"), pytest.param(["--online"], id="online", marks=pytest.mark.slow)]
+)
 def test_the_network_beats_the_filter(tmp_path, capsys, way):
     run = runpy.run_path(str(SCRIPT))["main"]
     errors = run(["--quick", "--output", str(tmp_path), *way])

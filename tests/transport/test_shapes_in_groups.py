@@ -11,6 +11,7 @@ from support.gradient_cases.cases_instances import grouped
 from support.gradient_cases.cases_media import block, clouds, homogeneous
 from support.gradient_cases.scenes import instances
 from support.gradient_cases.unknowns import rotate
+from support.marks import long
 from torchtransient import plugins
 
 
@@ -20,7 +21,7 @@ def mono():
     plugins.sync()
 
 
-@pytest.mark.parametrize("medium", [homogeneous, clouds])
+@pytest.mark.parametrize("medium", long([homogeneous, clouds], [clouds]))
 def test_light_passes_open_boundaries_in_a_group(medium):
     """A block of fog whose boundary has the BSDF ``null``: an instance of it was opaque."""
     images = []

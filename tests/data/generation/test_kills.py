@@ -78,6 +78,7 @@ def test_a_killed_worker_is_replaced(tmp_path, calm):
     assert "2 workers replaced" in out and data_files(tmp_path) == calm and leftovers(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_killed_supervisor(tmp_path, calm):
     """Its workers end by themselves, and the next run goes on."""
     child = start(RECIPE, tmp_path, **ASKED)

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 import torchtransient as tt
+from support.marks import long
 from torchtransient.data.recipes.maker import Maker
 from torchtransient.errors import SceneError
 
@@ -67,6 +68,7 @@ def test_preview_is_a_picture(recipe, tmp_path):
         recipe.preview(0)
 
 
+@pytest.mark.slow
 def test_cost_counts_what_is_built():
     """Every sample is a scene of its own: the forecast is that of making them, within what timing is good for."""
     ball = {"type": "sphere", "center": [0, -0.6, 0.2], "radius": 0.1, "bsdf": {"type": "ref", "id": "white"}}
@@ -76,7 +78,7 @@ def test_cost_counts_what_is_built():
     assert cost.seen == 64 and cost.sample_s >= np.mean([one.first_s for one in cost.structures[1:]])
 
 
-@pytest.mark.parametrize("kind", ["exhaustive", "list"])
+@pytest.mark.parametrize("kind", long(["exhaustive", "list"], ["list"]))
 def test_sheets_of_other_scans(kind, tmp_path):
     wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
     grid = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal")

@@ -118,22 +118,25 @@ class Problem:
         x = mi.Float(self.case.value)
         dr.enable_grad(x)
         keys = self.install(x)
-        g = np.broadcast_to(weights(self.film), self.film.cube_shape()).astype(np.float32)
-        self.scene.integrator().render_backward(
-            self.scene, self.params, (None, mi.TensorXf(g)), seed=seed, spp=self.case.spp
-        )
-        for key in keys:
-            dr.enqueue(dr.ADMode.Backward, self.params[key])
-        dr.traverse(dr.ADMode.Backward)
-        slope = float(dr.grad(x)[0])
-        self.detach()
-        return slope
+        try:
+            g = np.broadcast_to(weights(self.film), self.film.cube_shape()).astype(np.float32)
+            self.scene.integrator().render_backward(
+                self.scene, self.params, (None, mi.TensorXf(g)), seed=seed, spp=self.case.spp
+            )
+            for key in keys:
+                dr.enqueue(dr.ADMode.Backward, self.params[key])
+            dr.traverse(dr.ADMode.Backward)
+            return float(dr.grad(x)[0])
+        finally:
+            self.detach()
 
     def forward(self, seed: int) -> float:
         x = mi.Float(self.case.value)
         dr.enable_grad(x)
         self.install(x)
-        dr.set_grad(x, 1.0)
-        _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
-        self.detach()
+        try:
+            dr.set_grad(x, 1.0)
+            _, transient = self.scene.integrator().render_forward(self.scene, self.params, seed=seed, spp=self.case.spp)
+        finally:
+            self.detach()
         return float((np.array(transient).sum((0, 1)) * weights(self.film)).sum())
