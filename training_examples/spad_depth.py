@@ -59,8 +59,7 @@ def rendered(sizes: argparse.Namespace, folder: Path, workers: int) -> tuple[Ten
     """Light (N, 1, T, H, W) of all scenes as the detector's response leaves it, and (N, 1, H, W) the place of the
     surface in bins. Scenes 0 to ``test`` - 1 are for the test.
     """
-    recipe = boxes_before_a_wall(sizes.resolution)
-    count = sizes.test + sizes.train
+    recipe, count = boxes_before_a_wall(sizes.resolution), sizes.test + sizes.train
     print(tt.data.generate(recipe, folder := folder / f"spad_depth-{recipe.key()[:8]}-{count}", count, workers))
     whole = next(iter(DataLoader(tt.data.TransientDataset(folder), batch_size=count)))
     position = 1000 * whole["depth"].unsqueeze(1) / MM_PER_BIN
@@ -158,16 +157,16 @@ def draw(found: dict[str, Tensor], errors: dict[str, list[float]], path: Path) -
     figure = Figure(figsize=(13.5, 3.2), layout="constrained")
     *pictures, lines = figure.subplots(1, 5, width_ratios=[1, 1, 1, 1, 1.5])
     for axes, (name, position) in zip(pictures, found.items(), strict=True):
-        image = axes.imshow(position[0, 0] * MM_PER_BIN / 1000, vmin=0.3, vmax=1.8, cmap="viridis")
+        image = axes.imshow(position[0, 0].numpy() * MM_PER_BIN / 1000, vmin=0.3, vmax=1.8, cmap="viridis")
         axes.set(title=name, xticks=[], yticks=[])
     figure.colorbar(image, ax=pictures, label="distance in m", shrink=0.8)
     for name, colour in zip(list(found)[1:], ("tab:blue", "tab:orange", "tab:green"), strict=True):
         lines.plot(PHOTONS, errors[name], marker="o", label=name, color=colour)
         lines.plot(PHOTONS, errors[f"all: {name}"], marker="o", ls=":", mfc="none", color=colour)
     lines.set(title="mean error in mm (dotted: edges too)", xlabel="photons per cycle", xscale="log", yscale="log")
-    lines.set_xticks(PHOTONS, [f"{p:g}" for p in PHOTONS], minor=False)
+    lines.set_xticks(PHOTONS, [f"{p:g}" for p in PHOTONS])
+    lines.minorticks_off()
     lines.legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
     print(f"spad_depth: {path}")
 
