@@ -26,15 +26,18 @@ _LAZY = {
     "cost_of_accuracy": "torchtransient.accuracy.cost",
     "data": "torchtransient.data",
     "Plan": "torchtransient.render.plan",
+    "geometry": "torchtransient.geometry",
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
     "nlos": "torchtransient.nlos",
+    "parametrize": "torchtransient.parametrize",
     "render": "torchtransient.render.functional",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
     "threads": "torchtransient.render.threads",
+    "training": "torchtransient.training",
     "vis": "torchtransient.vis",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,6 +37,10 @@ def counts(shape, generator, dtype=torch.float64):
     return torch.randint(0, 6, shape, generator=generator).to(dtype)
 
 
+def halved(x):
+    return x.float() / 2 if x.is_floating_point() and x.element_size() < 4 else x / 2
+
+
 @dataclass(frozen=True)
 class LossCase:
     """`function(input, target, mask=, reduction=)`, the module of the same options, and what is claimed of both."""
@@ -56,6 +61,7 @@ class LossCase:
     floors_detached: bool = False  # the scale of an item goes in without gradient
     dim: int | None = None  # where time is, of losses that want to know it
     measurement_first: bool = False  # likelihoods (counts, mean)
+    second: Callable[..., torch.Tensor] | None = None  # what a loss of (input, another, target) is given as another
 
     def tensors(self, seed=0, dtype=torch.float64):
         generator = torch.Generator().manual_seed(seed)
@@ -65,6 +71,8 @@ class LossCase:
     def arguments(self, input, target):
         if not self.pair:
             return (input,)
+        if self.second is not None:
+            return input, self.second(input), target
         return (target, input) if self.measurement_first else (input, target)
 
     def __call__(self, input, target, mask=None, reduction="mean", **more):
@@ -131,7 +139,20 @@ CASES = [
              dim=-3),
     LossCase("Wasserstein, unbalanced", losses.wasserstein_loss, losses.WassersteinLoss,
              {**WIDTH, "creation_cost_opl": 0.3}, dim=-3),
+    LossCase("running sums", losses.cumulative_loss, losses.CumulativeLoss, WIDTH, dim=-3),
+    LossCase("running sums, by their noise", losses.cumulative_loss, losses.CumulativeLoss,
+             {**WIDTH, "per_root_count": True}, symmetric=False, floors_detached=True, dim=-3),
+    LossCase("many scales", losses.multiscale_loss, losses.MultiscaleLoss, {"scales": (1, 2, 3)}, dim=-3),
+    LossCase("many scales, first photon", losses.multiscale_loss, losses.MultiscaleLoss,
+             {"compare": functools.partial(losses.first_photon_loss, cycles=CYCLES, floor=1e-3), "scales": (1, 3)},
+             draw_target=counts, crop=None, symmetric=False, zero_at_equality=False, mapped=False, dim=-3),
     LossCase("Anscombe", losses.root_loss, losses.RootLoss),
+    LossCase("expected root", losses.expected_root_loss, losses.ExpectedRootLoss, symmetric=False,
+             zero_at_equality=False),
+    LossCase("two renders", losses.two_render_loss, losses.TwoRenderLoss, symmetric=False, zero_at_equality=False,
+             second=halved),
+    LossCase("two renders, complex", losses.two_render_loss, losses.TwoRenderLoss, draw=complex_numbers,
+             symmetric=False, zero_at_equality=False, second=halved),
     LossCase("log ratio", losses.log_ratio_loss, losses.LogRatioLoss, {"background": 0.05}, dim=-3),
     LossCase("log ratio, own background", losses.log_ratio_loss, losses.LogRatioLoss, symmetric=False,
              floors_detached=True, dim=-3),
@@ -143,6 +164,8 @@ CASES = [
     LossCase("total variation, complex, not smoothed", losses.total_variation, losses.TotalVariation,
              {"smoothing": 0.0}, pair=False, zero_at_equality=False, draw=complex_numbers, **VOLUMES),
     LossCase("depth", losses.depth_loss, losses.DepthLoss, input_shape=PICTURE, crop=PIXELS),
+    LossCase("depth, any scale", losses.scale_invariant_depth_loss, losses.ScaleInvariantDepthLoss,
+             input_shape=PICTURE, crop=PIXELS),
     LossCase("SSIM", losses.ssim_loss, losses.SSIMLoss, {"window": 5, "value_range": 1.1}, input_shape=PICTURE,
              crop=None),
     LossCase("SSIM, own range", losses.ssim_loss, losses.SSIMLoss, {"window": 3}, input_shape=PICTURE, crop=None,
@@ -165,6 +188,12 @@ OTHERS = {
     losses.surface_distance: _mesh,
     losses.relative_floor: losses.relative_floor,
     losses.anscombe: losses.anscombe,
+    losses.expected_anscombe: losses.expected_anscombe,
     losses.transient_phasors: lambda x: losses.transient_phasors(x, AXIS, BAND),
     losses.maximum_projections: lambda x: torch.cat([view.flatten() for view in losses.maximum_projections(x)]),
 }  # fmt: skip
+# Losses of one mesh (vertices, faces), with tests of their own.
+MESHES = {
+    losses.mesh_laplacian_smoothing: losses.MeshLaplacianSmoothing,
+    losses.mesh_normal_consistency: losses.MeshNormalConsistency,
+}
