@@ -32,7 +32,7 @@ FREQUENCIES = (120e6, 80e6, 16e6)
 EYE, FARTHEST_M = [0.0, 0.0, 3.0], 5.5
 # Rooms to learn from and for the test, pixels per side and samples of one; steps, rooms of a step, channels.
 FULL = argparse.Namespace(train=600, test=64, resolution=32, spp=128, steps=1000, batch=16, channels=16)
-SMOKE = argparse.Namespace(train=40, test=8, resolution=16, spp=32, steps=60, batch=8, channels=12)
+SMOKE = argparse.Namespace(train=24, test=8, resolution=16, spp=32, steps=80, batch=8, channels=12)
 
 
 def rooms(sizes: argparse.Namespace, max_depth: int = 6) -> tt.data.Recipe:
