@@ -61,6 +61,9 @@ def main(argv: Sequence[str] | None = None) -> tt.RenderOutput:
     parser.add_argument("--spp", type=int, default=8192, help="samples per pixel (%(default)s)")
     parser.add_argument("--max-depth", type=int, default=24, help="vertices of a path (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder (%(default)s)")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(height=24, spp=64, max_depth=8)
     options = parser.parse_args(argv)
     options.output.mkdir(parents=True, exist_ok=True)
     out = film(bottle(options.output, options.height, options.spp, options.max_depth), options.spp, options.output)

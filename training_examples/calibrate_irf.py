@@ -189,6 +189,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, float]:
     parser.add_argument("--frame-bin-ps", type=float, default=250.0, help="their bins (%(default)s)")
     parser.add_argument("--steps", type=int, default=800, help="steps of each fit (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(steps=80, lobes=2)
     options = parser.parse_args(argv)
     if options.irf is None and not options.frames:
         parser.error("give --irf, --frames or both")

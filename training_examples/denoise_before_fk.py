@@ -164,6 +164,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, float]:
     parser.add_argument("--scenes", type=int, default=32, help="to train on")
     parser.add_argument("--test-scenes", type=int, default=8, help="to measure errors on")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(steps=12, points=12, bins=64, scenes=4, test_scenes=2)
     options = parser.parse_args(argv)
     options.output.mkdir(parents=True, exist_ok=True)
 

@@ -47,7 +47,7 @@ class Sizes:
     channels: int = 64
 
 
-QUICK = Sizes(train=24, test=4, resolution=12, spp=16, steps=60, batch=4, channels=16)
+SMOKE = Sizes(train=24, test=4, resolution=12, spp=16, steps=60, batch=4, channels=16)
 
 
 @dataclass(frozen=True)
@@ -211,14 +211,14 @@ def draw(found: dict[str, Tensor], batch: dict[str, Tensor], losses: list[float]
 def main(argv: Sequence[str] | None = None) -> dict[str, Errors]:
     """Command line; returns the errors by method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small enough for seconds")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
     parser.add_argument("--online", action="store_true", help="render the scenes to learn from meanwhile")
     parser.add_argument("--scenes", type=int, help=f"to learn from ({Sizes.train})")
     parser.add_argument("--steps", type=int, help=f"steps of training ({Sizes.steps})")
     parser.add_argument("--workers", type=int, default=2, help="processes that render (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for all files (%(default)s)")
     options = parser.parse_args(argv)
-    base = QUICK if options.quick else Sizes()
+    base = SMOKE if options.smoke else Sizes()
     sizes = Sizes(**vars(base) | {
         "train": options.scenes or base.train, "steps": options.steps or base.steps,
     })  # fmt: skip

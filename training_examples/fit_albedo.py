@@ -140,6 +140,9 @@ def main(argv: Sequence[str] | None = None) -> Fit:
     parser.add_argument("--resolution", type=int, default=48, help="pixels per side (%(default)s)")
     parser.add_argument("--target-spp", type=int, default=4096, help="samples per pixel of the target (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(steps=8, spp=8, resolution=12, target_spp=256)
     options = parser.parse_args(argv)
     fit = fit_albedo(options.steps, options.spp, options.resolution, options.target_spp)
     picture = options.output / "fit_albedo.png"

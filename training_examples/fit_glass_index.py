@@ -105,6 +105,9 @@ def main() -> None:
     parser.add_argument("--learning-rate", type=float, default=0.02, help="Adam's first step, in units of the index")
     parser.add_argument("--seed", type=int, default=0, help="another number gives other samples in the fit")
     parser.add_argument("--output", type=Path, default=Path("fit_glass_index.png"), help="where the curves go")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args()[0].smoke:
+        parser.set_defaults(steps=6, spp=1024, resolution=4, repetitions=6)
     args = parser.parse_args()
 
     print(f"measuring: {args.repetitions} renders of {args.resolution}^2 pixels, {args.spp} spp, index {TRUTH}")

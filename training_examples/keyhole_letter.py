@@ -222,6 +222,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--resolution", type=int, default=48, help="pixels of a side of the picture")
     parser.add_argument("--output", type=Path, default=Path("demo_output"))
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(steps=60, resolution=24)
     options = parser.parse_args(argv)
     track = read_track(options.folder)
     model = Prediction(track, options.resolution)

@@ -375,11 +375,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         option = f"--{name.replace('_', '-')}"
         parser.add_argument(option, type=int, default=getattr(Settings, name), help="(%(default)s)")
     parser.add_argument("--late", action="store_true", help="measure light of up to five bounces, too")
-    parser.add_argument("--quick", action="store_true", help="few points and steps: seconds, and coarse")
+    parser.add_argument("--smoke", action="store_true", help="few points and steps: seconds, and coarse")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder (%(default)s)")
     options = parser.parse_args(argv)
     settings = Settings(late=options.late, **{name: getattr(options, name) for name in numbers})
-    if options.quick:
+    if options.smoke:
         settings = replace(settings, points=8, spp=256, measured_spp=1024, pose_steps=24, shape_steps=24)
     found: dict[str, Any] = {}
     for what in options.fit:

@@ -1,24 +1,26 @@
 """Depth from a SPAD in too much light: a small network trained on simulated pile-up, against Coates' correction.
 
-Every step makes new scenes (boxes before a slanted wall), their photon rates, and the first-photon histograms that
-`tt.sensing.SynchronousSPAD` draws from them. The network sees what a matched filter makes of Coates' estimate, the
-histogram, and the share of cycles still armed, of a neighbourhood of pixels, and corrects the scores of the filter.
+A recipe puts three boxes before a slanted wall, with a flash beside the camera; its scenes are rendered once. Every
+step gives some of them new photon rates, signal and background, and draws first-photon histograms from them
+(`tt.sensing.SynchronousSPAD`). The network sees what a matched filter makes of Coates' estimate, the histogram, and
+the share of cycles still armed, of a neighbourhood of pixels, and corrects the scores of the filter.
 
     python training_examples/spad_depth.py --output demo_output
 
-Prints a table of errors on scenes that were not trained on, in millimetres: matched filter on the raw histogram,
-Coates and matched filter, network; for several numbers of photons per laser cycle.
+Prints a table of errors on scenes that were not trained on, in millimetres, of pixels that see one surface and of all
+(edges of boxes too): matched filter on the raw histogram, Coates and matched filter, network; by photons per cycle.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 import torchtransient as tt
@@ -28,63 +30,51 @@ BINS = 128
 AXIS = tt.TimeAxis.from_seconds(0.0, 100e-12, BINS)  # 12.8 ns: walls up to 1.9 m away
 PULSE = sensing.GaussianResponse(300e-12)
 MM_PER_BIN = AXIS.bin_width_opl / 2 * 1000
+CYCLES = 300
+SPAD = sensing.SynchronousSPAD(CYCLES)
 PHOTONS = (0.3, 1.0, 3.0, 6.0)  # of signal and background together, per pixel and cycle, in the table
+# Scenes to learn from and for the test, pixels per side, steps, scenes of a step, channels of the network.
+FULL = argparse.Namespace(train=400, test=64, resolution=16, steps=400, batch=4, channels=8)
+SMOKE = argparse.Namespace(train=24, test=8, resolution=12, steps=20, batch=2, channels=4)
 
 
-@dataclass
-class Scenes:
-    """``position`` (B, 1, H, W) of the surface in bins, and ``rate`` (B, 1, T, H, W), detections per cycle and bin."""
-
-    position: Tensor
-    rate: Tensor
-
-
-def make_scenes(count: int, size: int, photons: tuple[float, float], generator: torch.Generator) -> Scenes:
-    """Boxes before a slanted wall; ``photons``: range of the mean number of detections per cycle of a scene."""
-
-    def draw(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *shape, generator=generator)
-
-    v, u = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
-    wall = draw(70, 110, 1, 1) + draw(-8, 8, 1, 1) * u + draw(-8, 8, 1, 1) * v
-    position, albedo = wall, draw(0.3, 1.0, 1, 1).expand(-1, size, size)
-    for _ in range(3):
-        near = (u - draw(-0.8, 0.8, 1, 1)).abs() < draw(0.15, 0.5, 1, 1)
-        near = near & ((v - draw(-0.8, 0.8, 1, 1)).abs() < draw(0.15, 0.5, 1, 1))
-        position = torch.where(near, draw(20, 65, 1, 1) + 3 * u, position)
-        albedo = torch.where(near, draw(0.1, 1.0, 1, 1), albedo)
-    signal = albedo / (position / 60) ** 2  # falls with the square of the distance
-    edges = torch.arange(BINS + 1).reshape(-1, 1, 1)
-    sigma_bins = float(PULSE.sigma_s) / AXIS.bin_width_s
-    shape = torch.special.ndtr((edges - position.unsqueeze(1)) / sigma_bins).diff(dim=1)
-    # Half to four fifths of all photons are background, spread over the whole window.
-    background = draw(1.0, 4.0, 1, 1, 1) * signal.mean((-2, -1))[:, None, None, None] / BINS
-    rate = signal.unsqueeze(1) * shape + background
-    total = rate.sum(1).mean((-2, -1)).reshape(-1, 1, 1, 1)
-    low, high = (torch.tensor(p).log() for p in photons)
-    wanted = draw(float(low), float(high), 1, 1, 1).exp()
-    return Scenes(position.unsqueeze(1), (rate * wanted / total).unsqueeze(1))
+def boxes_before_a_wall(resolution: int) -> tt.data.Recipe:
+    """The recipe. Direct light and what came over one more surface, as the box filter of a histogram has it."""
+    data, at = tt.data, tt.scenes.transforms
+    scene = tt.scenes.moving_wall(resolution=resolution, max_depth=3)  # the camera looks down from z = 4
+    scene["sensor"]["fov"], scene["light"]["position"] = 45.0, [0.01, 0.0, 4.0]
+    scene["wall"]["to_world"] = at.translate([0, 0, 2.75]) @ at.scale(3.0)
+    tilted = [data.Turn([1, 0, 0], -8, 8), data.Turn([0, 1, 0], -8, 8), data.Offset([0, 0, -0.2], [0, 0, 0.2])]
+    vary = {"wall.to_world": data.Compose(tilted), "wall.bsdf.reflectance.value": data.Uniform(0.3, 0.95)}
+    anywhere = data.Offset([-0.3, -0.3, -0.2], [0.3, 0.3, 0.3])
+    for name in ("box-1", "box-2", "box-3"):
+        grey = {"type": "diffuse", "reflectance": 0.5}
+        scene[name] = {"type": "cube", "to_world": at.translate([0, 0, 3.25]) @ at.scale(0.1), "bsdf": grey}
+        vary[f"{name}.to_world"] = data.Compose([data.Scale(0.6, 1.6, same=False), data.Turn([0, 1, 0]), anywhere])
+        vary[f"{name}.bsdf.reflectance.value"] = data.Uniform(0.1, 0.95)
+    return data.Recipe(scene, vary, time_axis=AXIS, spp=64, labels=["depth"], variant="llvm_ad_mono")
 
 
-class DepthNetwork(nn.Module):
-    """Scores (B, 1, T, H, W) from features (B, 3, T, H, W): those of the matched filter plus a learnt correction."""
+def rendered(sizes: argparse.Namespace, folder: Path, workers: int) -> tuple[Tensor, Tensor]:
+    """Light (N, 1, T, H, W) of all scenes as the detector's response leaves it, and (N, 1, H, W) the place of the
+    surface in bins. Scenes 0 to ``test`` - 1 are for the test.
+    """
+    recipe, count = boxes_before_a_wall(sizes.resolution), sizes.test + sizes.train
+    print(tt.data.generate(recipe, folder := folder / f"spad_depth-{recipe.key()[:8]}-{count}", count, workers))
+    whole = next(iter(DataLoader(tt.data.TransientDataset(folder), batch_size=count)))
+    position = 1000 * whole["depth"].unsqueeze(1) / MM_PER_BIN
+    return sensing.ImpulseResponse(PULSE, AXIS).expected(whole["transient"]), position
 
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Conv3d(3, channels, (7, 3, 3), padding=(3, 1, 1)),
-            nn.SiLU(),
-            nn.Conv3d(channels, channels, (5, 3, 3), padding=(4, 1, 1), dilation=(2, 1, 1)),
-            nn.SiLU(),
-            nn.Conv3d(channels, channels, (3, 3, 3), padding=(4, 1, 1), dilation=(4, 1, 1)),
-            nn.SiLU(),
-            nn.Conv3d(channels, 1, 1),
-        )
-        self.gain = nn.Parameter(torch.ones(()))
 
-    def forward(self, features: Tensor) -> Tensor:
-        """The corrected scores; a softmax over time makes probabilities of them."""
-        return self.gain * features[:, :1] + self.layers(features)
+def rates(light: Tensor, photons: tuple[float, float], generator: torch.Generator) -> Tensor:
+    """Detections per cycle and bin. ``photons``: range of a scene's mean number per pixel and cycle, of which half to
+    four fifths are background, spread over the whole window.
+    """
+    shape = (len(light), 1, 1, 1, 1)
+    signal = light / light.sum(2, keepdim=True).mean((-2, -1), keepdim=True)
+    background = torch.empty(shape).uniform_(1.0, 4.0, generator=generator)
+    wanted = torch.empty(shape).uniform_(*map(math.log, photons), generator=generator).exp()
+    return (signal + background / BINS) / (1 + background) * wanted
 
 
 def matched(rate: Tensor) -> Tensor:
@@ -93,121 +83,116 @@ def matched(rate: Tensor) -> Tensor:
     return sensing.log_matched_filter(rate, kernel.to(rate), first, signal_to_background=30.0)
 
 
-def features_of(counts: Tensor, cycles: int) -> Tensor:
-    """(B, 3, T, H, W): scores after Coates, root of the histogram, share of the cycles that are still armed."""
-    estimate = sensing.coates(counts, cycles)
-    scores = matched(estimate.rate * cycles)
-    scores = (scores - scores.mean(2, keepdim=True)) / scores.std(2, keepdim=True).clamp_min(1e-3)
-    armed = 1 - (counts.cumsum(2) - counts) / cycles
-    return torch.cat([scores, (counts / cycles).sqrt() * 5, armed], dim=1)
+class DepthNetwork(nn.Module):
+    """Scores (B, 1, T, H, W) from counts: those of Coates and matched filter plus what is learnt."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [nn.Conv3d(3, channels, (7, 3, 3), padding=(3, 1, 1)), nn.SiLU()]
+        for length, dilation in ((5, 2), (3, 4)):
+            shape = {"padding": (4, 1, 1), "dilation": (dilation, 1, 1)}
+            layers += [nn.Conv3d(channels, channels, (length, 3, 3), **shape), nn.SiLU()]
+        self.layers = nn.Sequential(*layers, nn.Conv3d(channels, 1, 1))
+        self.gain = nn.Parameter(torch.ones(()))
+
+    def forward(self, counts: Tensor) -> Tensor:
+        """A softmax over time makes probabilities of them."""
+        scores = matched(sensing.coates(counts, CYCLES).rate * CYCLES)
+        scores = (scores - scores.mean(2, keepdim=True)) / scores.std(2, keepdim=True).clamp_min(1e-3)
+        armed = 1 - (counts.cumsum(2) - counts) / CYCLES
+        features = torch.cat([scores, (counts / CYCLES).sqrt() * 5, armed], dim=1)
+        return self.gain * scores + self.layers(features)
 
 
-def position_of(scores: Tensor) -> Tensor:
-    """(B, 1, H, W): mean position within three bins of the highest probability."""
-    probabilities = torch.softmax(scores, dim=2)
-    return sensing.centre_of_mass(probabilities, half_width_bins=3)
-
-
-def train(steps: int, batch: int, size: int, cycles: int, channels: int) -> tuple[DepthNetwork, list[float]]:
-    """Train on scenes of 0.2 to 8 detections per cycle; cross-entropy against a narrow bump at the true bin."""
-    network = DepthNetwork(channels)
-    spad = sensing.SynchronousSPAD(cycles)
-    generator = torch.Generator().manual_seed(1)
+def train(light: Tensor, position: Tensor, sizes: argparse.Namespace) -> DepthNetwork:
+    """Train at 0.2 to 8 detections per cycle; cross-entropy against a narrow bump at the true bin."""
+    network = DepthNetwork(sizes.channels)
+    generator = torch.Generator().manual_seed(torch.initial_seed())
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 6e-3, total_steps=sizes.steps)
     bins = torch.arange(BINS).reshape(-1, 1, 1) + 0.5
-    losses = []
-    for _ in (bar := tqdm(range(steps), desc="spad_depth", unit="step")):
-        scenes = make_scenes(batch, size, (0.2, 8.0), generator)
-        counts = spad.sample(scenes.rate, generator)
-        target = torch.softmax(-0.5 * (bins - scenes.position.unsqueeze(2)).square(), dim=2)
-        log_probability = torch.log_softmax(network(features_of(counts, cycles)), dim=2)
+    for _ in (bar := tqdm(range(sizes.steps), desc="spad_depth", unit="step")):
+        taken = torch.randint(len(light), (sizes.batch,), generator=generator)
+        counts = SPAD.sample(rates(light[taken], (0.2, 8.0), generator), generator)
+        target = torch.softmax(-0.5 * (bins - position[taken].unsqueeze(2)).square(), dim=2)
+        log_probability = torch.log_softmax(network(counts), dim=2)
         loss = -(target * log_probability).sum(2).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-        losses.append(float(loss.detach()))
-        bar.set_postfix(loss=f"{losses[-1]:.3f}")
-    return network, losses
+        bar.set_postfix(loss=f"{loss.item():.3f}")
+    return network
 
 
-def estimates(network: DepthNetwork, counts: Tensor, cycles: int) -> dict[str, Tensor]:
+@torch.no_grad()
+def estimates(network: DepthNetwork, counts: Tensor) -> dict[str, Tensor]:
     """Positions (B, 1, H, W) in bins by the three methods."""
-    with torch.no_grad():
-        return {
-            "matched filter": sensing.peak_position(matched(counts)),
-            "Coates + matched filter": sensing.peak_position(matched(sensing.coates(counts, cycles).rate * cycles)),
-            "network": position_of(network(features_of(counts, cycles))),
-        }
+    return {
+        "matched filter": sensing.peak_position(matched(counts)),
+        "Coates + matched filter": sensing.peak_position(matched(sensing.coates(counts, CYCLES).rate)),
+        "network": sensing.centre_of_mass(network(counts).softmax(2), half_width_bins=3),
+    }
 
 
-def table(network: DepthNetwork, size: int, cycles: int, scenes: int) -> dict[str, list[float]]:
-    """Mean absolute errors in millimetres, per method and number of photons."""
-    spad = sensing.SynchronousSPAD(cycles)
+def table(network: DepthNetwork, light: Tensor, position: Tensor) -> dict[str, list[float]]:
+    """Mean absolute errors in millimetres, per method and number of photons; of all pixels under "all: ..."."""
+    bins = torch.arange(BINS).reshape(-1, 1, 1) + 0.5
+    single = (light * ((bins - position.unsqueeze(2)).abs() < 9)).sum(2) > 0.9 * light.sum(2)  # within three pulses
     errors: dict[str, list[float]] = {}
-    for k, photons in enumerate(PHOTONS):
-        generator = torch.Generator().manual_seed(1000 + k)
-        made = make_scenes(scenes, size, (photons, photons), generator)
-        counts = spad.sample(made.rate, generator)
-        for name, found in estimates(network, counts, cycles).items():
-            errors.setdefault(name, []).append(float((found - made.position).abs().mean()) * MM_PER_BIN)
+    generator = torch.Generator().manual_seed(1000)
+    for photons in PHOTONS:
+        counts = SPAD.sample(rates(light, (photons, photons), generator), generator)
+        for name, found in estimates(network, counts).items():
+            off = (found - position).abs() * MM_PER_BIN
+            errors.setdefault(name, []).append(float(off[single].mean()))
+            errors.setdefault(f"all: {name}", []).append(float(off.mean()))
     return errors
 
 
-def draw(network: DepthNetwork, losses: list[float], errors: dict[str, list[float]], cycles: int, path: Path) -> None:
-    """One scene in much light by every method, the loss, and the errors."""
+def draw(found: dict[str, Tensor], errors: dict[str, list[float]], path: Path) -> None:
+    """A scene by every method, and the errors."""
     from matplotlib.figure import Figure
 
-    generator = torch.Generator().manual_seed(5)
-    scene = make_scenes(1, 40, (4.0, 4.0), generator)
-    counts = sensing.SynchronousSPAD(cycles).sample(scene.rate, generator)
-    found = {"truth": scene.position, **estimates(network, counts, cycles)}
-    figure = Figure(figsize=(11.5, 6.4), layout="constrained")
-    upper, lower = figure.subfigures(2, 1)
-    for axes, (name, position) in zip(upper.subplots(1, 4), found.items(), strict=True):
-        image = axes.imshow(position[0, 0] * MM_PER_BIN / 1000, vmin=0.3, vmax=1.8, cmap="viridis")
+    figure = Figure(figsize=(13.5, 3.2), layout="constrained")
+    *pictures, lines = figure.subplots(1, 5, width_ratios=[1, 1, 1, 1, 1.5])
+    for axes, (name, position) in zip(pictures, found.items(), strict=True):
+        image = axes.imshow(position[0, 0].numpy() * MM_PER_BIN / 1000, vmin=0.3, vmax=1.8, cmap="viridis")
         axes.set(title=name, xticks=[], yticks=[])
-    upper.colorbar(image, ax=upper.axes, label="distance in m")
-    upper.suptitle("4 photons per laser cycle")
-    curve, bars, histogram = lower.subplots(1, 3)
-    curve.plot(losses, color="0.4")
-    curve.set(title="training", xlabel="step", ylabel="cross-entropy")
-    for name, values in errors.items():
-        bars.plot(PHOTONS, values, marker="o", label=name)
-    bars.set(title="errors on new scenes", xlabel="photons per cycle", ylabel="mm", xscale="log", yscale="log")
-    bars.set_xticks(PHOTONS, [f"{p:g}" for p in PHOTONS])
-    bars.minorticks_off()
-    bars.legend(fontsize=8)
-    histogram.step(range(BINS), counts[0, 0, :, 20, 20], color="0.5", label="histogram")
-    histogram.step(range(BINS), scene.rate[0, 0, :, 20, 20] * cycles, color="tab:blue", label="photons")
-    histogram.set(title="middle pixel", xlabel="bin", ylabel="counts")
-    histogram.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    figure.colorbar(image, ax=pictures, label="distance in m", shrink=0.8)
+    for name, colour in zip(list(found)[1:], ("tab:blue", "tab:orange", "tab:green"), strict=True):
+        lines.plot(PHOTONS, errors[name], marker="o", label=name, color=colour)
+        lines.plot(PHOTONS, errors[f"all: {name}"], marker="o", ls=":", mfc="none", color=colour)
+    lines.set(title="mean error in mm (dotted: edges too)", xlabel="photons per cycle", xscale="log", yscale="log")
+    lines.set_xticks(PHOTONS, [f"{p:g}" for p in PHOTONS])
+    lines.minorticks_off()
+    lines.legend(fontsize=7)
+    figure.savefig(path, dpi=90)
+    print(f"spad_depth: {path}")
 
 
-def main(argv: Sequence[str] | None = None) -> dict[str, list[float]]:
-    """Command line; returns the table."""
+def main(argv: Sequence[str] | None = None) -> list[dict[str, list[float]]]:
+    """Command line; returns the table of every seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=400, help="steps of training (%(default)s)")
-    parser.add_argument("--batch", type=int, default=4, help="scenes of a step (%(default)s)")
-    parser.add_argument("--size", type=int, default=16, help="pixels per side of a scene (%(default)s)")
-    parser.add_argument("--cycles", type=int, default=300, help="laser cycles of an exposure (%(default)s)")
-    parser.add_argument("--channels", type=int, default=8, help="channels of the network (%(default)s)")
-    parser.add_argument("--test-scenes", type=int, default=32, help="scenes of each column (%(default)s)")
-    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="weights and noise (%(default)s)")
+    parser.add_argument("--workers", type=int, default=2, help="processes that render (%(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for all files (%(default)s)")
     options = parser.parse_args(argv)
-    torch.manual_seed(0)
-    network, losses = train(options.steps, options.batch, options.size, options.cycles, options.channels)
-    errors = table(network, options.size, options.cycles, options.test_scenes)
-    print("mean error in mm       " + "".join(f"{p:>8g}" for p in PHOTONS) + "  photons per cycle")
-    for name, values in errors.items():
-        print(f"{name:<23}" + "".join(f"{v:8.1f}" for v in values))
-    picture = options.output / "spad_depth.png"
-    draw(network, losses, errors, options.cycles, picture)
-    print(f"spad_depth: {picture}")
-    return errors
+    sizes = SMOKE if options.smoke else FULL
+    light, position = rendered(sizes, options.output, options.workers)
+    tables = []
+    for seed in options.seeds:
+        torch.manual_seed(seed)
+        network = train(light[sizes.test :], position[sizes.test :], sizes)
+        tables.append(table(network, light[: sizes.test], position[: sizes.test]))
+        print(f"seed {seed}: mean error in mm" + "".join(f"{p:>16g}" for p in PHOTONS) + "  photons per cycle")
+        for name, values in tables[-1].items():
+            print(f"{name:<28}" + "".join(f"{v:16.1f}" for v in values))
+    generator = torch.Generator().manual_seed(5)
+    counts = SPAD.sample(rates(light[:1], (4.0, 4.0), generator), generator)
+    draw({"truth": position[:1], **estimates(network, counts)}, tables[-1], options.output / "spad_depth.png")
+    return tables
 
 
 if __name__ == "__main__":

@@ -242,6 +242,9 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
     parser.add_argument(
         "--output", type=Path, default=Path("demo_output"), help="folder for the pictures (%(default)s)"
     )
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
+    if parser.parse_known_args(argv)[0].smoke:
+        parser.set_defaults(resolution=18, spp=8, spp_step=4, max_depth=4, steps=2)
     options = parser.parse_args(argv)
     height = options.resolution * 16 // 9
     sizes = Sizes(options.resolution, height, options.spp, options.spp_step, options.max_depth, options.steps)

@@ -19,7 +19,7 @@ METHODS = ("highest bin", "matched filter", "untrained", "network")
 )
 def test_the_network_beats_the_filter(tmp_path, capsys, way):
     run = runpy.run_path(str(SCRIPT))["main"]
-    errors = run(["--quick", "--output", str(tmp_path), *way])
+    errors = run(["--smoke", "--output", str(tmp_path), *way])
     printed = capsys.readouterr().out
     rows = dict(re.findall(rf"^({'|'.join(METHODS)}) +([\d.]+) .*%$", printed, re.MULTILINE))
     assert tuple(rows) == METHODS

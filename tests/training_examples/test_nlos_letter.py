@@ -21,7 +21,7 @@ def example():
 
 
 def test_a_few_steps_halve_the_errors_of_a_pose(example, tmp_path):
-    found = example["main"](["--quick", "--fit", "pose", "--kind", "confocal", "--output", str(tmp_path)])
+    found = example["main"](["--smoke", "--fit", "pose", "--kind", "confocal", "--output", str(tmp_path)])
     errors = found["pose, confocal"]["fits"]["pose, confocal, seed 0"]
     assert errors["position, mm"][0] == pytest.approx(100.0, rel=1e-6)
     assert errors["rotation, degrees"][0] == pytest.approx(20.0, rel=1e-6)

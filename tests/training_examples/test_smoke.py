@@ -1,0 +1,36 @@
+"""Every training example has a small run of the same name; those that need no files run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = sorted((Path(__file__).parents[2] / "training_examples").glob("*.py"))
+# Those that have no test of their own which runs them so.
+NO_FILES = ("bottle", "denoise_before_fk", "fit_albedo", "fit_glass_index", "fit_wall")
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_the_small_run_is_called_smoke(script):
+    text = script.read_text(encoding="utf-8")
+    assert '"--smoke"' in text
+    assert '"--quick"' not in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NO_FILES)
+def test_the_small_run_leaves_a_picture(name, tmp_path):
+    (script,) = (path for path in SCRIPTS if path.stem == name)
+    command = [sys.executable, str(script), "--smoke", "--output", str(tmp_path)]
+    if name == "fit_glass_index":
+        command[-1] += "/fit_glass_index.png"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    pictures = list(tmp_path.glob("*.png"))
+    assert pictures
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
