@@ -30,6 +30,7 @@ _LAZY = {
     "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
     "nlos": "torchtransient.nlos",
+    "parametrize": "torchtransient.parametrize",
     "render": "torchtransient.render.functional",
     "scenes": "torchtransient.scenes",
     "sensing": "torchtransient.sensing",

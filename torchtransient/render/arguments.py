@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.utils import parametrize
 
 from torchtransient.errors import DeviceError, SceneError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.render.films.choice import FilmChoice
@@ -164,7 +165,10 @@ class Values(Mapping[str, nn.Parameter]):
                 "no batch; pass batches to the call, renderer({key: values})."
             )
         with torch.no_grad():
-            parameter.copy_(given)
+            if parametrize.is_parametrized(self._module, self._names[key]):
+                setattr(self._module, self._names[key], given)  # torch's property: the numbers behind it
+            else:
+                parameter.copy_(given)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

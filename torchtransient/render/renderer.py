@@ -13,6 +13,7 @@ from torch import nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import SceneError, ShapeError
 from torchtransient.gates import Gate
+from torchtransient.parametrize.copies import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope
 from torchtransient.plugins.physical_ranges import physical_range
 from torchtransient.pulses import Pulse
@@ -47,7 +48,7 @@ from torchtransient.render.slope import check_filter, filter_for, has_slope, res
 from torchtransient.render.variant import active_variant, device_type, stokes_components
 
 
-class TransientRenderer(nn.Module):
+class TransientRenderer(CopiesParametrized):
     """A scene as a differentiable layer.
 
     ``scene``: what :func:`torchtransient.load` takes. A steady ``hdrfilm`` and ``path`` are taken too: with
@@ -56,14 +57,14 @@ class TransientRenderer(nn.Module):
 
     ``parameters``: keys of ``scene.parameters()`` that get an ``nn.Parameter`` each, starting at the scene's value,
     or a mapping from keys to start values. In ``state_dict`` and ``named_parameters`` the dots of a key are slashes,
-    since torch forbids dots; ``renderer.values`` maps keys to parameters.
+    since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps them in range.
 
     ``time_axis``: replaces the one of the scene's films; phasor films become histograms. ``frequencies``: a
     :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and ``out.phasor`` takes the
     place of ``out.transient``. ``gates``: :class:`Gate` objects; the films become gated films with ``out.gated``.
     ``film``: the same as an object of ``torchtransient.render.films``, and how films of others are asked for. At most
-    one of the four. ``max_depth``: replaces the integrator's. ``spp``,
-    ``spp_grad``: samples per pixel of the render and of its derivatives; None takes the scene's and the render's.
+    one of the four. ``max_depth``: replaces the integrator's. ``spp``, ``spp_grad``: samples per pixel of the render
+    and of its derivatives; None takes the scene's and the render's.
 
     ``temporal_filter``: "box", "tent", "gaussian", or "auto": the scene's own, except that a box becomes a tent as
     soon as a parameter can change a path length (shapes, light position, sensor pose, index of refraction), because
@@ -95,8 +96,7 @@ class TransientRenderer(nn.Module):
     ``freeze``: True records what a call launches, so that later calls need no tracing, with the same values, gradients
     and noise; ``out.stats.recorded`` says what became of it, ``docs/speed.md`` what makes a new recording.
 
-    Copies and pickles carry the scene's description. Renders are serialised by one lock, so threads are safe. Second
-    derivatives raise ``GradientError``.
+    Copies and pickles carry the description. One lock makes threads safe. Second derivatives raise ``GradientError``.
     """
 
     @opaque
@@ -251,7 +251,7 @@ class TransientRenderer(nn.Module):
 
     @property
     def values(self) -> Mapping[str, nn.Parameter]:
-        """The parameters under their Mitsuba keys."""
+        """The parameters under their Mitsuba keys; of a parametrized one its value, which is no leaf."""
         return Values(self, self._names)
 
     @property

@@ -1,0 +1,26 @@
+"""Parameters that stay what they are: shares between 0 and 1, positive spectra, rigid poses.
+
+Torch only, never Mitsuba. Functions there and back first, under them the modules with `forward` and `right_inverse`
+that `torch.nn.utils.parametrize.register_parametrization` takes; `register` is the same by Mitsuba's keys.
+"""
+
+from torchtransient.parametrize.bounded import Albedo as Albedo
+from torchtransient.parametrize.bounded import Anisotropy as Anisotropy
+from torchtransient.parametrize.bounded import Bounded as Bounded
+from torchtransient.parametrize.bounded import IndexOfRefraction as IndexOfRefraction
+from torchtransient.parametrize.bounded import Roughness as Roughness
+from torchtransient.parametrize.bounded import bounded as bounded
+from torchtransient.parametrize.bounded import bounded_inverse as bounded_inverse
+from torchtransient.parametrize.copies import CopiesParametrized as CopiesParametrized
+from torchtransient.parametrize.poses import AxisAnglePose as AxisAnglePose
+from torchtransient.parametrize.poses import SE3Pose as SE3Pose
+from torchtransient.parametrize.poses import axis_angle_from_pose as axis_angle_from_pose
+from torchtransient.parametrize.poses import pose_from_axis_angle as pose_from_axis_angle
+from torchtransient.parametrize.poses import pose_from_twist as pose_from_twist
+from torchtransient.parametrize.poses import twist_from_pose as twist_from_pose
+from torchtransient.parametrize.positive import Positive as Positive
+from torchtransient.parametrize.positive import positive as positive
+from torchtransient.parametrize.positive import positive_inverse as positive_inverse
+from torchtransient.parametrize.registration import original as original
+from torchtransient.parametrize.registration import register as register
+from torchtransient.parametrize.registration import remove as remove

@@ -1,0 +1,191 @@
+"""Values between two bounds, by the logistic function: albedo, roughness, index of refraction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import as_number, real_array, shown
+
+Bound = float | Tensor
+# What single precision makes of the ends of a range, as a share of it.
+_SLACK = 1e-5
+
+
+def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
+    """`low + (high - low) / (1 + exp(-x))`, of any real `x`; never beyond the bounds, and on them only where the
+    precision of `x` has nothing in between.
+
+    `low`, `high`: finite numbers, or tensors that broadcast to `x`, low < high. Raises UnitError, ShapeError.
+    """
+    where = "bounded"
+    x = _floating(x, where)
+    below, above = _ends(x, low, high, where)
+    width = above - below
+    # From the nearer end: full precision at both, and no rounding past the upper one.
+    return torch.where(x < 0, below + width * torch.sigmoid(x), above - width * torch.sigmoid(-x))
+
+
+def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, margin: float | None = None) -> Tensor:
+    """The `x` of which `bounded` makes `value`.
+
+    At the bounds themselves there is none: UnitError, unless `margin` says how near a value may come to them, as a
+    share of the range between 0 and 0.5; what is nearer is moved there. Values beyond the bounds by more than rounding,
+    and such as are not finite, raise UnitError in any case.
+    """
+    return _inverse(value, low, high, _checked_margin(margin, "bounded_inverse"), "bounded_inverse")
+
+
+def _inverse(value: Tensor, low: Bound, high: Bound, margin: float | None, where: str) -> Tensor:
+    value = _floating(value, where)
+    below, above = _ends(value, low, high, where)
+    width = above - below
+    share = (value - below) / width
+    if not bool(((share >= -_SLACK) & (share <= 1 + _SLACK)).all()):
+        raise UnitError(f"{where}: expected values between {_said(low)} and {_said(high)}, got {_span(value)}.")
+    if margin is not None:
+        value = torch.minimum(torch.maximum(value, below + margin * width), above - margin * width)
+    elif not bool(((value > below) & (value < above)).all()):
+        raise UnitError(
+            f"{where}: no finite number stands for the bounds {_said(low)} and {_said(high)} themselves, got "
+            f"{_span(value)}. Start from values inside, or give margin=1e-3 to move them inside by that share."
+        )
+    return torch.log((value - below) / (above - value))
+
+
+class Bounded(nn.Module):
+    """`bounded` as a parametrization: `forward` from all real numbers into (low, high), `right_inverse` back.
+
+    `low`, `high`: numbers or tensors that broadcast to the parameter. `margin`: as in `bounded_inverse`. The slope is
+    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are not
+    part of `state_dict`.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, low: Any = 0.0, high: Any = 1.0, margin: float | None = None) -> None:
+        super().__init__()
+        name = type(self).__name__
+        self.margin = _checked_margin(margin, name)
+        ends = [_bound(given, name) for given in (low, high)]
+        _check_order(ends[0], ends[1], name)
+        self.register_buffer("low", ends[0], persistent=False)
+        self.register_buffer("high", ends[1], persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return bounded(x, self.low, self.high)
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """Raises UnitError as `bounded_inverse`."""
+        return _inverse(value, self.low, self.high, self.margin, type(self).__name__)
+
+    def extra_repr(self) -> str:
+        return f"{_said(self.low)} to {_said(self.high)}"
+
+
+class Albedo(Bounded):
+    """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes."""
+
+    def __init__(self, low: Any = 0.0, high: Any = 1.0, margin: float | None = None) -> None:
+        super().__init__(low, high, margin)
+
+
+class Roughness(Bounded):
+    """`alpha` of microfacets and `roughness` of principled materials, 0.0001 to 1: Mitsuba renders smaller ones as
+    0.0001, where the slope is zero.
+    """
+
+    def __init__(self, low: Any = 1e-4, high: Any = 1.0, margin: float | None = None) -> None:
+        super().__init__(low, high, margin)
+
+
+class IndexOfRefraction(Bounded):
+    """`eta` of dielectrics, inside over outside, 1 to 4: gases to germanium. Below 1 the inside is the thinner one:
+    give another `low`, greater than 0. Not for metals, whose `eta` and `k` are `Positive`.
+    """
+
+    def __init__(self, low: Any = 1.0, high: Any = 4.0, margin: float | None = None) -> None:
+        super().__init__(low, high, margin)
+
+
+class Anisotropy(Bounded):
+    """`g` of the phase functions `hg`, the mean cosine of scattering, -0.99 to 0.99: Mitsuba takes -1 to 1 without the
+    ends.
+    """
+
+    def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:
+        super().__init__(low, high, margin)
+
+
+# ------------------------------------------------------------------------------------------------------------- checks
+
+
+def _floating(x: Tensor, where: str) -> Tensor:
+    if not isinstance(x, Tensor) or not x.is_floating_point():
+        got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
+        raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
+    return x
+
+
+def _bound(given: Any, where: str) -> Tensor:
+    if isinstance(given, Tensor) and given.is_floating_point():
+        return given.detach().clone()
+    array = real_array(given)
+    if array is None:
+        raise UnitError(f"{where}: expected bounds as numbers or tensors of numbers, got {shown(given)}.")
+    return torch.tensor(array)
+
+
+def _check_order(low: Tensor, high: Tensor, where: str) -> None:
+    try:
+        ordered = bool((torch.isfinite(low) & torch.isfinite(high) & (low < high)).all())
+    except RuntimeError:
+        raise ShapeError(
+            f"{where}: expected bounds of shapes that broadcast, got {tuple(low.shape)} and {tuple(high.shape)}."
+        ) from None
+    if not ordered:
+        raise UnitError(
+            f"{where}: expected finite bounds, low < high, got {_said(low)} and {_said(high)}. Use Positive for values "
+            "that have a lower bound alone."
+        )
+
+
+def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Tensor]:
+    """Both as tensors that fit. Numbers are looked at; tensors are looked at where a module takes them."""
+    if not isinstance(low, Tensor) or not isinstance(high, Tensor):
+        _check_order(_bound(low, where), _bound(high, where), where)
+    ends = [torch.as_tensor(end, dtype=like.dtype, device=like.device) for end in (low, high)]
+    for end in ends:
+        try:
+            end.expand(like.shape)
+        except RuntimeError:
+            raise ShapeError(
+                f"{where}: expected bounds that broadcast to {tuple(like.shape)}, got {tuple(end.shape)}."
+            ) from None
+    return ends[0], ends[1]
+
+
+def _checked_margin(margin: Any, where: str) -> float | None:
+    if margin is None:
+        return None
+    number = as_number(margin)
+    if number is None or not 0 < number < 0.5:
+        raise UnitError(f"{where}: expected margin as a share of the range between 0 and 0.5, got {shown(margin)}.")
+    return number
+
+
+def _said(bound: Bound) -> str:
+    if isinstance(bound, Tensor):
+        return f"{bound.item():g}" if bound.numel() == 1 else f"[{bound.min():g} ... {bound.max():g}]"
+    return f"{bound:g}"
+
+
+def _span(value: Tensor) -> str:
+    if not value.numel():
+        return "none"
+    least, most = value.min().item(), value.max().item()
+    return f"{least:.8g}" if least == most else f"values from {least:.8g} to {most:.8g}"
