@@ -23,14 +23,14 @@ LEVEL = {
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
     "transform_bins": 0, "yaml_numbers": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
-    "parametrize": 1,
+    "parametrize": 1, "geometry": 1,
     "scenes": 2,
     "render": 3,
-    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4,
+    "files": 4, "nlos": 4, "data": 4, "accuracy": 4, "testing": 4, "training": 4,
     "cli": 5,
     "__main__": 6,
 }  # fmt: skip
-TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "vis"}
+TORCH_PILLAR = {"sensing", "reconstruction", "losses", "metrics", "parametrize", "geometry", "vis"}
 MITSUBA = {"mitsuba", "drjit"}
 # Packages that a room does without: the one pillar's world in the other, and everything bound to a variant at level 0.
 FORBIDDEN = {

@@ -26,6 +26,7 @@ _LAZY = {
     "cost_of_accuracy": "torchtransient.accuracy.cost",
     "data": "torchtransient.data",
     "Plan": "torchtransient.render.plan",
+    "geometry": "torchtransient.geometry",
     "load": "torchtransient.render.scene_handle",
     "plan": "torchtransient.render.plan",
     "losses": "torchtransient.losses",
@@ -36,6 +37,7 @@ _LAZY = {
     "sensing": "torchtransient.sensing",
     "stokes": "torchtransient.stokes",
     "threads": "torchtransient.render.threads",
+    "training": "torchtransient.training",
     "vis": "torchtransient.vis",
 }
 

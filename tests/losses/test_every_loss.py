@@ -11,7 +11,7 @@ import pickle
 import pytest
 import torch
 
-from support.loss_cases import CASES, OTHERS
+from support.loss_cases import CASES, MESHES, OTHERS
 from torchtransient import FrequencyAxis, losses
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 
@@ -46,10 +46,10 @@ def test_every_loss_is_in_the_list():
     """Every function of the room is a case or one of the others, which reduce nothing; every module is a case."""
     functions = public(inspect.isfunction)
     reducing = {function for function in functions if "reduction" in inspect.signature(function).parameters}
-    assert reducing == {case.function for case in CASES}
+    assert reducing == {case.function for case in CASES} | set(MESHES)
     assert functions - reducing == set(OTHERS)
     modules = public(lambda thing: inspect.isclass(thing) and issubclass(thing, torch.nn.Module))
-    assert modules == {case.module for case in CASES}
+    assert modules == {case.module for case in CASES} | set(MESHES.values())
 
 
 @pytest.mark.parametrize("call", OTHERS.values(), ids=[function.__name__ for function in OTHERS])
@@ -312,18 +312,22 @@ def wrong_calls(case):
                 yield TorchTransientError, "expected", lambda name=name, value=value: replaced(case, name, value)(x, y)
 
 
-EVEN_COMPLEX = (losses.squared_loss, losses.measurement_consistency)
+EVEN_COMPLEX = (losses.squared_loss, losses.two_render_loss, losses.measurement_consistency)
 LEVELS = (-1.0, float("nan"), float("inf"), True, "a", [1.0])
 WRONG_OPTIONS = {
     **dict.fromkeys(("floor", "background", "smoothing", "value_range", "creation_cost_opl"), LEVELS),
     "bin_width_opl": (*LEVELS, 0.0),
     "read_noise": (*LEVELS, 0.0, None),
     **dict.fromkeys(("cycles", "periods", "window"), (0, -4, 2.5, float("nan"), True, "a", None)),
-    **dict.fromkeys(("phase_only", "isotropic", "shot_noise", "scale_invariant", "constant", "per_root_count"), ("no", 1, None)),
-    **dict.fromkeys(("axis", "frequencies"), (None, [1.0], FrequencyAxis((1e9,)))),
+    **dict.fromkeys(("phase_only", "isotropic", "shot_noise", "scale_invariant"), ("no", 1, None)),
+    **dict.fromkeys(("constant", "per_root_count"), ("no", 1, None)),
+    "axis": ([1.0], FrequencyAxis((1e9,))),
+    "frequencies": (None, [1.0], FrequencyAxis((1e9,))),
     **dict.fromkeys(("operator", "compare", "root"), (None, "a", 3)),
     "dead_bins": (-1.0, 0.0, 0.2, float("nan"), float("inf"), "a", True),
-    "spacing": (1.0, (1.0, 2.0), (1.0, 0.0, 1.0), "abc", None),
+    "balance": (-0.1, 1.1, float("nan"), True, "a", None),
+    "scales": (0, (), (0,), (1, 2.5), "ab", 3),
+    "spacing": (1.0, (1.0, 2.0), (1.0, 0.0, 1.0), "abc"),
     "dim": (1.5, True, "time"),
     "reduction": ("median", None, True),
 }

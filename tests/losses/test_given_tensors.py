@@ -228,7 +228,8 @@ def test_of_nothing_is_zero(case, place, masked):
         return
     whole = case(*case.tensors(), reduction="none")
     wanted = list(whole.shape)
-    wanted[place] = 0
+    if case.function is not losses.scale_invariant_depth_loss or place != -1:  # which has a value for each map
+        wanted[place] = 0
     x = x.clone().requires_grad_()
     for reduction in ("none", "mean", "sum"):
         value = case(x, y, mask, reduction)
@@ -326,7 +327,7 @@ def test_numbers_of_things(value):
     assert float(losses.ssim_loss(X, Y, window=3.0)) == float(losses.ssim_loss(X, Y, window=3))
 
 
-@pytest.mark.parametrize("spacing", [1.0, (1.0, 1.0), "abc", None, (1.0, NAN, 1.0)])
+@pytest.mark.parametrize("spacing", [1.0, (1.0, 1.0), "abc", (1.0, NAN, 1.0)])
 def test_spacings_are_three_numbers(spacing):
     with pytest.raises(TorchTransientError, match="spacing"):
         losses.total_variation(X, spacing=spacing)

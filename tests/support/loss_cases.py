@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -140,7 +141,11 @@ CASES = [
              {**WIDTH, "creation_cost_opl": 0.3}, dim=-3),
     LossCase("running sums", losses.cumulative_loss, losses.CumulativeLoss, WIDTH, dim=-3),
     LossCase("running sums, by their noise", losses.cumulative_loss, losses.CumulativeLoss,
-             {**WIDTH, "per_root_count": True}, draw_target=counts, symmetric=False, zero_at_equality=False, dim=-3),
+             {**WIDTH, "per_root_count": True}, symmetric=False, floors_detached=True, dim=-3),
+    LossCase("many scales", losses.multiscale_loss, losses.MultiscaleLoss, {"scales": (1, 2, 3)}, dim=-3),
+    LossCase("many scales, first photon", losses.multiscale_loss, losses.MultiscaleLoss,
+             {"compare": functools.partial(losses.first_photon_loss, cycles=CYCLES, floor=1e-3), "scales": (1, 3)},
+             draw_target=counts, crop=None, symmetric=False, zero_at_equality=False, mapped=False, dim=-3),
     LossCase("Anscombe", losses.root_loss, losses.RootLoss),
     LossCase("expected root", losses.expected_root_loss, losses.ExpectedRootLoss, symmetric=False,
              zero_at_equality=False),
@@ -159,6 +164,8 @@ CASES = [
     LossCase("total variation, complex, not smoothed", losses.total_variation, losses.TotalVariation,
              {"smoothing": 0.0}, pair=False, zero_at_equality=False, draw=complex_numbers, **VOLUMES),
     LossCase("depth", losses.depth_loss, losses.DepthLoss, input_shape=PICTURE, crop=PIXELS),
+    LossCase("depth, any scale", losses.scale_invariant_depth_loss, losses.ScaleInvariantDepthLoss,
+             input_shape=PICTURE, crop=PIXELS),
     LossCase("SSIM", losses.ssim_loss, losses.SSIMLoss, {"window": 5, "value_range": 1.1}, input_shape=PICTURE,
              crop=None),
     LossCase("SSIM, own range", losses.ssim_loss, losses.SSIMLoss, {"window": 3}, input_shape=PICTURE, crop=None,
@@ -185,3 +192,8 @@ OTHERS = {
     losses.transient_phasors: lambda x: losses.transient_phasors(x, AXIS, BAND),
     losses.maximum_projections: lambda x: torch.cat([view.flatten() for view in losses.maximum_projections(x)]),
 }  # fmt: skip
+# Losses of one mesh (vertices, faces), with tests of their own.
+MESHES = {
+    losses.mesh_laplacian_smoothing: losses.MeshLaplacianSmoothing,
+    losses.mesh_normal_consistency: losses.MeshNormalConsistency,
+}

@@ -1,8 +1,18 @@
 """Data sets: randomised scenes, generation, storage and reading; and the files of renders and captures."""
 
+from torchtransient.data.augmentation.augment import Augment as Augment
+from torchtransient.data.augmentation.augment import Augmented as Augmented
+from torchtransient.data.augmentation.operations import Affine as Affine
+from torchtransient.data.augmentation.operations import Crop as Crop
+from torchtransient.data.augmentation.operations import Flip as Flip
+from torchtransient.data.augmentation.operations import Operation as Operation
+from torchtransient.data.augmentation.operations import QuarterTurn as QuarterTurn
+from torchtransient.data.augmentation.spatial_filter import SpatialFilter as SpatialFilter
+from torchtransient.data.augmentation.spatial_filter import spatial_filter as spatial_filter
 from torchtransient.data.generation.generate import Generated as Generated
 from torchtransient.data.generation.generate import generate as generate
 from torchtransient.data.reading.online import OnlineDataset as OnlineDataset
+from torchtransient.data.reading.recipe_dataset import RecipeDataset as RecipeDataset
 from torchtransient.data.reading.stream import TransientStream as TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset as TransientDataset
 from torchtransient.data.recipes.distribution import Distribution as Distribution

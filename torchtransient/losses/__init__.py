@@ -12,7 +12,9 @@ from torchtransient.losses.dead_time_likelihoods import first_photon_loss as fir
 from torchtransient.losses.dead_time_likelihoods import first_photon_nll as first_photon_nll
 from torchtransient.losses.dead_time_likelihoods import free_running_nll as free_running_nll
 from torchtransient.losses.depth import DepthLoss as DepthLoss
+from torchtransient.losses.depth import ScaleInvariantDepthLoss as ScaleInvariantDepthLoss
 from torchtransient.losses.depth import depth_loss as depth_loss
+from torchtransient.losses.depth import scale_invariant_depth_loss as scale_invariant_depth_loss
 from torchtransient.losses.expected_roots import ExpectedRootLoss as ExpectedRootLoss
 from torchtransient.losses.expected_roots import expected_anscombe as expected_anscombe
 from torchtransient.losses.expected_roots import expected_root_loss as expected_root_loss
@@ -28,6 +30,13 @@ from torchtransient.losses.measurement import PairLoss as PairLoss
 from torchtransient.losses.measurement import SquaredLoss as SquaredLoss
 from torchtransient.losses.measurement import measurement_consistency as measurement_consistency
 from torchtransient.losses.measurement import squared_loss as squared_loss
+from torchtransient.losses.mesh_smoothness import MeshLaplacianSmoothing as MeshLaplacianSmoothing
+from torchtransient.losses.mesh_smoothness import MeshNormalConsistency as MeshNormalConsistency
+from torchtransient.losses.mesh_smoothness import mesh_laplacian_smoothing as mesh_laplacian_smoothing
+from torchtransient.losses.mesh_smoothness import mesh_normal_consistency as mesh_normal_consistency
+from torchtransient.losses.multiscale import MultiscaleLoss as MultiscaleLoss
+from torchtransient.losses.multiscale import multiscale_loss as multiscale_loss
+from torchtransient.losses.noisy_renders import SampleSchedule as SampleSchedule
 from torchtransient.losses.noisy_renders import TwoRenderLoss as TwoRenderLoss
 from torchtransient.losses.noisy_renders import two_render_loss as two_render_loss
 from torchtransient.losses.phasors import PhasorLoss as PhasorLoss

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -26,12 +26,12 @@ def check_reduction(reduction: Reduction, where: str) -> None:
 
 
 def check_pair(
-    input: Tensor, target: Tensor, where: str, *, complex_too: bool = False, names: str = "input and target"
+    input: object, target: object, where: str, *, complex_too: bool = False, names: str = "input and target"
 ) -> tuple[Tensor, Tensor]:
     """Both in their common dtype (`working_dtype`). Raises ShapeError for no tensors or two shapes, UnitError for other
     numbers, DeviceError.
     """
-    check_dense((input, target), where)
+    input, target = check_dense((input, target), where)
     if input.shape != target.shape:
         raise ShapeError(
             f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
@@ -41,14 +41,15 @@ def check_pair(
     return input.to(dtype), target.to(dtype)
 
 
-def check_dense(tensors: tuple[object, ...], where: str) -> None:
-    """Raises ShapeError unless all are tensors, and none a sparse one."""
+def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
+    """The same. Raises ShapeError unless all are tensors, and none a sparse one."""
     kinds = [
         str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
     ]
     if not all(isinstance(x, Tensor) and x.layout == torch.strided for x in tensors):
         number = {1: "a dense tensor", 2: "two dense tensors"}.get(len(tensors), "dense tensors")
         raise ShapeError(f"{where}: expected {number}, got {' and '.join(kinds)}.")
+    return cast("tuple[Tensor, ...]", tensors)
 
 
 def check_device(x: Tensor, other: Tensor, where: str, names: str) -> None:

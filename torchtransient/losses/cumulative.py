@@ -9,23 +9,23 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_flag,
-    check_level,
     check_mask,
     check_option,
     check_pair,
     counted,
     reduce,
 )
-from torchtransient.losses.layouts import bins_dim, check_held
+from torchtransient.losses.layouts import bin_width, bins_dim, check_held
+from torchtransient.losses.measured import TRANSIENT, Transient, reads
 
 
+@reads(input=TRANSIENT, target=TRANSIENT)
 def cumulative_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Transient,
+    target: Transient,
     bin_width_opl: float | None = None,
     *,
     per_root_count: bool = False,
@@ -41,8 +41,8 @@ def cumulative_loss(
 
     `per_root_count`: over the root of the target's total in each pixel (at least one), the noise of its running sum
     where the target is photon counts, so that bright pixels do not outvote dark ones; without gradient, not symmetric.
-    `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins that do not count are empty in both, and have no
-    width. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
+    `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins that do not count are empty in both and
+    have no width. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "cumulative_loss"
     check_held(reduction, dim, where)
@@ -50,9 +50,7 @@ def cumulative_loss(
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
-    if bin_width_opl is None:
-        raise UnitError(f"{where}: expected bin_width_opl, metres of optical path, with tensors, got None.")
-    width = check_level("bin_width_opl", bin_width_opl, input.new_empty(()), where)
+    width = bin_width(bin_width_opl, input, where)
     a, b = counted(input, mask), counted(target, mask)
     area = width * counted((a - b).cumsum(dim).abs(), mask).sum(dim)
     if per_root_count:
@@ -77,7 +75,7 @@ class CumulativeLoss(nn.Module):
         self.bin_width_opl, self.per_root_count = bin_width_opl, per_root_count
         self.dim, self.reduction = dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return cumulative_loss(
             input,
             target,

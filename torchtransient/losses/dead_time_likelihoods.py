@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import (
     Reduction,
+    check_dense,
     check_mask,
     check_option,
     check_reduction,
@@ -24,6 +25,7 @@ from torchtransient.losses.comparison import (
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import as_columns, bins_dim, check_held
 from torchtransient.losses.likelihoods import Options, check_constant, check_counts, check_rates, floored
+from torchtransient.losses.measured import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.spad import first_photon_log_prob
@@ -46,9 +48,10 @@ def _exact(measured: Tensor, mask: Tensor | None, dim: int) -> Tensor:
     return counts if mask is None else counted(counts, mask.any(dim, keepdim=True))
 
 
+@reads(counts=TRANSIENT, rate=TRANSIENT)
 def first_photon_nll(
-    counts: Tensor,
-    rate: Tensor,
+    counts: Transient,
+    rate: Transient,
     cycles: int,
     *,
     dead_bins: float | None = None,
@@ -69,9 +72,10 @@ def first_photon_nll(
     return _first_photon(counts, rate, cycles, dead_bins, options, "first_photon_nll")
 
 
+@reads(input=TRANSIENT, target=TRANSIENT)
 def first_photon_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Transient,
+    target: Transient,
     cycles: int,
     *,
     dead_bins: float | None = None,
@@ -86,10 +90,10 @@ def first_photon_loss(
 
 
 def _first_photon(
-    counts: Tensor, rate: Tensor, cycles: int, dead_bins: float | None, options: Options, where: str
+    given: object, model: object, cycles: int, dead_bins: float | None, options: Options, where: str
 ) -> Tensor:
     check_reduction(options.reduction, where)
-    measured, rate = counts, check_counts(counts, rate, where)[1]
+    (measured, _), rate = check_dense((given, model), where), check_counts(given, model, where)[1]
     number = check_whole("cycles", cycles, where, UnitError)
     dead = None if dead_bins is None else _check_dead_time(dead_bins, where)
     dim = bins_dim(rate, options.dim, where)
@@ -125,9 +129,10 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
     return periods - window - edges
 
 
+@reads(counts=TRANSIENT, rate=TRANSIENT)
 def free_running_nll(
-    counts: Tensor,
-    rate: Tensor,
+    counts: Transient,
+    rate: Transient,
     periods: int,
     dead_bins: float,
     *,
@@ -145,7 +150,7 @@ def free_running_nll(
     """
     where = "free_running_nll"
     check_reduction(reduction, where)
-    measured, rate = counts, check_counts(counts, rate, where)[1]
+    (measured, _), rate = check_dense((counts, rate), where), check_counts(counts, rate, where)[1]
     periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
     dim = bins_dim(rate, dim, where)
     mask = check_mask(mask, rate, where)
@@ -186,7 +191,7 @@ class _FirstPhoton(nn.Module):
 class FirstPhotonNLL(_FirstPhoton):
     """`first_photon_nll(counts, rate, cycles)` with its options held."""
 
-    def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, counts: Transient, rate: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
             counts,
             rate,
@@ -202,7 +207,7 @@ class FirstPhotonNLL(_FirstPhoton):
 class FirstPhotonLoss(_FirstPhoton):
     """`first_photon_loss(input, target, cycles)` with its options held."""
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_loss(
             input,
             target,
@@ -234,7 +239,7 @@ class FreeRunningNLL(nn.Module):
         self.dead_bins = _check_dead_time(dead_bins, where)
         self.floor, self.dim, self.reduction = floor, dim, reduction
 
-    def forward(self, counts: Tensor, rate: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, counts: Transient, rate: Transient, mask: Tensor | None = None) -> Tensor:
         return free_running_nll(
             counts,
             rate,

@@ -22,6 +22,7 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
+from torchtransient.losses.measured import LIGHT, Light, reads
 from torchtransient.losses.roots import anscombe
 
 _OFFSET = Fraction(3, 8)
@@ -47,8 +48,9 @@ def expected_anscombe(mean: Tensor) -> Tensor:
     return anscombe(light) + _correction(light) + torch.where(negative, mean, torch.zeros_like(mean)) * _SLOPE
 
 
+@reads(input=LIGHT, target=LIGHT)
 def expected_root_loss(
-    input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean"
+    input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """`(anscombe(target) - expected_anscombe(input))^2` of each element, any shape: a model's mean counts, and counts.
 
@@ -143,5 +145,5 @@ class ExpectedRootLoss(nn.Module):
         check_reduction(reduction, "ExpectedRootLoss")
         self.reduction = reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return expected_root_loss(input, target, mask=mask, reduction=self.reduction)

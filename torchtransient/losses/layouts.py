@@ -14,8 +14,8 @@ import operator
 
 from torch import Tensor
 
-from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import Reduction, check_reduction
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.losses.comparison import Reduction, check_level, check_reduction
 from torchtransient.quantities import shown
 
 _IMAGES = -3
@@ -69,6 +69,16 @@ def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
     if not x.shape[place]:
         raise ShapeError(f"{where}: expected one or more bins in dimension {place}, got {tuple(x.shape)}.")
     return place
+
+
+def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
+    """The width of a bin, metres of optical path, in the precision of `like`. Raises UnitError, also for none."""
+    if width_opl is None:
+        raise UnitError(
+            f"{where}: expected bin_width_opl, metres of optical path, with tensors, got None. Give "
+            "axis.bin_width_opl, or a result that has an axis."
+        )
+    return check_level("bin_width_opl", width_opl, like.new_empty(()), where)
 
 
 def item_dims(x: Tensor, dim: int | None, where: str, instead: str = "") -> tuple[int, ...]:

@@ -35,6 +35,7 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import check_held, item_dims
+from torchtransient.losses.measured import LIGHT, Light, reads
 
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
 _RELATIVE_FLOOR = 1e-3
@@ -50,10 +51,10 @@ class Options(NamedTuple):
     constant: bool = False
 
 
-def check_counts(measured: Tensor, model: Tensor, where: str) -> tuple[Tensor, Tensor]:
+def check_counts(measured: object, model: object, where: str) -> tuple[Tensor, Tensor]:
     """Both in their common dtype. Raises ShapeError, DeviceError; UnitError for other numbers and whole models."""
     pair = check_pair(measured, model, where, names="counts and model")
-    if not model.is_floating_point():
+    if isinstance(model, Tensor) and not model.is_floating_point():
         raise UnitError(f"{where}: expected a model of a floating dtype, got {model.dtype}. Use model.float().")
     return pair
 
@@ -104,9 +105,10 @@ def _relative_floor(
     return (share * torch.where(item > 0, item, whole)).clamp_min(torch.finfo(model.dtype).tiny)
 
 
+@reads(counts=LIGHT, mean=LIGHT)
 def poisson_nll(
-    counts: Tensor,
-    mean: Tensor,
+    counts: Light,
+    mean: Light,
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
@@ -123,9 +125,9 @@ def poisson_nll(
     return _poisson(counts, mean, Options(floor, dim, mask, reduction, constant), "poisson_nll")
 
 
-def _poisson(counts: Tensor, mean: Tensor, options: Options, where: str) -> Tensor:
+def _poisson(given: object, model: object, options: Options, where: str) -> Tensor:
     check_held(options.reduction, options.dim, where)
-    counts, mean = check_counts(counts, mean, where)
+    counts, mean = check_counts(given, model, where)
     mask = check_mask(options.mask, mean, where)
     counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
     check_rates(mean, where)
@@ -140,9 +142,10 @@ def _poisson(counts: Tensor, mean: Tensor, options: Options, where: str) -> Tens
     return _reduce(value, options.reduction, where, mask)
 
 
+@reads(input=LIGHT, target=LIGHT)
 def poisson_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Light,
+    target: Light,
     *,
     floor: Tensor | float | None = None,
     dim: int | None = None,
@@ -153,9 +156,10 @@ def poisson_loss(
     return _poisson(target, input, Options(floor, dim, mask, reduction), "poisson_loss")
 
 
+@reads(measured=LIGHT, mean=LIGHT)
 def read_noise_nll(
-    measured: Tensor,
-    mean: Tensor,
+    measured: Light,
+    mean: Light,
     read_noise: Tensor | float,
     *,
     shot_noise: bool = True,
@@ -195,14 +199,14 @@ class _Poisson(nn.Module):
 class PoissonNLL(_Poisson):
     """`poisson_nll(counts, mean)` with its options held."""
 
-    def forward(self, counts: Tensor, mean: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, counts: Light, mean: Light, mask: Tensor | None = None) -> Tensor:
         return poisson_nll(counts, mean, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
 
 
 class PoissonLoss(_Poisson):
     """`poisson_loss(input, target)` with its options held."""
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return poisson_loss(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
 
 
@@ -216,7 +220,7 @@ class ReadNoiseNLL(nn.Module):
         check_option("read_noise", read_noise, "ReadNoiseNLL", needed=True, square=True)
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
 
-    def forward(self, measured: Tensor, mean: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, measured: Light, mean: Light, mask: Tensor | None = None) -> Tensor:
         return read_noise_nll(
             measured, mean, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
         )

@@ -24,6 +24,7 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import check_held, item_dims
+from torchtransient.losses.measured import LIGHT, VALUES, Light, Volume, reads
 
 # The first argument of likelihoods that are not losses (input, target): a model there would be taken for counts.
 _MEASUREMENT_FIRST = {"counts", "measured", "target"}
@@ -43,7 +44,8 @@ class PairModule(Protocol):
     def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
 
 
-def squared_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
+@reads(input=LIGHT, target=LIGHT)
+def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
     """`|input - target|^2` of each element, real or complex, any shape. Symmetric. Raises ShapeError, UnitError."""
     check_reduction(reduction, "squared_loss")
     input, target = check_pair(input, target, "squared_loss", complex_too=True)
@@ -51,9 +53,10 @@ def squared_loss(input: Tensor, target: Tensor, *, mask: Tensor | None = None, r
     return reduce(_power(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
 
 
+@reads(volume=VALUES, measured=LIGHT)
 def measurement_consistency(
-    volume: Tensor,
-    measured: Tensor,
+    volume: Volume,
+    measured: Light,
     operator: Callable[[Tensor], Tensor],
     *,
     compare: PairLoss | PairModule = squared_loss,
@@ -78,7 +81,7 @@ def measurement_consistency(
     where = "measurement_consistency"
     check_held(reduction, dim, where)
     compared = _checked(operator, compare, scale_invariant, reduction, where)
-    check_dense((volume, measured), where)
+    volume, measured = check_dense((volume, measured), where)
     prediction = operator(volume)
     if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
         got = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
@@ -177,7 +180,7 @@ class SquaredLoss(nn.Module):
         check_reduction(reduction, "SquaredLoss")
         self.reduction = reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return squared_loss(input, target, mask=mask, reduction=self.reduction)
 
 
@@ -201,7 +204,7 @@ class MeasurementConsistency(nn.Module):
         self.operator, self.compare = operator, compare
         self.scale_invariant, self.dim, self.reduction = scale_invariant, dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Volume, target: Light, mask: Tensor | None = None) -> Tensor:
         return measurement_consistency(
             input,
             target,

@@ -6,13 +6,28 @@ parameters change, too. The product of the residuals of two independent renders 
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 from torch import Tensor, nn
 
-from torchtransient.losses.comparison import Reduction, check_mask, check_pair, check_reduction, counted, reduce
+from torchtransient.errors import UnitError
+from torchtransient.losses.comparison import (
+    Reduction,
+    check_mask,
+    check_pair,
+    check_reduction,
+    check_whole,
+    counted,
+    reduce,
+)
+from torchtransient.losses.measured import LIGHT, Light, reads
+from torchtransient.quantities import finite, shown
 
 
+@reads(first=LIGHT, second=LIGHT, target=LIGHT)
 def two_render_loss(
-    first: Tensor, second: Tensor, target: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean"
+    first: Light, second: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """`Re[(first - target) conj(second - target)]` of each element, real or complex, any shape: a squared error.
 
@@ -31,6 +46,59 @@ def two_render_loss(
     return reduce(product, reduction, where, mask)
 
 
+@dataclass(frozen=True)
+class SampleSchedule:
+    """Samples per pixel of a fit: few at first, where noise averages out over steps, more where bias is left.
+
+    `schedule(step)`: `first` up to the share `hold` of `steps`, then doubled in equal parts of what is left, and `last`
+    from the end on. By doubling alone, since every other number of samples is compiled and recorded anew. Numbers only:
+    `renderer(values, spp=schedule(step), seed=step)`. Raises UnitError for numbers that are no such schedule.
+    """
+
+    first: int
+    last: int
+    steps: int
+    hold: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name in ("first", "last", "steps"):
+            object.__setattr__(self, name, check_whole(name, getattr(self, name), "SampleSchedule", UnitError))
+        object.__setattr__(self, "hold", finite("SampleSchedule: hold", self.hold))
+        if self.last < self.first or not 0 <= self.hold <= 1:
+            raise UnitError(
+                f"SampleSchedule: expected first <= last and hold between 0 and 1, got {self.first}, {self.last} and "
+                f"{self.hold}."
+            )
+
+    def __call__(self, step: int) -> int:
+        """Samples per pixel of that step, counted from 0."""
+        number = finite("SampleSchedule: step", step)
+        if number < 0:
+            raise UnitError(f"SampleSchedule: expected a step of 0 or more, got {shown(step)}.")
+        doublings = math.ceil(math.log2(self.last / self.first))
+        share = number / self.steps
+        if share < self.hold or doublings == 0:
+            return self.first
+        done = doublings if share >= 1 else 1 + math.floor((share - self.hold) / (1 - self.hold) * doublings)
+        return min(self.last, self.first << done)
+
+    @staticmethod
+    def needed(spp: int, bias: float, allowed: float) -> int:
+        """Samples per pixel at which a `bias` of a loss at `spp` is at most `allowed`, which is in its unit.
+
+        The bias of a loss of a render falls with one over the samples; that of a squared error is `squared_loss(first,
+        target) - two_render_loss(first, second, target)`. Take a tenth of what the noise of the target makes of the
+        loss. By doubling `spp`, at least itself, also where the estimate of the bias is below zero. Raises UnitError.
+        """
+        where = "SampleSchedule.needed"
+        number = check_whole("spp", spp, where, UnitError)
+        limit = finite(f"{where}: allowed", allowed)
+        if limit <= 0:
+            raise UnitError(f"{where}: expected allowed above zero, got {shown(allowed)}.")
+        ratio = finite(f"{where}: bias", bias) / limit
+        return number << math.ceil(math.log2(ratio)) if ratio > 1 else number
+
+
 class TwoRenderLoss(nn.Module):
     """`two_render_loss(first, second, target)` with its reduction held."""
 
@@ -39,5 +107,5 @@ class TwoRenderLoss(nn.Module):
         check_reduction(reduction, "TwoRenderLoss")
         self.reduction = reduction
 
-    def forward(self, first: Tensor, second: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, first: Light, second: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return two_render_loss(first, second, target, mask=mask, reduction=self.reduction)

@@ -30,6 +30,8 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.layouts import bins_dim, check_held, item_dims
+from torchtransient.losses.measured import PHASOR, TRANSIENT, Phasors, Transient, reads
+from torchtransient.quantities import shown
 from torchtransient.sensing.layout import without_autocast
 
 # The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
@@ -38,8 +40,13 @@ _PHASE_FLOOR = 1e-3
 _ROUNDING = 1e-9
 
 
+@reads(transient=TRANSIENT)
 def transient_phasors(
-    transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, *, dim: int | None = None
+    transient: Transient,
+    axis: TimeAxis | None = None,
+    frequencies: FrequencyAxis | None = None,
+    *,
+    dim: int | None = None,
 ) -> Tensor:
     """Phasors (..., C, F, Y, X), complex, of transients (..., C, T, Y, X): a dense transform to F frequencies.
 
@@ -52,9 +59,11 @@ def transient_phasors(
     return _phasors(transient, axis, frequencies, dim, "transient_phasors")
 
 
-def _phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, dim: int | None, where: str) -> Tensor:
-    _check_axes(axis, frequencies, where)
-    check_dense((transient,), where)
+def _phasors(
+    given: object, time_axis: TimeAxis | None, band: FrequencyAxis | None, dim: int | None, where: str
+) -> Tensor:
+    axis, frequencies = _check_axes(time_axis, band, where)
+    (transient,) = check_dense((given,), where)
     place = bins_dim(transient, dim, where) + transient.ndim
     lead, bins, trail = transient.shape[:place], transient.shape[place], transient.shape[place + 1 :]
     if bins != axis.num_bins:
@@ -70,12 +79,14 @@ def _phasors(transient: Tensor, axis: TimeAxis, frequencies: FrequencyAxis, dim:
     return _transformed(record, cos, sin).reshape(*lead, frequencies.num_frequencies, *trail)
 
 
-def _check_axes(axis: TimeAxis, frequencies: FrequencyAxis, where: str) -> None:
+def _check_axes(
+    axis: TimeAxis | None, frequencies: FrequencyAxis | None, where: str
+) -> tuple[TimeAxis, FrequencyAxis]:
     """Raises UnitError for no axes, and for frequencies that bins cannot tell from lower ones."""
     if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
         raise UnitError(
             f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
-            f"{type(frequencies).__name__}."
+            f"{type(frequencies).__name__}. Results that have an axis need no other."
         )
     highest, most = max(abs(f) for f in frequencies.frequencies), 0.5 / axis.bin_width_opl
     if highest > most * (1 + _ROUNDING):
@@ -83,6 +94,7 @@ def _check_axes(axis: TimeAxis, frequencies: FrequencyAxis, where: str) -> None:
             f"{where}: expected a wavelength of two bins at least, frequencies of {most:.4g} per metre at most, got "
             f"{highest:.4g}. Take narrower bins or lower frequencies; in hertz with FrequencyAxis.from_hertz."
         )
+    return axis, frequencies
 
 
 @without_autocast
@@ -90,9 +102,10 @@ def _transformed(record: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.complex(cos @ record, sin @ record)
 
 
+@reads(input=PHASOR, target=PHASOR)
 def phasor_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Phasors,
+    target: Phasors,
     *,
     phase_only: bool = False,
     floor: Tensor | float | None = None,
@@ -112,8 +125,8 @@ def phasor_loss(
 
 
 def _phasor_loss(
-    input: Tensor,
-    target: Tensor,
+    ours: object,
+    theirs: object,
     phases: tuple[bool, Tensor | float | None, int | None],
     mask: Tensor | None,
     reduction: Reduction,
@@ -123,7 +136,7 @@ def _phasor_loss(
     check_flag("phase_only", phase_only, where)
     check_held(reduction, dim, where)
     check_option("floor", floor, where)
-    input, target = check_pair(input, target, where, complex_too=True)
+    input, target = check_pair(ours, theirs, where, complex_too=True)
     if not input.is_complex():
         raise UnitError(f"{where}: expected complex phasors, got {input.dtype}. See transient_phasor_loss.")
     mask = check_mask(mask, input, where)
@@ -131,10 +144,10 @@ def _phasor_loss(
     if phase_only:
         if floor is None:
             item = item_dims(input, dim, where, " or floor=")
-            ours, theirs = (_PHASE_FLOOR * item_scale(*x, item, mask) for x in ((input, target), (target, input)))
+            scale, other = (_PHASE_FLOOR * item_scale(*x, item, mask) for x in ((input, target), (target, input)))
         else:
-            ours = theirs = check_level("floor", floor, input, where)
-        input, target = _phase(input, ours), _phase(target, theirs)
+            scale = other = check_level("floor", floor, input, where)
+        input, target = _phase(input, scale), _phase(target, other)
     difference = input - target
     return reduce(difference.real.square() + difference.imag.square(), reduction, where, mask)
 
@@ -146,11 +159,12 @@ def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
     return scaled / (scaled.real.square() + scaled.imag.square() + (floor / size) ** 2).sqrt()
 
 
+@reads(input=TRANSIENT, target=TRANSIENT)
 def transient_phasor_loss(
-    input: Tensor,
-    target: Tensor,
-    axis: TimeAxis,
-    frequencies: FrequencyAxis,
+    input: Transient,
+    target: Transient,
+    axis: TimeAxis | None = None,
+    frequencies: FrequencyAxis | None = None,
     *,
     phase_only: bool = False,
     floor: Tensor | float | None = None,
@@ -191,7 +205,7 @@ class PhasorLoss(nn.Module):
         check_option("floor", floor, "PhasorLoss")
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Phasors, target: Phasors, mask: Tensor | None = None) -> Tensor:
         return phasor_loss(
             input,
             target,
@@ -208,8 +222,8 @@ class TransientPhasorLoss(nn.Module):
 
     def __init__(
         self,
-        axis: TimeAxis,
-        frequencies: FrequencyAxis,
+        axis: TimeAxis | None = None,
+        frequencies: FrequencyAxis | None = None,
         phase_only: bool = False,
         floor: float | None = None,
         dim: int | None = None,
@@ -217,13 +231,16 @@ class TransientPhasorLoss(nn.Module):
     ) -> None:
         super().__init__()
         check_held(reduction, dim, "TransientPhasorLoss")
-        _check_axes(axis, frequencies, "TransientPhasorLoss")
+        if axis is not None:
+            _check_axes(axis, frequencies, "TransientPhasorLoss")
+        elif not isinstance(frequencies, FrequencyAxis):
+            raise UnitError(f"TransientPhasorLoss: expected frequencies, a FrequencyAxis, got {shown(frequencies)}.")
         check_flag("phase_only", phase_only, "TransientPhasorLoss")
         check_option("floor", floor, "TransientPhasorLoss")
         self.axis, self.frequencies = axis, frequencies
         self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return transient_phasor_loss(
             input,
             target,

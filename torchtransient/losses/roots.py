@@ -24,6 +24,7 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.layouts import check_held, item_dims
+from torchtransient.losses.measured import LIGHT, Light, reads
 
 _OFFSET = 3 / 8
 _BACKGROUND = 1e-3
@@ -48,9 +49,10 @@ def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
     return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / math.sqrt(offset)
 
 
+@reads(input=LIGHT, target=LIGHT)
 def root_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Light,
+    target: Light,
     *,
     root: Callable[[Tensor], Tensor] = anscombe,
     mask: Tensor | None = None,
@@ -74,9 +76,10 @@ def root_loss(
     return reduce((ours - theirs).square(), reduction, "root_loss", mask)
 
 
+@reads(input=LIGHT, target=LIGHT)
 def log_ratio_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Light,
+    target: Light,
     *,
     background: Tensor | float | None = None,
     dim: int | None = None,
@@ -119,7 +122,7 @@ class RootLoss(nn.Module):
         check_function("root", root, "RootLoss")
         self.root, self.reduction = root, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return root_loss(input, target, root=self.root, mask=mask, reduction=self.reduction)
 
 
@@ -134,7 +137,7 @@ class LogRatioLoss(nn.Module):
         check_option("background", background, "LogRatioLoss")
         self.background, self.dim, self.reduction = background, dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return log_ratio_loss(
             input, target, background=self.background, dim=self.dim, mask=mask, reduction=self.reduction
         )

@@ -17,13 +17,15 @@ from torchtransient.losses.comparison import (
     counted,
     reduce,
 )
+from torchtransient.losses.measured import STEADY, VALUES, Picture, Volume, reads
 
 WINDOW = 11
 
 
+@reads(input=STEADY, target=STEADY)
 def ssim_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Picture,
+    target: Picture,
     *,
     window: int = WINDOW,
     value_range: float | None = None,
@@ -50,8 +52,8 @@ def _check_window(window: int, where: str) -> int:
 
 
 def _ssim(
-    input: Tensor,
-    target: Tensor,
+    ours: object,
+    theirs: object,
     options: tuple[int, float | None],
     mask: Tensor | None,
     reduction: Reduction,
@@ -60,7 +62,7 @@ def _ssim(
     from kornia.metrics import ssim
 
     check_reduction(reduction, where)
-    input, target = check_pair(input, target, where)
+    input, target = check_pair(ours, theirs, where)
     window, value_range = _check_window(options[0], where), options[1]
     half = window // 2
     if input.ndim < 3 or min(input.shape[-2:]) <= half:
@@ -98,9 +100,10 @@ def _projections(volume: Tensor, where: str) -> tuple[Tensor, Tensor, Tensor]:
     return volume.amax(-3), volume.amax(-2), volume.amax(-1)
 
 
+@reads(input=VALUES, target=VALUES)
 def projection_ssim_loss(
-    input: Tensor,
-    target: Tensor,
+    input: Volume,
+    target: Volume,
     *,
     window: int = WINDOW,
     value_range: float | None = None,
@@ -140,7 +143,7 @@ class SSIMLoss(nn.Module):
         check_option("value_range", value_range, "SSIMLoss")
         self.window, self.value_range, self.reduction = _check_window(window, "SSIMLoss"), value_range, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Picture, target: Picture, mask: Tensor | None = None) -> Tensor:
         return ssim_loss(
             input, target, window=self.window, value_range=self.value_range, mask=mask, reduction=self.reduction
         )
@@ -156,7 +159,7 @@ class ProjectionSSIMLoss(nn.Module):
         self.window = _check_window(window, "ProjectionSSIMLoss")
         self.value_range, self.reduction = value_range, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Volume, target: Volume, mask: Tensor | None = None) -> Tensor:
         return projection_ssim_loss(
             input, target, window=self.window, value_range=self.value_range, mask=mask, reduction=self.reduction
         )

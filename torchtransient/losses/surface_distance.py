@@ -30,7 +30,7 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
                 f"{where}: expected {name} (V, 3) with one or more faces (F, 3), got {tuple(mesh.shape)} and "
                 f"{tuple(index.shape)}."
             )
-        _check_faces(index, mesh, f"{where}: {name}")
+        check_faces(index, mesh, f"{where}: {name}")
     check_device(vertices, others, where, "both meshes")
     cells = check_whole("cells", cells, where)
     dtype = working_dtype((vertices, others), where)
@@ -43,7 +43,7 @@ def _both_ways(first: Tensor, second: Tensor, cells: int) -> Tensor:
     return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
 
 
-def _check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
+def check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
         raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
     check_device(faces, vertices, where, "vertices and faces")

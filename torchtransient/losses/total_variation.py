@@ -21,16 +21,18 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
+from torchtransient.losses.measured import VALUES, Volume, reads
 from torchtransient.quantities import shown
 
 _DIMS = (-3, -2, -1)
 _SMOOTHING = 1e-3
 
 
+@reads(volume=VALUES)
 def total_variation(
-    volume: Tensor,
+    volume: Volume,
     *,
-    spacing: Sequence[float] = (1.0, 1.0, 1.0),
+    spacing: Sequence[float] | None = None,
     isotropic: bool = True,
     smoothing: float | None = None,
     mask: Tensor | None = None,
@@ -38,8 +40,8 @@ def total_variation(
 ) -> Tensor:
     """Modulus of the gradient of each voxel of a volume (..., Z, Y, X), real or complex (Rudin, Osher, Fatemi 1992).
 
-    Differences to the next voxel along Z, Y, X over `spacing`, metres between voxels (of a `VoxelGrid` with even depths
-    `(depths[1] - depths[0], *pitch)`; without it per voxel); none past the end, none to voxels that do not count.
+    Differences to the next voxel along Z, Y, X over `spacing`, metres between voxels (None: those of the grid of
+    a `HiddenVolume`, or per voxel); none past the end, none to voxels that do not count.
     `isotropic`: the root of the sum of their squares; else the sum of their moduli, which favours faces along the axes.
     Times the volume of a voxel, its sum is the area of a surface times the step across it
     (anisotropic: of its projections onto the axes).
@@ -51,7 +53,7 @@ def total_variation(
     where = "total_variation"
     check_reduction(reduction, where)
     check_flag("isotropic", isotropic, where)
-    check_dense((volume,), where)
+    (volume,) = check_dense((volume,), where)
     if volume.ndim < 3:
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
     volume = volume.to(working_dtype((volume,), where, complex_too=True))
@@ -71,7 +73,9 @@ def total_variation(
     return reduce(value, reduction, where, mask)
 
 
-def _check_spacing(spacing: Sequence[float], like: Tensor, where: str) -> tuple[float, float, float]:
+def _check_spacing(spacing: Sequence[float] | None, like: Tensor, where: str) -> tuple[float, float, float]:
+    if spacing is None:
+        return 1.0, 1.0, 1.0
     if not hasattr(spacing, "__len__") or len(spacing) != 3:
         raise ShapeError(
             f"{where}: expected the spacing along Z, Y and X, three numbers, got {shown(spacing)}. For a VoxelGrid "
@@ -106,7 +110,7 @@ class TotalVariation(nn.Module):
 
     def __init__(
         self,
-        spacing: Sequence[float] = (1.0, 1.0, 1.0),
+        spacing: Sequence[float] | None = None,
         isotropic: bool = True,
         smoothing: float | None = None,
         reduction: Reduction = "mean",
@@ -115,11 +119,12 @@ class TotalVariation(nn.Module):
         check_reduction(reduction, "TotalVariation")
         check_flag("isotropic", isotropic, "TotalVariation")
         check_option("smoothing", smoothing, "TotalVariation", zero=True, square=True)
-        self.spacing = _check_spacing(spacing, torch.empty((), dtype=torch.float64), "TotalVariation")
+        checked = _check_spacing(spacing, torch.empty((), dtype=torch.float64), "TotalVariation")
+        self.spacing = None if spacing is None else checked
         self.isotropic = isotropic
         self.smoothing, self.reduction = smoothing, reduction
 
-    def forward(self, volume: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, volume: Volume, mask: Tensor | None = None) -> Tensor:
         return total_variation(
             volume,
             spacing=self.spacing,

@@ -20,16 +20,18 @@ from torchtransient.losses.comparison import (
     item_scale,
     reduce,
 )
-from torchtransient.losses.layouts import bins_dim, check_held, item_dims
+from torchtransient.losses.layouts import bin_width, bins_dim, check_held, item_dims
+from torchtransient.losses.measured import TRANSIENT, Transient, reads
 
 # Pixels below this share of the mean light of a pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3
 
 
+@reads(input=TRANSIENT, target=TRANSIENT)
 def wasserstein_loss(
-    input: Tensor,
-    target: Tensor,
-    bin_width_opl: float,
+    input: Transient,
+    target: Transient,
+    bin_width_opl: float | None = None,
     *,
     creation_cost_opl: float | None = None,
     floor: Tensor | float | None = None,
@@ -50,8 +52,9 @@ def wasserstein_loss(
     pixels. This is the cost of one way to do it, at least that of the cheapest (partial optimal transport).
 
     Light counts as at the middle of its bin; negative bins, of captures less their background, enter the same formula.
-    Computed by cumulative sums of differences. `dim`: where time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins
-    that do not count are empty in both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
+    Computed by cumulative sums of differences. `bin_width_opl`: None takes that of results with an axis. `dim`: where
+    time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins that do not count are empty in both. `reduction="none"`:
+    without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "wasserstein_loss"
     check_held(reduction, dim, where)
@@ -59,7 +62,7 @@ def wasserstein_loss(
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
-    width = check_level("bin_width_opl", bin_width_opl, input.new_empty(()), where)
+    width = bin_width(bin_width_opl, input, where)
     pixels = None if mask is None else mask.any(dim)
     a, b = counted(input, mask), counted(target, mask)
     if creation_cost_opl is not None:
@@ -111,7 +114,7 @@ class WassersteinLoss(nn.Module):
 
     def __init__(
         self,
-        bin_width_opl: float,
+        bin_width_opl: float | None = None,
         creation_cost_opl: float | None = None,
         floor: float | None = None,
         dim: int | None = None,
@@ -119,13 +122,13 @@ class WassersteinLoss(nn.Module):
     ) -> None:
         super().__init__()
         check_held(reduction, dim, "WassersteinLoss")
-        check_option("bin_width_opl", bin_width_opl, "WassersteinLoss", needed=True)
+        check_option("bin_width_opl", bin_width_opl, "WassersteinLoss")
         check_option("creation_cost_opl", creation_cost_opl, "WassersteinLoss")
         check_option("floor", floor, "WassersteinLoss")
         self.bin_width_opl, self.creation_cost_opl = bin_width_opl, creation_cost_opl
         self.floor, self.dim, self.reduction = floor, dim, reduction
 
-    def forward(self, input: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return wasserstein_loss(
             input,
             target,

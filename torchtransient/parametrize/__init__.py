@@ -24,3 +24,9 @@ from torchtransient.parametrize.positive import positive_inverse as positive_inv
 from torchtransient.parametrize.registration import original as original
 from torchtransient.parametrize.registration import register as register
 from torchtransient.parametrize.registration import remove as remove
+from torchtransient.parametrize.simplex import Simplex as Simplex
+from torchtransient.parametrize.simplex import simplex as simplex
+from torchtransient.parametrize.simplex import simplex_inverse as simplex_inverse
+from torchtransient.parametrize.spectra import PositiveSpectrum as PositiveSpectrum
+from torchtransient.parametrize.spectra import ReflectanceSpectrum as ReflectanceSpectrum
+from torchtransient.parametrize.spectra import spline_basis as spline_basis

@@ -22,7 +22,7 @@ def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
     `low`, `high`: finite numbers, or tensors that broadcast to `x`, low < high. Raises UnitError, ShapeError.
     """
     where = "bounded"
-    x = _floating(x, where)
+    x = floating(x, where)
     below, above = _ends(x, low, high, where)
     width = above - below
     # From the nearer end: full precision at both, and no rounding past the upper one.
@@ -36,11 +36,11 @@ def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, margin: 
     share of the range between 0 and 0.5; what is nearer is moved there. Values beyond the bounds by more than rounding,
     and such as are not finite, raise UnitError in any case.
     """
-    return _inverse(value, low, high, _checked_margin(margin, "bounded_inverse"), "bounded_inverse")
+    return _inverse(value, low, high, checked_margin(margin, "bounded_inverse"), "bounded_inverse")
 
 
 def _inverse(value: Tensor, low: Bound, high: Bound, margin: float | None, where: str) -> Tensor:
-    value = _floating(value, where)
+    value = floating(value, where)
     below, above = _ends(value, low, high, where)
     width = above - below
     share = (value - below) / width
@@ -70,7 +70,7 @@ class Bounded(nn.Module):
     def __init__(self, low: Any = 0.0, high: Any = 1.0, margin: float | None = None) -> None:
         super().__init__()
         name = type(self).__name__
-        self.margin = _checked_margin(margin, name)
+        self.margin = checked_margin(margin, name)
         ends = [_bound(given, name) for given in (low, high)]
         _check_order(ends[0], ends[1], name)
         self.register_buffer("low", ends[0], persistent=False)
@@ -124,7 +124,8 @@ class Anisotropy(Bounded):
 # ------------------------------------------------------------------------------------------------------------- checks
 
 
-def _floating(x: Tensor, where: str) -> Tensor:
+def floating(x: Tensor, where: str) -> Tensor:
+    """The tensor. Raises ShapeError for what is none of floating numbers."""
     if not isinstance(x, Tensor) or not x.is_floating_point():
         got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
         raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
@@ -169,7 +170,8 @@ def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Te
     return ends[0], ends[1]
 
 
-def _checked_margin(margin: Any, where: str) -> float | None:
+def checked_margin(margin: Any, where: str) -> float | None:
+    """A share between 0 and 0.5, or None. Raises UnitError."""
     if margin is None:
         return None
     number = as_number(margin)

@@ -1,11 +1,13 @@
 """Rigid motions as six numbers: three of rotation (axis times angle, radians), three of translation (metres).
 
-Matrices act on column vectors, as Mitsuba's `to_world`. Exponentials and logarithms are kornia's, which have
-derivatives at zero, too.
+Matrices act on column vectors, as Mitsuba's `to_world`. Rotations are kornia's, which have derivatives at zero. The
+exponential of SE(3) is not: kornia's turns tensors into parameters, which loses forward-mode tangents, and its Jacobian
+of SO(3) has no second derivative at zero.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
@@ -13,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.parametrize.bounded import _floating
+from torchtransient.parametrize.bounded import floating
 from torchtransient.quantities import positive, real_array, shown
 
 Frame = Literal["world", "local"]
@@ -43,25 +45,21 @@ def pose_from_twist(x: Tensor) -> Tensor:
     """Exponential of SE(3), (..., 4, 4) of (..., 6): `x[..., :3]` the rotation (axis times angle, radians),
     `x[..., 3:]` the translation per unit of time of a screw motion, at time 1. Raises ShapeError.
     """
-    from kornia.geometry.liegroup import Se3
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
     x = _six(x, "pose_from_twist")
     flat = x.reshape(-1, 6)
-    found: Tensor = Se3.exp(torch.cat([flat[:, 3:], flat[:, :3]], -1)).matrix()
-    return found.reshape(*x.shape[:-1], 4, 4)
+    turn = flat[:, :3]
+    shift = (_jacobian(turn) @ flat[:, 3:, None])[..., 0]
+    return _assembled(axis_angle_to_rotation_matrix(turn), shift).reshape(*x.shape[:-1], 4, 4)
 
 
 def twist_from_pose(pose: Tensor) -> Tensor:
     """Logarithm of SE(3), (..., 6) of rigid motions (..., 4, 4), angles up to pi; the inverse of `pose_from_twist`.
     Raises ShapeError, UnitError as `axis_angle_from_pose`.
     """
-    from kornia.geometry.liegroup import Se3
-
-    _check_rigid(pose, "twist_from_pose")
-    if not pose.numel():
-        return pose.new_zeros(*pose.shape[:-2], 6)
-    twist: Tensor = Se3.from_matrix(pose.reshape(-1, 4, 4)).log()
-    return torch.cat([twist[:, 3:], twist[:, :3]], -1).reshape(*pose.shape[:-2], 6)
+    turn = _rotation_vector(pose, "twist_from_pose")
+    return torch.cat([turn, torch.linalg.solve(_jacobian(turn), pose[..., :3, 3:])[..., 0]], -1)
 
 
 class _RigidPose(nn.Module):
@@ -92,10 +90,10 @@ class _RigidPose(nn.Module):
         base, centre = self.base.to(x.device, x.dtype), self.centre.to(x.device, x.dtype)
         delta = type(self)._to_matrix(torch.cat([x[..., :3], self.length_scale * x[..., 3:]], -1))
         rotation = delta[..., :3, :3]
-        # About the centre: T(centre) delta T(-centre).
-        shift = delta[..., :3, 3] + centre - (rotation @ centre[..., None])[..., 0]
-        motion = _assembled(rotation, shift)
         try:
+            # About the centre: T(centre) delta T(-centre).
+            shift = delta[..., :3, 3] + centre - (rotation @ centre[..., None])[..., 0]
+            motion = _assembled(rotation, shift)
             return motion @ base if self.frame == "world" else base @ motion
         except RuntimeError:
             raise ShapeError(
@@ -107,7 +105,7 @@ class _RigidPose(nn.Module):
         motion of the base.
         """
         name = type(self).__name__
-        matrix, base, centre = (t.to(torch.float64) for t in (_floating(pose, name), self.base, self.centre))
+        matrix, base, centre = (t.to(torch.float64) for t in (floating(pose, name), self.base, self.centre))
         if matrix.shape[-2:] != (4, 4):
             raise ShapeError(f"{name}: expected transforms (..., 4, 4), got {tuple(matrix.shape)}.")
         inverse = torch.linalg.inv(base)
@@ -152,7 +150,7 @@ class SE3Pose(_RigidPose):
 
 
 def _six(x: Tensor, where: str) -> Tensor:
-    x = _floating(x, where)
+    x = floating(x, where)
     if x.ndim < 1 or x.shape[-1] != 6:
         raise ShapeError(f"{where}: expected six numbers (..., 6), rotation and translation, got {tuple(x.shape)}.")
     return x
@@ -165,18 +163,38 @@ def _assembled(rotation: Tensor, shift: Tensor) -> Tensor:
     return torch.cat([upper, last], -2)
 
 
+def _jacobian(turn: Tensor) -> Tensor:
+    """Left Jacobian of SO(3), (..., 3, 3) of (..., 3): the mean of the rotations from none to `turn`,
+    `1 + (1 - cos a) / a^2 [turn] + (a - sin a) / a^3 [turn]^2`, with a power series of `a^2` below a = 0.5.
+    """
+    square = (turn * turn).sum(-1)[..., None, None]
+    near = square < 0.25
+    s, far = torch.where(near, square, 0.0), torch.where(near, 1.0, square)
+    angle = far.sqrt()
+    series = [torch.zeros_like(s), torch.zeros_like(s)]
+    for k in range(7, -1, -1):
+        sign = (-1) ** k
+        series = [sign / math.factorial(2 * k + first) + s * one for first, one in zip((2, 3), series, strict=True)]
+    first = torch.where(near, series[0], 2 * torch.sin(angle / 2) ** 2 / far)
+    second = torch.where(near, series[1], (angle - torch.sin(angle)) / (far * angle))
+    x, y, z = turn.unbind(-1)
+    none = torch.zeros_like(x)
+    cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(*turn.shape, 3)
+    return torch.eye(3, dtype=turn.dtype, device=turn.device) + first * cross + second * cross @ cross
+
+
 def _rotation_vector(pose: Tensor, where: str) -> Tensor:
-    from kornia.geometry.liegroup import So3
+    from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     _check_rigid(pose, where)
     if not pose.numel():
         return pose.new_zeros(*pose.shape[:-2], 3)
-    vector: Tensor = So3.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).log()
+    vector: Tensor = rotation_matrix_to_axis_angle(pose[..., :3, :3].reshape(-1, 3, 3))
     return vector.reshape(*pose.shape[:-2], 3)
 
 
 def _check_rigid(pose: Tensor, where: str, of_what: str = "") -> None:
-    pose = _floating(pose, where)
+    pose = floating(pose, where)
     if pose.ndim < 2 or pose.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: expected transforms (..., 4, 4), got {tuple(pose.shape)}.")
     rotation = pose.detach()[..., :3, :3]

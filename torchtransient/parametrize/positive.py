@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import UnitError
-from torchtransient.parametrize.bounded import _floating
+from torchtransient.parametrize.bounded import floating
 from torchtransient.quantities import finite, shown
 from torchtransient.quantities import positive as greater_than_zero
 
@@ -23,7 +23,7 @@ def positive(x: Tensor, low: float = 0.0, scale: float = 1.0, function: Shape = 
     the value: what is typical of it. Raises UnitError, ShapeError.
     """
     base, unit = _settings(low, scale, function, "positive")
-    x = _floating(x, "positive")
+    x = floating(x, "positive")
     return base + unit * (torch.exp(x) if function == "exp" else nn.functional.softplus(x))
 
 
@@ -34,7 +34,7 @@ def positive_inverse(value: Tensor, low: float = 0.0, scale: float = 1.0, functi
 
 def _inverse(value: Tensor, low: float, scale: float, function: Shape, where: str) -> Tensor:
     base, unit = _settings(low, scale, function, where)
-    y = (_floating(value, where) - base) / unit
+    y = (floating(value, where) - base) / unit
     if not bool(((y > 0) & torch.isfinite(y)).all()):
         raise UnitError(
             f"{where}: expected finite values above {base:g}, got some from {value.min().item():g} to "

@@ -10,8 +10,9 @@ from torchtransient.errors import SceneError, ShapeError, TorchTransientError, U
 
 
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
-    """`torch.nn.utils.parametrize.register_parametrization` by a key: of a renderer (or a module that holds one) a key
-    of its scene, `"box.to_world"`; of other modules a path, `"encoder.weight"`. Returns the module.
+    """`torch.nn.utils.parametrize.register_parametrization` by a key: of a renderer, or a module that holds one, a key
+    of its scene, `"box.to_world"`; of other modules a path, `"encoder.weight"`; or one behind the other where a module
+    holds several renderers. Returns the module.
 
     The present value is where it starts, by `right_inverse`. Optimisers are made afterwards: `module.parameters()` has
     the numbers behind the value (`original`), and `renderer.values[key]` the value. Another one on the same key is
@@ -67,15 +68,16 @@ def _parametrized(module: nn.Module, key: str) -> tuple[nn.Module, str]:
 
 def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
     """The module that holds the parameter of a key, and its name there."""
-    path, _, last = key.rpartition(".")
-    try:
-        owner = module.get_submodule(path)
-    except AttributeError:
-        owner = None
-    if owner is not None and _has(owner, last):
-        return owner, last
-    # Torch forbids dots: renderers have slashes for them.
-    name = key.replace(".", "/")
+    # Torch forbids dots in names: renderers have slashes for them.
+    parts = key.split(".")
+    for k in range(len(parts)):
+        try:
+            owner = module.get_submodule(".".join(parts[:k]))
+        except AttributeError:
+            break
+        if _has(owner, "/".join(parts[k:])):
+            return owner, "/".join(parts[k:])
+    name = "/".join(parts)
     found = [one for one in module.modules() if _has(one, name)]
     if len(found) == 1:
         return found[0], name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -147,3 +148,28 @@ def test_parts_and_axis(data):
     stream = TransientStream(data, window=(4.0, 5.0), pixels=(slice(3), slice(3)))
     assert stream.axis.num_bins == 50 and next(iter(stream))["transient"].shape == (1, 50, 3, 3)
     assert stream.about["spp"] == 16
+
+
+@pytest.mark.parametrize(("workers", "size", "rank"), [(0, 4, None), (2, 4, None), (3, 2, (1, 2))])
+def test_an_epoch_goes_on_where_it_was_stopped(data, workers, size, rank):
+    share = {} if rank is None else {"rank": rank[0], "world_size": rank[1]}
+
+    def read(batches):
+        stream = TransientStream(data, fields=["depth"], **share)
+        stream.set_epoch(3, batches, size)
+        # More workers than cores, for once.
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="This DataLoader will create")
+            batches = list(DataLoader(stream, batch_size=size, num_workers=workers))
+        return [batch["index"].tolist() for batch in batches]
+
+    whole = read(0)
+    for stop in range(len(whole) + 1) if workers == 0 else (1, len(whole) - 1):
+        assert read(stop) == whole[stop:]
+    stream = TransientStream(data, fields=["depth"], **share)
+    # The epoch after it begins at its beginning.
+    stream.set_epoch(3, 2, size)
+    stream.set_epoch(4)
+    assert len(indices(stream)) == stream.num_samples
+    with pytest.raises(TorchTransientError, match="batches: expected a whole number"):
+        stream.set_epoch(0, -1)

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -68,6 +69,14 @@ def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch, name, value):
     before = digest(write(tmp_path / "a.h5", samples))
     monkeypatch.setenv(name, value)
     assert digest(write(tmp_path / "b.h5", samples)) == before and os.environ[name] == value
+
+
+def test_chunks_are_compressed_without_threads(tmp_path):
+    """Threads of each of 32 chunks would wait 128 times here, and two workers would be hardly faster than one."""
+    samples = [sample(i, (1, 1024, 32, 32)) for i in range(4)]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
+    write(tmp_path / "a.h5", samples)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw - before < 64
 
 
 def test_failures_are_named(tmp_path):

@@ -100,6 +100,13 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         return self._producers.schedule.made
 
     @property
+    def next_index(self) -> int:
+        """Number of the next sample that nobody was asked for: ``first`` of a data set that goes on after this one. Its
+        ring fills anew, so that draws are others than those of a run that was not stopped.
+        """
+        return self._producers.schedule.next_index
+
+    @property
     def failed(self) -> int:
         """Samples that could not be rendered."""
         return self._producers.failed

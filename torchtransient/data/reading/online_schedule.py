@@ -43,6 +43,11 @@ class Schedule:
         self._readable: deque[int] = deque()
         self._random = random.Random(seed)
 
+    @property
+    def next_index(self) -> int:
+        """The number after those that were ordered."""
+        return self._next
+
     def order(self, producer: int) -> Order | None:
         """The next sample for a producer, None where it has enough or has to wait."""
         if sum(order.producer == producer for order in self.orders.values()) >= self.ahead:

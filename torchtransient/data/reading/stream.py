@@ -45,8 +45,8 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         if (rank is None) != (world_size is None):
             raise StorageError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
         self._rank = None if rank is None or world_size is None else _checked_rank(rank, world_size)
-        # In shared memory: workers that stay for several epochs are told.
-        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+        # In shared memory: workers that stay for several epochs are told. Epoch, batches that are left out, their size.
+        self._place = torch.tensor([0, 0, 1]).share_memory_()  # type: ignore[no-untyped-call]
 
     @property
     def axis(self) -> TimeAxis | None:
@@ -61,11 +61,20 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     @property
     def epoch(self) -> int:
         """The epoch that is read next."""
-        return int(self._epoch.item())
+        return int(self._place[0])
 
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next iteration, in all workers. Call it before the loader is iterated over."""
-        self._epoch.fill_(count(f"{WHAT}: epoch", epoch, 0))
+    def set_epoch(self, epoch: int, batches: int = 0, batch_size: int = 1) -> None:
+        """Choose the order of the next iteration, in all workers. Call it before the loader is iterated over.
+
+        ``batches``: how many of them of ``batch_size`` a loader of this rank has given already, in an epoch that goes
+        on: they are left out, and those that follow are the same as without a stop. With as many workers as before.
+        """
+        numbers = [
+            count(f"{WHAT}: epoch", epoch, 0),
+            count(f"{WHAT}: batches", batches, 0),
+            count(f"{WHAT}: batch_size", batch_size),
+        ]
+        self._place.copy_(torch.tensor(numbers))
 
     @property
     def num_samples(self) -> int:
@@ -74,21 +83,40 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         return stop - start
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        epoch = self.epoch
-        for number in self.order(epoch):
+        epoch, batches, size = self._place.tolist()
+        part, parts = _worker()
+        given, turn = self._given(batches, size, parts)
+        # Loaders begin with their first worker: it takes the share of the one whose turn it is.
+        part = (part + turn) % parts
+        for number in self._order(epoch, part, parts)[given[part] :]:
             yield self.dataset.sample(int(number), epoch)
 
     def order(self, epoch: int) -> NDArray[np.int64]:
         """(n,) int64: the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch."""
+        return self._order(epoch, *_worker())
+
+    def _order(self, epoch: int, part: int, parts: int) -> NDArray[np.int64]:
         rank, ranks = self._ranks()
-        worker = get_worker_info()
         start, stop = _share(self._used(), rank, ranks)
-        part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
         first, last = _share(stop - start, part, parts)
         found = self._everything(epoch)[start + first : start + last]
         if not self.shuffle:
             return found
         return _buffered(found, self.buffer, np.random.default_rng([self.seed, epoch, 1, rank, part]))
+
+    def _given(self, batches: int, size: int, parts: int) -> tuple[list[int], int]:
+        """How many samples each worker has given when its loader has given so many batches, and whose turn it is.
+
+        Workers take turns; the last batch of each may be a smaller one, and who has no more is left out.
+        """
+        shares = [_share(self.num_samples, n, parts) for n in range(parts)]
+        left = [-(-(last - first) // size) for first, last in shares]
+        given, turn = [0] * parts, 0
+        while batches and any(left):
+            if left[turn]:
+                left[turn], batches, given[turn] = left[turn] - 1, batches - 1, given[turn] + size
+            turn = (turn + 1) % parts
+        return given, turn
 
     def _everything(self, epoch: int) -> NDArray[np.int64]:
         """All samples, file by file: the same order in all ranks and workers."""
@@ -112,6 +140,11 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     def __getstate__(self) -> dict[str, Any]:
         # Spawned workers do not know torch.distributed.
         return {**self.__dict__, "_rank": self._ranks()}
+
+
+def _worker() -> tuple[int, int]:
+    worker = get_worker_info()
+    return (0, 1) if worker is None else (worker.id, worker.num_workers)
 
 
 def _share(size: int, part: int, parts: int) -> tuple[int, int]:

@@ -94,7 +94,7 @@ class Compressor:
         """The chunks of an array, in the order of ``places``."""
         # What h5py looks up for each `self._data[0] = array` takes longer than to compress a small image.
         whole = np.ascontiguousarray(array, self.dtype).reshape(self._data.shape)
-        with _without_settings():
+        with _fixed_settings():
             self._data.id.write(self._all, self._all, whole, self._type)
         return [self._data.id.read_direct_chunk(place)[1] for place in self.places]
 
@@ -111,12 +111,16 @@ class Compressor:
 
 
 @contextmanager
-def _without_settings() -> Iterator[None]:
-    """Blosc takes its block size, level and threads from the environment too, and makes other bytes of them."""
+def _fixed_settings() -> Iterator[None]:
+    """Blosc takes its block size, level and threads from the environment too, and makes other bytes of them. Without a
+    number it starts threads for every chunk, which wait for each other and for those of other workers.
+    """
     settings = {name: os.environ.pop(name) for name in list(os.environ) if name.startswith("BLOSC_")}
+    os.environ["BLOSC_NTHREADS"] = "1"
     try:
         yield
     finally:
+        del os.environ["BLOSC_NTHREADS"]
         os.environ.update(settings)
 
 

@@ -1,0 +1,310 @@
+"""Augmented samples are those of a scene and a camera that exist: rendered anew, they are the same."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient import geometry
+from torchtransient.data import Affine, Augment, Augmented, Crop, Flip, QuarterTurn
+from torchtransient.data.augmentation.augment import KINDS
+from torchtransient.data.augmentation.pixel_map import PixelMap
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.render.cameras import camera_of
+from torchtransient.render.labels import LABELS, NUMBERED, first_return, scene_labels
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+
+VARIANT = "llvm_ad_mono_polarized"
+POSE = look_at([0.6, 0.4, 3.0], [0.1, 0.0, 0.0], [0.1, 1.0, 0.0])
+N = 12
+# Near its Brewster angle it polarises what it reflects.
+ROUGH = {"type": "roughconductor", "alpha": 0.4, "eta": 1.5, "k": 0.3}
+
+
+def scene_of(pose=POSE, mirror=None, rows=(0, N), columns=(0, N)):
+    """A wall that is not frontal, two spheres and a light; with a mirror (4, 4) of the world, the mirrored scene."""
+    mirror = np.eye(4) if mirror is None else mirror
+    # A rectangle is its own mirror image: the shape is mirrored before, so that its front stays in front.
+    before = np.diag([np.linalg.det(mirror), 1.0, 1.0, 1.0])
+    wall = mirror @ translate([0.0, 0.0, -1.0]) @ rotate([0.4, 1.0, 0.2], 25.0) @ scale(6.0) @ before
+
+    def place(x, y, z):
+        return (mirror @ [x, y, z, 1.0])[:3].tolist()
+
+    film = {
+        "type": "transient_hdr_film", "width": N, "height": N, "rfilter": {"type": "box"}, "temporal_bins": 40,
+        "start_opl": 4.0, "bin_width_opl": 0.2, "crop_width": columns[1] - columns[0], "crop_offset_x": columns[0],
+        "crop_height": rows[1] - rows[0], "crop_offset_y": rows[0],
+    }  # fmt: skip
+    return {
+        "type": "scene",
+        "integrator": {"type": "transient_path", "max_depth": 2},
+        "sensor": {"type": "perspective", "fov": 45.0, "to_world": pose, "film": film},
+        "light": {"type": "point", "position": place(-0.4, 1.1, 2.5), "intensity": 20.0},
+        "wall": {"type": "rectangle", "to_world": wall, "bsdf": ROUGH},
+        "ball": {"type": "sphere", "center": place(0.5, 0.3, 0.4), "radius": 0.4, "bsdf": {"type": "diffuse"}},
+        "drop": {"type": "sphere", "center": place(-0.4, -0.2, 0.6), "radius": 0.3, "bsdf": ROUGH},
+    }
+
+
+def sample_of(scene, spp=512):
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), spp=spp, temporal_filter="tent")
+    out, camera = renderer(seed=0), camera_of(renderer)
+    found = {"transient": out.transient, "steady": out.steady, **scene_labels(renderer, names=LABELS)}
+    found["first_return"] = first_return(out.transient, out.axis, polarized=True)
+    found |= {"intrinsics": camera.intrinsics, "to_world": camera.to_world, "index": 7}
+    return {name: value.clone() if isinstance(value, torch.Tensor) else value for name, value in found.items()}
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return sample_of(scene_of())
+
+
+def camera_mirror(axis):
+    """(4, 4) of the world: the mirror of the camera's x or y."""
+    inside = np.diag([-1.0, 1, 1, 1] if axis == "x" else [1.0, -1, 1, 1])
+    return POSE @ inside @ np.linalg.inv(POSE)
+
+
+def turned(quarters):
+    """The camera that sees the picture turned counterclockwise by quarters: it has turned clockwise itself."""
+    return POSE @ rotate([0.0, 0.0, 1.0], 90.0 * quarters)
+
+
+# (operation, the scene that its samples show)
+CASES = {
+    "flip": (Flip(p=1.0), {"mirror": camera_mirror("x")}),
+    "vertical flip": (Flip("vertical", 1.0), {"mirror": camera_mirror("y")}),
+    "quarter turn": (QuarterTurn(1), {"pose": turned(1)}),
+    "half turn": (QuarterTurn(2), {"pose": turned(2)}),
+    "three quarters": (QuarterTurn([-1]), {"pose": turned(3)}),
+    "crop": (Crop((5, 7), (2, 4)), {"rows": (2, 7), "columns": (4, 11)}),
+    "turn and flip": ([QuarterTurn(1), Flip(p=1.0)], {"pose": turned(1), "mirror": camera_mirror("y")}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_the_scene_rendered_anew(sample, name):
+    operations, scene = CASES[name]
+    found = Augment(operations, polarized=True)(sample)
+    known = sample_of(scene_of(**scene))
+    assert set(found) == set(sample) and found["index"] == 7
+    assert torch.allclose(found["intrinsics"], known["intrinsics"], atol=1e-4)
+    assert torch.allclose(found["to_world"], known["to_world"], atol=1e-5)
+    for label in LABELS:
+        if label == "uv" or (label == "primitive" and "mirror" in scene):
+            continue  # coordinates on a surface, which is another one once it is mirrored
+        a, b = found[label].double(), known[label].double()
+        assert a.shape == b.shape and torch.equal(a.isnan(), b.isnan())
+        same = (a - b).abs().nan_to_num() < 1e-4
+        # A centre that lies on an edge to rounding may fall to either side.
+        assert same.double().mean() == 1.0, label
+    for light in ("transient", "steady"):
+        for k in range(3):
+            s, t = (one[light].select(-5 if light == "transient" else -4, k) for one in (found, known))
+            # 512 samples of each: smooth but for pixels on edges.
+            off = (s - t).norm() / t.norm()
+            assert off < 0.05, (light, k, off.item())
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_circular_light_changes_its_hand(direction):
+    """Behind a circular polarizer: in the mirror it is one of the other hand."""
+
+    def behind(mirror=None):
+        scene = scene_of(mirror=mirror)
+        pane = POSE @ translate([0.0, 0.0, 0.3]) @ scale(2.0)
+        bsdf = {"type": "circular", "left_handed": mirror is not None}
+        scene["pane"] = {"type": "rectangle", "to_world": pane, "bsdf": bsdf}
+        scene["integrator"]["max_depth"] = 3
+        out = tt.TransientRenderer(tt.load(scene, variant=VARIANT), spp=128)(seed=0)
+        return {"steady": out.steady.clone(), "transient": out.transient.clone()}
+
+    before = behind()
+    found = Augment(Flip(direction, 1.0), polarized=True)(before)
+    known = behind(camera_mirror("x" if direction == "horizontal" else "y"))
+    for light, dim in (("steady", -4), ("transient", -5)):
+        a, b, old = (one[light].select(dim, 3) for one in (found, known, before))
+        assert (a - b).norm() < 0.15 * b.norm() and a.sum() * old.sum() < 0
+
+
+def test_all_labels_are_known():
+    assert set(LABELS) <= set(KINDS) and "first_return" in KINDS
+    assert {name for name, kind in KINDS.items() if kind == "number"} == set(NUMBERED)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_points_of_the_new_camera(sample, name):
+    found = Augment(CASES[name][0], polarized=True)(sample)
+    points = geometry.points_from_distance(found["depth"], found["intrinsics"], found["to_world"])
+    assert torch.allclose(points, found["position"], atol=2e-5)
+    z_depth = geometry.z_depth_from_distance(found["depth"], found["intrinsics"])
+    assert torch.allclose(z_depth, found["z_depth"], atol=2e-5)
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_affine_maps_of_kornia(sample, k):
+    """Points of the new camera lie within the half pixel that the nearest one may be off; a matrix stays one."""
+    from kornia.augmentation import RandomAffine, RandomRotation, RandomShear
+
+    affine = RandomAffine(40.0, (0.1, 0.1), (0.7, 1.4), p=1.0)
+    kornia = [affine, RandomRotation(60.0, p=1.0), RandomShear(30.0, p=1.0)][k]
+    generator = torch.Generator().manual_seed(k)
+    state = torch.get_rng_state()
+    found = Augment([Affine(kornia), Flip(p=1.0)], polarized=True)(sample, generator=generator)
+    assert torch.equal(torch.get_rng_state(), state)
+    matrix = found["intrinsics"]
+    assert torch.allclose(matrix.tril(-1), torch.zeros(3, 3), atol=1e-4) and bool((matrix.diagonal() > 0).all())
+    turn = found["to_world"][:3, :3]
+    assert torch.allclose(turn @ turn.mT, torch.eye(3), atol=1e-5) and torch.linalg.det(turn) > 0.99
+    points = geometry.points_from_distance(found["depth"], matrix, found["to_world"])
+    on_wall = found["shape"] == 0
+    assert on_wall.sum() > 20
+    off = (points - found["position"]).norm(dim=0)[on_wall]
+    # Half a pixel's diagonal of the old image, 45 degrees over 12 pixels, on a wall 4 to 6 m away that is tilted.
+    assert off.max() < 6.0 * math.tan(math.radians(22.5)) / 6 * 0.75 * 1.5
+    rim = found["shape"] == -1
+    assert bool(found["depth"][rim].isnan().all()) and bool((found["material"][rim] == -1).all())
+    assert set(found["shape"].unique().tolist()) <= set(sample["shape"].unique().tolist()) | {-1}
+    norms = found["normals"].norm(dim=0)[~rim]
+    assert torch.allclose(norms, torch.ones_like(norms), atol=1e-5)
+
+
+def test_light_is_interpolated_bin_by_bin():
+    """A picture that is linear in u and v stays so, each bin with its own slope; the sum over bins commutes."""
+    from kornia.augmentation import RandomAffine
+
+    v, u = torch.meshgrid(torch.arange(16.0), torch.arange(16.0), indexing="ij")
+    cube = torch.stack([u, v, u + 2 * v, 0 * u]).reshape(1, 4, 16, 16)
+    augment = Augment(Affine(RandomAffine(30.0, scale=(1.2, 1.3), p=1.0)))
+    found = augment({"transient": cube, "steady": cube.sum(1)}, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(found["transient"].sum(1), found["steady"], atol=1e-3)
+    first, second, third, none = found["transient"][0]
+    assert torch.allclose(third, first + 2 * second, atol=1e-3)
+    assert bool((none == 0).all())
+    slope = torch.diff(first[5:11, 5:11], dim=1)
+    assert slope.std() < 1e-3 and slope.mean() < 0.9
+
+
+def test_maps_of_pixels():
+    """Against torch's own flips and turns, of images that are not square."""
+    image = torch.arange(30.0).reshape(5, 6)
+    tag = {"depth": image}
+    assert torch.equal(Augment(Flip(p=1.0))(tag)["depth"], image.flip(-1))
+    assert torch.equal(Augment(Flip("vertical", 1.0))(tag)["depth"], image.flip(-2))
+    for k in range(4):
+        assert torch.equal(Augment(QuarterTurn(k))(tag)["depth"], torch.rot90(image, k, (-2, -1)))
+    assert torch.equal(Augment(Crop((2, 3), (1, 2)))(tag)["depth"], image[1:3, 2:5])
+    assert torch.equal(tag["depth"], torch.arange(30.0).reshape(5, 6))
+    complex_cube = torch.randn(1, 3, 5, 6, dtype=torch.complex64)
+    assert torch.equal(Augment(Flip(p=1.0))({"phasor": complex_cube})["phasor"], complex_cube.flip(-1))
+
+
+def test_decomposition_of_maps():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        matrix = np.eye(3)
+        matrix[:2] = rng.normal(size=(2, 3))
+        drawn = PixelMap(matrix, (8, 8), (8, 8))
+        whole = drawn.rotation @ (np.eye(3) if drawn.mirror is None else drawn.mirror)
+        np.testing.assert_allclose(whole @ whole.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(drawn.rotation) > 0
+        upper = matrix[:2, :2] @ whole[:2, :2].T
+        assert abs(upper[1, 0]) < 1e-12 and upper[0, 0] > 0 and upper[1, 1] > 0
+
+
+def test_tuples_batches_and_draws(sample):
+    augment = Augment([Flip(), QuarterTurn(), Crop((6, 6))], names=("transient", "depth"))
+    pair = (sample["transient"][0], sample["depth"])
+    one = augment(pair, generator=torch.Generator().manual_seed(5))
+    again = augment(pair, generator=torch.Generator().manual_seed(5))
+    assert isinstance(one, tuple) and all(torch.equal(a, b) for a, b in zip(one, again, strict=True))
+    batch = tuple(torch.stack([x, 2 * x]) for x in pair)
+    both = augment(batch, generator=torch.Generator().manual_seed(5))
+    assert torch.equal(both[1][0], one[1]) and torch.equal(both[0][1], 2 * one[0])
+    seen = {augment(pair)[1].sum().item() for _ in range(40)}
+    assert len(seen) > 20
+    batch = {name: torch.stack([value, value]) for name, value in sample.items() if isinstance(value, torch.Tensor)}
+    together = Augment(CASES["turn and flip"][0], polarized=True)(batch)
+    alone = Augment(CASES["turn and flip"][0], polarized=True)(sample)
+    for name, value in together.items():
+        assert torch.allclose(value[1].double(), alone[name].double(), atol=1e-5, equal_nan=True), name
+
+
+def test_a_data_set_of_them(sample):
+    data = [{"depth": sample["depth"] + k, "index": k} for k in range(4)]
+    augmented = pickle.loads(pickle.dumps(Augmented(data, Augment([Flip(), QuarterTurn()]), seed=3)))
+    assert len(augmented) == 4
+    first = [augmented[k]["depth"] for k in range(4)]
+    assert all(torch.equal(a, augmented[k]["depth"]) for k, a in enumerate(first))
+    assert torch.equal(augmented[-1]["depth"], first[3])
+    epochs = [augmented.sample(0, epoch)["depth"] for epoch in range(12)]
+    assert len({tuple(one.flatten().nan_to_num().tolist()) for one in epochs}) > 3
+    batch = next(iter(torch.utils.data.DataLoader(augmented, batch_size=4)))
+    assert torch.equal(batch["depth"], torch.stack(first))
+
+
+def test_what_is_not_a_number_of_light(sample):
+    counts = torch.randint(0, 9, (1, 5, N, N), dtype=torch.uint8)
+    from kornia.augmentation import RandomRotation
+
+    augment = Augment(Affine(RandomRotation((30.0, 30.0), p=1.0)), fields={"mask": "number"})
+    found = augment({"measurement": counts, "mask": torch.ones(N, N, dtype=torch.bool), "uv": sample["uv"]})
+    assert found["measurement"].dtype == torch.uint8 and found["measurement"].max() <= 8
+    assert found["mask"].dtype == torch.bool and 0 < found["mask"].sum() < N * N
+    assert torch.equal(found["mask"], ~found["uv"][0].isnan())
+
+
+FLIP = Augment(Flip(p=1.0))
+DEPTH, CUBE = torch.ones(4, 5), torch.ones(1, 3, 4, 5)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: FLIP({"normals": torch.ones(3, 4, 5)}), SceneError, "give to_world="),
+        (lambda: FLIP({"depth": DEPTH, "values": {"box.to_world": 1}}), SceneError, "'box.to_world' is not true"),
+        (lambda: Augment(Crop((2, 2)))({"depth": DEPTH, "values": {"sensor.x_fov": 3}}), SceneError, "'sensor.x_fov'"),
+        (lambda: Augment(QuarterTurn(1))({"depth": DEPTH, "values": {"sensor.to_world": 1}}), SceneError, "not true"),
+        (lambda: FLIP({"depth": DEPTH, "mask": DEPTH > 0}), SceneError, "fields="),
+        (lambda: FLIP({"depth": DEPTH, "transient": CUBE[..., :3]}), ShapeError, "one size"),
+        (lambda: FLIP({"index": 3}), SceneError, "got none"),
+        (lambda: FLIP({"depth": 3.0}), ShapeError, "image"),
+        (lambda: FLIP({"normals": DEPTH, "to_world": torch.eye(4)}), ShapeError, r"\(\.\.\., 3, H, W\)"),
+        (lambda: FLIP((CUBE, DEPTH)), SceneError, "names="),
+        (lambda: FLIP({"depth": DEPTH, "to_world": torch.eye(3)}), ShapeError, r"\(\.\.\., 4, 4\)"),
+        (lambda: Augment(Flip(p=1.0), polarized=True)({"transient": CUBE}), ShapeError, "4 Stokes components"),
+        (lambda: Augment(QuarterTurn(1), polarized=True)({"steady": torch.ones(4, 1, 4, 5)}), SceneError, "wants intr"),
+        (lambda: Augment(Flip(p=1.0), polarized=True)({"measurement": CUBE}), SceneError, "measure afterwards"),
+        (lambda: Augment(Crop((5, 5)))({"depth": DEPTH}), ShapeError, "do not fit"),
+        (lambda: Augment(Crop((2, 2), (3, 3)))({"depth": DEPTH}), ShapeError, "do not fit"),
+        (lambda: Augment("flip"), SceneError, "Flip, QuarterTurn, Crop or Affine"),
+        (lambda: Augment(Flip(), fields={"mask": "mask"}), SceneError, "fields among"),
+        (lambda: Flip("diagonal"), SceneError, "'horizontal' or 'vertical'"),
+        (lambda: Flip(p=2.0), UnitError, "between 0 and 1"),
+        (lambda: QuarterTurn([]), SceneError, "got none"),
+        (lambda: QuarterTurn([0.5]), SceneError, "whole number"),
+        (lambda: Crop(3), ShapeError, "two numbers"),
+        (lambda: Crop((0, 3)), ShapeError, "at least 1"),
+        (lambda: Affine("rotate"), SceneError, "of kornia that keeps the size"),
+        (lambda: Augmented([1], "flip"), SceneError, "expected an Augment"),
+    ],
+)  # fmt: skip
+def test_what_it_refuses(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_kornias_maps_that_are_no_cameras():
+    from kornia.augmentation import RandomCrop, RandomPerspective
+
+    with pytest.raises(SceneError, match="no affine map"):
+        Augment(Affine(RandomPerspective(p=1.0)))({"depth": torch.ones(8, 8)})
+    with pytest.raises(SceneError, match="Windows are Crop's"):
+        Affine(RandomCrop((3, 3)))

@@ -1,0 +1,248 @@
+"""Cameras against the rays that Mitsuba draws, and distances, points and normals against the labels of a render."""
+
+from __future__ import annotations
+
+import itertools
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient import geometry
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.render.cameras import camera_of
+from torchtransient.render.labels import scene_labels
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.testing.small_room import VARIANT, make_room
+
+POSE = look_at([1.0, 2.0, 3.0], [0.2, 0.5, 0.0])
+OFFSET = (0.1, -0.07)
+CROP = {"crop_width": 4, "crop_height": 3, "crop_offset_x": 1, "crop_offset_y": 2}
+
+
+def sensor_rays(axis, size, crop, offset, kind="perspective", pose=POSE):
+    """Directions (3, H, W) and origins of Mitsuba's rays through the centres of pixels."""
+    (height, width), more = size, CROP if crop else {}
+    film = {"type": "hdrfilm", "width": width, "height": height, **more}
+    sensor = mi.load_dict(
+        {
+            "type": kind, "fov": 50.0, "fov_axis": axis, "to_world": mi.ScalarTransform4f(pose), "film": film,
+            **({"aperture_radius": 0.1, "focus_distance": 2.0} if kind == "thinlens" else
+               {"principal_point_offset_x": offset[0], "principal_point_offset_y": offset[1]}),
+        }
+    )  # fmt: skip
+    width, height = (int(n) for n in sensor.film().crop_size())
+    v, u = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    position = mi.Point2f((u.ravel() + 0.5) / width, (v.ravel() + 0.5) / height)
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    return np.array(ray.d).reshape(3, height, width), np.array(ray.o).reshape(3, height, width)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])
+@pytest.mark.parametrize("size", [(6, 8), (9, 5)])
+@pytest.mark.parametrize("crop", [False, True])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), OFFSET])
+def test_intrinsics_are_mitsubas_rays(axis, size, crop, offset):
+    with mi.variant_context(VARIANT):
+        directions, origins = sensor_rays(axis, size, crop, offset)
+    window = (CROP["crop_offset_x"], CROP["crop_offset_y"]) if crop else (0, 0)
+    matrix = geometry.intrinsics(50.0, size, axis, offset, window)
+    found = geometry.ray_directions(matrix, directions.shape[1:], POSE)
+    np.testing.assert_allclose(found, directions, atol=2e-6)
+    # Kornia's own camera goes from the points of these rays to the pixels.
+    points = torch.tensor(origins + 3 * directions, dtype=torch.float64)
+    camera = geometry.pinhole_camera(matrix.double(), POSE, directions.shape[1:])
+    pixels = camera.project(points.reshape(1, 3, -1).mT)[0].mT.reshape(2, *directions.shape[1:])
+    v, u = torch.meshgrid(*(torch.arange(float(n)) for n in directions.shape[1:]), indexing="ij")
+    assert torch.allclose(pixels.float(), torch.stack([u, v]), atol=1e-5 * 50)
+    # And back, to points 1 m away along the axis.
+    back = camera.unproject(pixels.reshape(1, 2, -1).mT, torch.ones(1, 1, 1).double())[0].mT.reshape(points.shape)
+    known = POSE[:3, 3, None, None] + directions / np.einsum("ahw,a->hw", directions, POSE[:3, 2])
+    np.testing.assert_allclose(back, known, atol=1e-5)
+
+
+def test_thinlens_has_the_same_middle_rays():
+    with mi.variant_context(VARIANT):
+        directions, _ = sensor_rays("x", (6, 8), False, (0.0, 0.0), "thinlens")
+    found = geometry.ray_directions(geometry.intrinsics(50.0, (6, 8)), (6, 8), POSE)
+    np.testing.assert_allclose(found, directions, atol=2e-6)
+    scene = make_room()
+    scene["sensor"].update({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0})
+    camera = camera_of(tt.TransientRenderer(tt.load(scene, variant=VARIANT)))
+    assert torch.allclose(camera.intrinsics, geometry.intrinsics(20.0, (3, 4)))
+
+
+def test_extrinsics_there_and_back():
+    matrix = torch.tensor(POSE)
+    outside = geometry.extrinsics(matrix)
+    assert torch.allclose(outside @ geometry.camera_to_world(matrix), torch.eye(4).double(), atol=1e-14)
+    assert torch.allclose(geometry.to_world_from_extrinsics(outside), matrix, atol=1e-14)
+    ahead = outside @ torch.tensor([*(POSE[:3, 3] + 2 * POSE[:3, 2]), 1.0])
+    up_and_left = outside @ torch.tensor([*(POSE[:3, 3] + POSE[:3, 1] + POSE[:3, 0]), 1.0])
+    assert torch.allclose(ahead, torch.tensor([0.0, 0, 2, 1]).double(), atol=1e-14)
+    assert torch.allclose(up_and_left, torch.tensor([-1.0, -1, 0, 1]).double(), atol=1e-14)
+
+
+def test_gradients():
+    fov, offset = torch.tensor([40.0, 50.0]).double(), torch.tensor([[0.1, 0.0], [0.0, -0.2]]).double()
+    leaves = (fov.requires_grad_(), offset.requires_grad_())
+    assert torch.autograd.gradcheck(lambda fov, offset: geometry.intrinsics(fov, (6, 8), "y", offset), leaves)
+    distance = torch.linspace(1.0, 3.0, 12).double().reshape(3, 4).requires_grad_()
+    matrix = geometry.intrinsics(50.0, (3, 4)).double()
+    for function in (
+        lambda d: geometry.normals_from_distance(d, matrix),
+        lambda d: geometry.opl_from_distance(d, matrix, POSE, [0.3, 0.1, 2.0]),
+        lambda d: geometry.distance_from_opl(d + 4, matrix, POSE, [0.3, 0.1, 2.0]),
+        lambda d: geometry.points_from_distance(geometry.distance_from_z_depth(d, matrix), matrix, POSE),
+    ):
+        assert torch.autograd.gradcheck(function, (distance,))
+
+
+# ----------------------------------------------------------------------------------------------- against the labels
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A tilted wall and a sphere before it: a renderer, its camera, its labels."""
+    scene = make_room()
+    scene["sensor"].update(
+        {"fov": 35.0, "principal_point_offset_x": 0.05, "to_world": look_at([0.4, 0.3, 4.0], [0.1, 0.0, 0.0])}
+    )
+    scene["sensor"]["film"].update({"width": 32, "height": 24})
+    scene["wall"]["to_world"] = translate([0.0, 0.0, -0.5]) @ rotate([0.3, 1.0, 0.0], 20.0) @ scale(6.0)
+    scene["box"] = {"type": "sphere", "center": [0.2, 0.1, 1.0], "radius": 0.5}
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), ["sensor.x_fov", "sensor.to_world"], spp=4)
+    names = ("depth", "z_depth", "position", "normals", "shape")
+    return renderer, camera_of(renderer), scene_labels(renderer, names=names)
+
+
+def test_distances_and_points_are_the_labels(seen):
+    _, camera, labels = seen
+    depth, z_depth = labels["depth"], labels["z_depth"]
+    assert torch.allclose(geometry.distance_from_z_depth(z_depth, camera.intrinsics), depth, atol=1e-5)
+    assert torch.allclose(geometry.z_depth_from_distance(depth, camera.intrinsics), z_depth, atol=1e-5)
+    points = geometry.points_from_distance(depth, camera.intrinsics, camera.to_world)
+    assert torch.allclose(points, labels["position"], atol=2e-5)
+    from kornia.geometry.depth import depth_to_3d_v2
+
+    known = depth_to_3d_v2(z_depth[None], camera.intrinsics[None])[0].permute(2, 0, 1)
+    assert torch.allclose(geometry.points_from_distance(depth, camera.intrinsics), known, atol=1e-5)
+
+
+def test_normals_are_the_labels(seen):
+    """On the wall to rounding, on the sphere to what nine pixels see of its curvature; on the rim one-sided."""
+    from kornia.morphology import erosion
+
+    _, camera, labels = seen
+    found = geometry.normals_from_distance(labels["depth"], camera.intrinsics, camera.to_world)
+    cosine = (found * labels["normals"]).sum(0)
+    for number, worst in ((0, 1 - 1e-5), (1, 0.985)):
+        whole = (labels["shape"] == number).float()[None, None]
+        inside = erosion(torch.nn.functional.pad(whole, (1, 1, 1, 1)), torch.ones(3, 3))[0, 0, 1:-1, 1:-1] > 0
+        assert inside.sum() > 20
+        assert cosine[inside].min() > worst
+    in_camera = geometry.normals_from_distance(labels["depth"], camera.intrinsics)
+    rays = geometry.ray_directions(camera.intrinsics, camera.size)
+    assert bool(((in_camera * rays).sum(0) < 0).all())  # turned to the camera
+    depth = labels["depth"].clone()
+    depth[10, 10] = torch.nan
+    assert int(geometry.normals_from_distance(depth, camera.intrinsics).isnan().all(0).sum()) == 9
+
+
+@pytest.mark.parametrize("light", [None, [-0.5, 0.25, 4.0]])
+def test_optical_path_there_and_back(seen, light):
+    _, camera, labels = seen
+    setting = {"camera_matrix": camera.intrinsics, "to_world": camera.to_world, "light": light, "index": 1.2}
+    depth = labels["depth"]
+    opl = geometry.opl_from_distance(depth, **setting)
+    place = camera.to_world[:3, 3] if light is None else torch.tensor(light)
+    known = 1.2 * (depth + (labels["position"] - place[:, None, None]).norm(dim=0))
+    assert torch.allclose(opl, known, atol=3e-5)
+    assert torch.allclose(geometry.distance_from_opl(opl, **setting), depth, atol=3e-5)
+
+
+def test_optical_path_is_where_the_light_arrives(seen):
+    """The first bin with light, of a transient with 1 cm bins and one bounce."""
+    renderer, camera, labels = seen
+    axis = tt.TimeAxis(5.0, 0.01, 600)
+    one = tt.TransientRenderer(renderer.scene, time_axis=axis, spp=16, max_depth=2, temporal_filter="box")
+    transient = one(seed=0).transient.sum(0)
+    opl = geometry.opl_from_distance(labels["depth"], camera.intrinsics, camera.to_world, [-0.5, 0.25, 4.0])
+    arrival = axis.centers_opl.float()[transient.argmax(0)]
+    lit = transient.sum(0) > 0
+    assert lit.float().mean() > 0.7
+    # A pixel is some 9 cm wide at 5 m, of a wall tilted by 20 degrees: its light spreads over 2 * 9 cm * tan 20.
+    assert (arrival - opl)[lit].abs().median() < 0.04
+
+
+def test_a_path_that_is_too_short():
+    setting = {"camera_matrix": geometry.intrinsics(50.0, (2, 2)), "to_world": np.eye(4), "light": [0.0, 0.0, 3.0]}
+    assert geometry.distance_from_opl(torch.full((2, 2), 2.9), **setting).isnan().all()
+
+
+def test_camera_of_takes_values_and_their_gradients(seen):
+    renderer, camera, _ = seen
+    fov = torch.tensor(40.0, requires_grad=True)
+    other = camera_of(renderer, {"sensor.x_fov": fov})
+    assert torch.allclose(other.intrinsics, geometry.intrinsics(40.0, (24, 32), "x", (0.05, 0.0)))
+    other.intrinsics[0, 0].backward()
+    assert fov.grad < 0
+    assert camera.size == (24, 32) and torch.equal(camera.to_world, renderer.values["sensor.to_world"])
+
+
+def test_camera_of_refuses(seen):
+    renderer, *_ = seen
+    with pytest.raises(SceneError, match="without a batch"):
+        camera_of(renderer, {"sensor.x_fov": torch.tensor([40.0, 41.0])})
+    with pytest.raises(SceneError, match="a sensor from 0 to 0"):
+        camera_of(renderer, sensor=1)
+    scene = make_room()
+    scene["sensor"]["type"] = "orthographic"
+    del scene["sensor"]["fov"]
+    with pytest.raises(SceneError, match="OrthographicCamera"):
+        camera_of(tt.TransientRenderer(tt.load(scene, variant=VARIANT)))
+
+
+MATRIX, IMAGE = torch.eye(3), torch.ones(4, 5)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: geometry.intrinsics(180.0, (4, 5)), UnitError, "between 0 and 180 degrees"),
+        (lambda: geometry.intrinsics("wide", (4, 5)), ShapeError, "fov_deg as numbers"),
+        (lambda: geometry.intrinsics(40.0, 4), ShapeError, r"size as \(height, width\)"),
+        (lambda: geometry.intrinsics(40.0, (4, 0)), ShapeError, "whole number"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), "z"), SceneError, "fov_axis"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), "x", (0.1,)), ShapeError, "two finite numbers"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset=(1,)), ShapeError, "crop_offset"),
+        (lambda: geometry.extrinsics(np.eye(3)), ShapeError, r"\(\.\.\., 4, 4\)"),
+        (lambda: geometry.z_depth_from_distance(IMAGE, torch.eye(4)), ShapeError, r"\(\.\.\., 3, 3\)"),
+        (lambda: geometry.z_depth_from_distance(IMAGE, torch.zeros(3, 3)), ShapeError, "with an inverse"),
+        (lambda: geometry.z_depth_from_distance(IMAGE.long(), MATRIX), ShapeError, "floating image"),
+        (lambda: geometry.opl_from_distance(IMAGE, light=[0, 0, 1.0]), UnitError, "camera_matrix= and to_world="),
+        (lambda: geometry.opl_from_distance(IMAGE, MATRIX, np.eye(4), [0.0, 1.0]), ShapeError, "points"),
+        (lambda: geometry.distance_from_opl(IMAGE, index=0.0), UnitError, "index"),
+        (lambda: geometry.normals_from_distance(IMAGE[:1], MATRIX), ShapeError, "two rows"),
+    ],
+)
+def test_what_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_batches():
+    fovs = torch.tensor([30.0, 60.0])
+    matrices = geometry.intrinsics(fovs, (4, 5))
+    poses = torch.stack([torch.eye(4), torch.tensor(POSE, dtype=torch.float32)])
+    depth = 1 + torch.rand(2, 4, 5, generator=torch.Generator().manual_seed(0))
+    for function in (geometry.points_from_distance, geometry.normals_from_distance):
+        together = function(depth, matrices, poses)
+        for k in range(2):
+            assert torch.allclose(together[k], function(depth[k], matrices[k], poses[k]), atol=1e-6)
+    many = itertools.starmap(lambda k, d: geometry.z_depth_from_distance(d, matrices[k]), enumerate(depth))
+    assert torch.allclose(geometry.z_depth_from_distance(depth, matrices), torch.stack(list(many)), atol=1e-6)
+    camera = geometry.pinhole_camera(matrices, poses[1], (4, 5))
+    assert camera.batch_size == 2

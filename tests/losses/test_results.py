@@ -1,0 +1,195 @@
+"""Losses of results: renders, captures and what methods found, by their attributes, in place of tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from support.loss_cases import AXIS, BAND, BINS, CASES
+from torchtransient import TimeAxis, losses
+from torchtransient.errors import ShapeError, TorchTransientError, UnitError
+
+# The attribute that a loss reads, by the argument that is a pair of results.
+READS = {
+    **dict.fromkeys((losses.phasor_loss,), "phasor"),
+    **dict.fromkeys((losses.depth_loss, losses.scale_invariant_depth_loss), "depth_m"),
+    losses.ssim_loss: "steady",
+    **dict.fromkeys((losses.projection_ssim_loss, losses.total_variation), "values"),
+}
+every = pytest.mark.parametrize("case", CASES, ids=str)
+
+
+def attribute_of(case):
+    return READS.get(case.function, "transient")
+
+
+def result(tensor, attribute="transient", axis=AXIS, **more):
+    """What a renderer returns, as far as a loss may know: one measure, None for the others."""
+    measures = {"transient": None, "phasor": None, "gated": None, "steady": None, attribute: tensor}
+    return SimpleNamespace(**measures, **{"axis": axis, "frequencies": None, "gates": None, **more})
+
+
+def own(case, tensor, attribute):
+    """Only what such a result has: the axis of a transient."""
+    if attribute in ("depth_m", "values"):
+        return SimpleNamespace(**{attribute: tensor})
+    return result(tensor, attribute, axis=AXIS if attribute == "transient" else None)
+
+
+def given(case, x, y):
+    """The same arguments as results, each alone and both."""
+    attribute = attribute_of(case)
+    first = "values" if case.function is losses.measurement_consistency else attribute
+    a, b = own(case, x, first), own(case, y, attribute)
+    return [(a, b)] if not case.pair or case.second is not None else [(a, b), (a, y), (x, b)]
+
+
+def bare(case):
+    """Without the options that results bring."""
+    known = {name: value for name, value in case.options.items() if name not in ("bin_width_opl", "axis")}
+    return dataclasses.replace(case, options=known, second=None if case.second is None else halved(case))
+
+
+def halved(case):
+    """A second render of a result is a result."""
+
+    def second(x):
+        attribute = attribute_of(case)
+        return x / 2 if isinstance(x, torch.Tensor) else own(case, getattr(x, attribute) / 2, attribute)
+
+    return second
+
+
+@every
+def test_results_are_their_tensors(case):
+    x, y = case.tensors()
+    mask = torch.rand(y.shape, generator=torch.Generator().manual_seed(9)) < 0.6
+    for a, b in given(case, x, y):
+        taken = bare(case)
+        for reduction in ("mean", "none"):
+            wanted = case(x, y, mask, reduction)
+            torch.testing.assert_close(taken(a, b, mask, reduction), wanted, rtol=0, atol=0)
+            torch.testing.assert_close(taken.as_module(a, b, mask, reduction), wanted, rtol=0, atol=0)
+    leaf = x.clone().requires_grad_()
+    bare(case)(*given(case, leaf, y)[0], reduction="sum").backward()
+    other = x.clone().requires_grad_()
+    case(other, y, reduction="sum").backward()
+    torch.testing.assert_close(leaf.grad, other.grad, rtol=0, atol=0)
+
+
+@every
+def test_results_without_what_is_compared(case):
+    x, _ = case.tensors()
+    attribute = attribute_of(case)
+    wrong = "steady" if attribute != "steady" else "transient"
+    empty = own(case, None, attribute) if attribute in ("depth_m", "values") else result(x, wrong)
+    with pytest.raises(ShapeError, match=rf"a result with .*{attribute}.*, got SimpleNamespace with") as caught:
+        bare(case)(x if case.pair else empty, empty)
+    assert str(caught.value).startswith(case.function.__name__ + ":")
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if attribute_of(c) == "transient" and c.pair], ids=str)
+def test_results_on_two_axes(case):
+    """A bin of another place, not one of another rounding."""
+    x, y = case.tensors()
+    if case.function is losses.measurement_consistency:
+        return  # its first result is a volume
+    other = TimeAxis(AXIS.start_opl + 0.5 * AXIS.bin_width_opl, AXIS.bin_width_opl, BINS)
+    a = own(case, x, "transient")
+    with pytest.raises(UnitError, match="results on one axis") as caught:
+        bare(case)(a, result(y, axis=other))
+    assert str(caught.value).startswith(case.function.__name__ + ":")
+    rounded = TimeAxis(AXIS.start_opl * (1 + 1e-9), AXIS.bin_width_opl * (1 + 1e-9), BINS)
+    assert bool(torch.isfinite(bare(case)(a, result(y, axis=rounded))))
+
+
+def test_frequencies_are_an_axis():
+    x = torch.randn(1, 5, 2, 2, dtype=torch.complex64)
+    bands = BAND, dataclasses.replace(BAND, start_opl=3)
+    one, other = (result(x, "phasor", None, frequencies=band) for band in bands)
+    assert float(losses.phasor_loss(one, one)) == 0
+    for loss in (losses.phasor_loss, losses.squared_loss):
+        with pytest.raises(UnitError, match="one axis"):
+            loss(one, other)
+
+
+def test_where_time_is_comes_from_the_scan():
+    """An exhaustive capture and a list, which ask for `dim` as tensors."""
+    exhaustive, points = torch.rand(2, BINS, 2, 2, 3, 3), torch.rand(2, BINS, 7)
+    for x, shape, dim in ((exhaustive, (2, 2, 3, 3), -5), (points, (7,), -2)):
+        y = x.flip(-1)
+        with pytest.raises(ShapeError, match="dim="):
+            losses.wasserstein_loss(x, y, 0.05)
+        captures = [result(t, scan=SimpleNamespace(shape=shape)) for t in (x, y)]
+        found = losses.wasserstein_loss(*captures, reduction="none")
+        torch.testing.assert_close(found, losses.wasserstein_loss(x, y, 0.05, dim=dim, reduction="none"))
+    stokes = torch.rand(2, 4, 3, BINS, 4, 5)  # a batch of Stokes components
+    torch.testing.assert_close(
+        losses.wasserstein_loss(result(stokes), stokes.flip(-1)),
+        losses.wasserstein_loss(stokes, stokes.flip(-1), 0.05, dim=-3),
+    )
+
+
+def test_what_is_given_counts_more_than_what_a_result_knows():
+    x, y = (torch.rand(1, BINS, 3, 3, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    found = losses.cumulative_loss(result(x), result(y), 1.0)
+    torch.testing.assert_close(found, losses.cumulative_loss(x, y, 1.0))
+    torch.testing.assert_close(losses.cumulative_loss(result(x), y), losses.cumulative_loss(x, y, 0.05))
+    for loss in (losses.cumulative_loss, losses.wasserstein_loss):
+        with pytest.raises(UnitError, match="bin_width_opl, metres of optical path, with tensors"):
+            loss(x, y)
+    with pytest.raises(UnitError, match="expected a TimeAxis"):
+        losses.transient_phasor_loss(x, y, frequencies=BAND)
+    torch.testing.assert_close(
+        losses.transient_phasors(result(x), frequencies=BAND), losses.transient_phasors(x, AXIS, BAND)
+    )
+    torch.testing.assert_close(
+        losses.TransientPhasorLoss(frequencies=BAND)(result(x), y), losses.transient_phasor_loss(x, y, AXIS, BAND)
+    )
+
+
+def test_a_capture_with_transient_and_phasor_beside_a_phasor():
+    x, p = torch.rand(1, BINS, 2, 2), torch.randn(1, 5, 2, 2, dtype=torch.complex64)
+    both = SimpleNamespace(transient=x, phasor=p, axis=AXIS, frequencies=BAND)
+    alone = result(2 * p, "phasor", None, frequencies=BAND)
+    torch.testing.assert_close(losses.squared_loss(both, alone), losses.squared_loss(p, 2 * p))
+    torch.testing.assert_close(losses.squared_loss(both, x + 1), losses.squared_loss(x, x + 1))
+
+
+def test_what_is_no_result_is_refused_as_before():
+    x = torch.rand(1, BINS, 2, 2)
+    for other in ({"transient": x}, [x], None, x.numpy()):
+        with pytest.raises(TorchTransientError, match="expected two dense tensors"):
+            losses.squared_loss(x, other)
+
+
+def test_renders_of_the_library():
+    """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
+    from torchtransient.capture import Capture, Scan, Wall
+    from torchtransient.files.result_file import Result
+    from torchtransient.reconstruction.hidden_volume import HiddenVolume
+    from torchtransient.reconstruction.voxels import VoxelGrid
+    from torchtransient.sensing.itof_depth import ItofReading
+
+    x = torch.rand(1, BINS, 2, 2)
+    scan = Scan.grid(Wall.plane(1.0, 1.0), (2, 2), kind="confocal")
+    capture = Capture(x, AXIS, scan)
+    rendered = Result(2 * x, 2 * x.sum(-3), AXIS)
+    torch.testing.assert_close(losses.wasserstein_loss(rendered, capture), torch.tensor(0.0), atol=1e-7, rtol=0)
+    torch.testing.assert_close(losses.cumulative_loss(capture, rendered), losses.cumulative_loss(x, 2 * x, 0.05))
+    reading = ItofReading(*(torch.rand(1, 2, 3, 3) for _ in range(4)), torch.rand(1, 3, 3))
+    torch.testing.assert_close(losses.depth_loss(reading, reading.depth_m + 1), torch.tensor(1.0))
+    grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 1.5]], (4, 3, 5))
+    volume = HiddenVolume(torch.rand(1, 5, 3, 4), grid, "f-k migration")
+    wanted = losses.total_variation(volume.values, spacing=(0.2, 2 / 3, 0.5))
+    torch.testing.assert_close(losses.total_variation(volume), wanted)
+    uneven = dataclasses.replace(grid, depths=grid.depths**2)
+    with pytest.raises(ShapeError, match="evenly spaced planes"):
+        losses.total_variation(dataclasses.replace(volume, grid=uneven))
+    torch.testing.assert_close(
+        functools.partial(losses.ssim_loss, window=3)(rendered, rendered.steady), torch.tensor(0.0)
+    )

@@ -1,0 +1,101 @@
+"""Bounds, margins, and what stands at the ends."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchtransient import parametrize
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.parametrize import bounded, bounded_inverse, positive, positive_inverse, simplex_inverse
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("low, high", [(0.0, 1.0), (0.1, 0.3), (1e-4, 1.0), (-0.99, 0.99), (1.0, 4.0), (-7.0, -3.0)])
+def test_never_beyond_its_bounds(dtype, low, high):
+    x = torch.cat([torch.linspace(-60, 60, 2401), torch.tensor([-1e4, 1e4, -math.inf, math.inf])]).to(dtype)
+    value = bounded(x, low, high)
+    ends = torch.tensor([low, high], dtype=torch.float64).to(dtype)
+    assert bool((value >= ends[0]).all()) and bool((value <= ends[1]).all())
+    ordered = value[:2401]
+    assert bool((ordered[1:] >= ordered[:-1] - torch.finfo(dtype).eps * max(abs(low), abs(high))).all())
+
+
+def test_it_is_the_logistic_function():
+    x = torch.linspace(-5, 5, 21, dtype=torch.float64)
+    assert torch.allclose(bounded(x, 2.0, 5.0), 2 + 3 / (1 + torch.exp(-x)), rtol=1e-14)
+
+
+def test_both_ends_are_as_precise():
+    """Of 1e-6 from either end the distance survives, to what single precision has near one."""
+    value = torch.tensor([1e-30, 1e-6, 1 - 2.0**-20])
+    back = bounded(bounded_inverse(value))
+    assert torch.allclose(back, value, rtol=1e-6)
+    assert (1 - back[2]).item() == pytest.approx(2.0**-20, rel=0.1)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -1e-7, 1 + 1e-6])
+def test_the_ends_need_a_margin(value):
+    value = torch.tensor([0.5, value])
+    with pytest.raises(UnitError, match="margin=1e-3"):
+        bounded_inverse(value)
+    moved = bounded(bounded_inverse(value, margin=0.01))
+    assert moved[0] == 0.5
+    assert moved[1].item() == pytest.approx(0.01 if value[1] < 0.5 else 0.99, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf])
+@pytest.mark.parametrize("margin", [None, 0.1])
+def test_beyond_the_bounds_no_margin_helps(value, margin):
+    with pytest.raises(UnitError, match=r"Albedo: expected values between 0 and 1"):
+        parametrize.Albedo(margin=margin).right_inverse(torch.tensor([0.5, value]))
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (math.nan, 1.0), ("0", 1.0)])
+def test_bounds_that_are_none(low, high):
+    for make in (lambda: parametrize.Bounded(low, high), lambda: bounded(torch.zeros(2), low, high)):
+        with pytest.raises(UnitError, match="bounds"):
+            make()
+
+
+def test_bounds_have_to_fit():
+    with pytest.raises(ShapeError, match="broadcast"):
+        parametrize.Bounded([0.0, 0.0], [1.0, 1.0, 1.0])
+    with pytest.raises(ShapeError, match="broadcast to"):
+        parametrize.Bounded([0.0, 0.0], 1.0)(torch.zeros(3))
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.5, -1.0, math.nan, "little", True])
+def test_margins_that_are_none(margin):
+    for make in (lambda: parametrize.Albedo(margin=margin), lambda: parametrize.Simplex(margin=margin)):
+        with pytest.raises(UnitError, match="margin"):
+            make()
+
+
+def test_positive_at_its_limits():
+    assert positive(torch.tensor([-1e4, -20.0]))[0] >= 0
+    value = torch.tensor([1e-30, 1e-3, 1.0, 1e4, 1e30])
+    for function in ("softplus", "exp"):
+        back = positive(positive_inverse(value, function=function), function=function)
+        # The logarithm of 1e30 is 69: what its last digit is worth, the value has 69-fold.
+        assert torch.allclose(back, value, rtol=69 * 2**-23), function
+    for wrong in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(UnitError, match="Positive: expected finite values above 0"):
+            parametrize.Positive().right_inverse(torch.tensor([1.0, wrong]))
+    for settings in ({"scale": 0.0}, {"low": math.inf}, {"function": "square"}):
+        with pytest.raises(UnitError, match="expected"):
+            parametrize.Positive(**settings)
+
+
+def test_simplex():
+    with pytest.raises(UnitError, match="sum 1"):
+        simplex_inverse(torch.tensor([0.5, 0.6]))
+    with pytest.raises(UnitError, match="margin=1e-3"):
+        simplex_inverse(torch.tensor([0.0, 1.0]))
+    weights = parametrize.Simplex(0, margin=0.01)
+    found = weights(weights.right_inverse(torch.tensor([[0.0, 0.5], [1.0, 0.5]])))
+    assert torch.allclose(found.sum(0), torch.ones(2)) and found[0, 0].item() == pytest.approx(0.005, rel=0.01)
+    with pytest.raises(ShapeError, match="along dimension 2"):
+        parametrize.simplex(torch.zeros(3), 2)

@@ -1,0 +1,193 @@
+"""Parametrizations of a renderer's values, by keys with dots, through everything that happens to a module."""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils import parametrize as torch_parametrize
+
+import torchtransient as tt
+from torchtransient.errors import SceneError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.parametrize import Albedo, AxisAnglePose, original, register, remove
+from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
+
+KEYS = [COLOUR, WALL_POSE]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return tt.load(make_room(), variant=VARIANT)
+
+
+@pytest.fixture
+def plain(scene):
+    return tt.TransientRenderer(scene, KEYS, spp=4, temporal_filter="tent")
+
+
+@pytest.fixture
+def renderer(scene):
+    made = tt.TransientRenderer(scene, KEYS, spp=4, temporal_filter="tent")
+    register(made, COLOUR, Albedo())
+    register(made, WALL_POSE, AxisAnglePose(made.values[WALL_POSE]))
+    return made
+
+
+def light(renderer, seed=3):
+    return renderer(seed=seed).transient
+
+
+def test_the_same_render_and_the_chain_rule(renderer, plain):
+    first, second = light(renderer), light(plain)
+    assert torch.allclose(first, second, rtol=1e-4, atol=1e-7 * second.abs().max().item())
+    weights = torch.rand(first.shape, generator=torch.Generator().manual_seed(1))
+    (first * weights).sum().backward()
+    (second * weights).sum().backward()
+    for key in KEYS:
+        behind = original(renderer, key)
+        value = getattr(renderer, key.replace(".", "/"))
+        (known,) = torch.autograd.grad(value, behind, plain.values[key].grad)
+        assert behind.grad.abs().max() > 0
+        assert torch.allclose(behind.grad, known, rtol=2e-3, atol=1e-4 * known.abs().max().item())
+
+
+def test_torchs_own_call_does_it(plain):
+    before = light(plain).detach()
+    name = COLOUR.replace(".", "/")
+    torch_parametrize.register_parametrization(plain, name, Albedo())
+    assert torch.allclose(light(plain), before, rtol=1e-4, atol=1e-7 * before.abs().max().item())
+    torch_parametrize.remove_parametrizations(plain, name)
+    assert isinstance(plain.values[COLOUR], nn.Parameter) and type(plain) is tt.TransientRenderer
+
+
+def test_names_values_and_writing(renderer):
+    names = dict(renderer.named_parameters())
+    assert {name: tuple(p.shape) for name, p in names.items()} == {
+        f"parametrizations.{COLOUR.replace('.', '/')}.original": (3,),
+        f"parametrizations.{WALL_POSE.replace('.', '/')}.original": (6,),
+    }
+    renderer.values[COLOUR] = [0.1, 0.2, 0.3]
+    assert torch.allclose(renderer.values[COLOUR], torch.tensor([0.1, 0.2, 0.3]))
+    assert torch.allclose(original(renderer, COLOUR), torch.logit(torch.tensor([0.1, 0.2, 0.3])), atol=1e-6)
+    before = original(renderer, COLOUR).detach().clone()
+    with pytest.raises(UnitError, match="Albedo: expected values between 0 and 1"):
+        renderer.values[COLOUR] = [0.1, 0.2, 1.3]
+    assert torch.equal(original(renderer, COLOUR), before)
+    given = torch.tensor([0.5, 0.5, 0.5], requires_grad=True)
+    out = renderer({COLOUR: given}, seed=1).transient.sum()  # values of a call are taken as they are
+    out.backward()
+    assert given.grad.abs().min() > 0 and original(renderer, COLOUR).grad is None
+
+
+def copies():
+    def saved(module):
+        file = io.BytesIO()
+        torch.save(module, file)
+        file.seek(0)
+        return torch.load(file, weights_only=False)
+
+    return {
+        "deepcopy": copy.deepcopy,
+        "copy": copy.copy,
+        "pickle": lambda module: pickle.loads(pickle.dumps(module)),
+        "torch.save": saved,
+        "variation": lambda module: module.variation(temporal_filter="tent"),
+        "deepcopy of a deepcopy": lambda module: copy.deepcopy(copy.deepcopy(module)),
+    }
+
+
+@pytest.mark.parametrize("how", copies())
+def test_copies_are_renderers_of_their_own(renderer, how):
+    with torch.no_grad():
+        original(renderer, COLOUR).add_(0.3)
+    twin = copies()[how](renderer)
+    assert isinstance(twin, tt.TransientRenderer) and repr(twin) == repr(renderer)
+    assert [n for n, _ in twin.named_parameters()] == [n for n, _ in renderer.named_parameters()]
+    assert torch.equal(light(twin), light(renderer))
+    if how == "copy":  # shares its tensors, as copies of modules do
+        return
+    before = light(renderer).detach()
+    with torch.no_grad():
+        original(twin, COLOUR).add_(1.0)
+    remove(twin, COLOUR)
+    remove(twin, WALL_POSE)
+    assert type(twin) is tt.TransientRenderer
+    assert not torch.allclose(light(twin), before, rtol=1e-3)
+    assert torch.equal(light(renderer), before)
+    light(renderer).sum().backward()
+    assert original(renderer, WALL_POSE).grad.abs().max() > 0
+
+
+def test_a_plain_renderer_is_copied_as_before(plain):
+    for twin in (copy.deepcopy(plain), pickle.loads(pickle.dumps(plain))):
+        assert type(twin) is tt.TransientRenderer
+        assert torch.equal(light(twin), light(plain))
+        register(twin, COLOUR, Albedo())
+        assert not torch_parametrize.is_parametrized(plain)
+
+
+def test_state_dict_and_optimiser_go_on(renderer, scene):
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)
+
+    def step(module, optimizer, seed):
+        optimizer.zero_grad()
+        light(module, seed).square().mean().backward()
+        optimizer.step()
+
+    step(renderer, optimizer, 1)
+    saved = copy.deepcopy((renderer.state_dict(), optimizer.state_dict()))
+    step(renderer, optimizer, 2)
+
+    other = tt.TransientRenderer(scene, KEYS, spp=4, temporal_filter="tent")
+    register(other, COLOUR, Albedo())
+    register(other, WALL_POSE, AxisAnglePose(other.values[WALL_POSE]))
+    again = torch.optim.Adam(other.parameters(), lr=0.05)
+    other.load_state_dict(saved[0])
+    again.load_state_dict(saved[1])
+    step(other, again, 2)
+    for key in KEYS:
+        assert torch.allclose(original(other, key), original(renderer, key), rtol=1e-4, atol=1e-6)
+
+
+def test_functional_call(renderer):
+    name = f"parametrizations.{COLOUR.replace('.', '/')}.original"
+    x = torch.tensor([0.3, -0.2, 0.1])
+    out = torch.func.functional_call(renderer, {name: x}, kwargs={"seed": 3}).transient
+    assert torch.allclose(out, renderer({COLOUR: torch.sigmoid(x)}, seed=3).transient, rtol=1e-4, atol=1e-9)
+
+
+def test_inside_of_another_module_and_twice(scene):
+    holder = nn.ModuleDict({"scene": tt.TransientRenderer(scene, [COLOUR], spp=4), "net": nn.Linear(2, 2)})
+    register(holder, COLOUR, Albedo(margin=1e-3))
+    register(holder, "net.weight", tt.parametrize.Bounded(-1.0, 1.0))
+    register(holder, COLOUR, tt.parametrize.Bounded(0.0, 1.0))  # of what the first one makes
+    assert len(holder["scene"].parametrizations[COLOUR.replace(".", "/")]) == 2
+    assert bool((holder["net"].weight.abs() < 1).all())
+    twin = copy.deepcopy(holder)
+    assert torch.equal(light(twin["scene"]), light(holder["scene"]))
+
+
+def test_what_is_wrong_is_said(renderer, plain):
+    for call in (lambda: register(plain, "box.colour", Albedo()), lambda: original(plain, "box.colour")):
+        with pytest.raises(UnknownKeyError, match=r"TransientRenderer has no parameter 'box\.colour'; there are"):
+            call()
+    with pytest.raises(SceneError, match="has no parametrization"):
+        remove(plain, COLOUR)
+    with pytest.raises(SceneError, match=r"an nn\.Module, got type"):
+        register(plain, COLOUR, Albedo)
+    with pytest.raises(ShapeError, match=r"AxisAnglePose: expected transforms \(\.\.\., 4, 4\)"):
+        register(plain, COLOUR, AxisAnglePose())
+    with pytest.raises(ShapeError, match=f"Unflatten does not fit '{COLOUR}'"):
+        register(plain, COLOUR, nn.Unflatten(0, (1, 3)))
+    with pytest.raises(UnitError, match="rigid motion of the base"):
+        register(plain, WALL_POSE, AxisAnglePose())
+    assert type(plain) is tt.TransientRenderer
+    two = nn.ModuleList([renderer, plain])
+    with pytest.raises(UnknownKeyError, match="several modules"):
+        register(two, COLOUR, Albedo())
+    register(two, f"1.{COLOUR}", Albedo())
+    assert torch_parametrize.is_parametrized(plain, COLOUR.replace(".", "/"))

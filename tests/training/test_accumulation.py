@@ -1,0 +1,163 @@
+"""``tt.training.accumulate``: the gradient of a batch, part by part; and what autocast and scaled losses make of it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+import torchtransient as tt
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+from torchtransient.training import Seeds, accumulate
+
+EPS = torch.finfo(torch.float32).eps
+
+
+class Proposer(nn.Module):
+    """A colour from a measurement, and the light of the room with it."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.network = nn.Linear(5, 3)
+        self.renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=8)
+
+    def forward(self, measured, seed):
+        return self.renderer({COLOUR: torch.sigmoid(self.network(measured))}, seed=seed).transient
+
+
+@pytest.fixture(scope="module")
+def model():
+    return Proposer()
+
+
+def gradients(model):
+    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+
+def test_parts_have_the_gradient_of_the_batch(model):
+    measured = torch.randn(6, 5, generator=torch.Generator().manual_seed(1))
+    seeds = Seeds(0)
+
+    def loss_of(samples):
+        return model(measured[samples], seeds(0, samples)).square().sum((1, 2, 3, 4)).mean()
+
+    model.zero_grad()
+    whole = loss_of(list(range(6)))
+    whole.backward()
+    expected = gradients(model)
+    # Of each sample alone: what float sums of them can lose is a share of the sum of their magnitudes.
+    magnitude = {name: torch.zeros_like(value) for name, value in expected.items()}
+    for n in range(6):
+        model.zero_grad()
+        (loss_of([n]) / 6).backward()
+        for name, value in gradients(model).items():
+            magnitude[name] += value.abs()
+    for parts, weights in (([[0, 1, 2], [3, 4, 5]], None), ([[0, 1, 2, 3], [4, 5]], [4 / 6, 2 / 6])):
+        model.zero_grad()
+        total = accumulate(loss_of, parts, weights=weights)
+        assert total == pytest.approx(whole.item(), rel=8 * EPS)
+        for name, value in gradients(model).items():
+            # 6 samples and 2 weights are at most 8 roundings of a sum.
+            assert ((value - expected[name]).abs() <= 8 * EPS * magnitude[name]).all(), name
+    assert expected["network.weight"].abs().max() > 0
+
+
+def test_memory_is_that_of_a_part():
+    """Bytes that wait for the backward pass, at their most."""
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=1)
+    colours = torch.full((8, 3), 0.4, requires_grad=True)
+    held, most = 0, 0
+
+    def kept(tensor):
+        nonlocal held, most
+        held += tensor.nbytes
+        most = max(most, held)
+        return tensor
+
+    def loss_of(part):
+        nonlocal held
+        held = 0
+        return renderer({COLOUR: colours[part]}, seed=0).transient.square().sum()
+
+    found = {}
+    for name, parts in {"whole": [slice(0, 8)], "parts": [slice(n, n + 1) for n in range(8)]}.items():
+        most = 0
+        with torch.autograd.graph.saved_tensors_hooks(kept, lambda tensor: tensor):
+            accumulate(loss_of, parts)
+        found[name] = most
+    cube = 4 * 3 * 24 * 3 * 4
+    assert found["whole"] >= 8 * cube
+    assert found["parts"] <= found["whole"] / 7
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_autocast_around_network_renderer_and_loss(model, kind):
+    measured = torch.randn(2, 5, generator=torch.Generator().manual_seed(1))
+
+    def loss_of():
+        out = model.renderer({COLOUR: torch.sigmoid(model.network(measured))}, seed=3)
+        return out, tt.losses.root_loss(out.transient, torch.ones_like(out.transient))
+
+    model.zero_grad()
+    _, exact = loss_of()
+    exact.backward()
+    expected = gradients(model)
+    model.zero_grad()
+    with torch.autocast("cpu", dtype=kind):
+        assert model.network(measured).dtype == kind
+        out, loss = loss_of()
+    # The render takes and gives float32, whatever the network computes in.
+    assert out.transient.dtype == out.steady.dtype == torch.float32
+    scaler = torch.amp.GradScaler("cpu", enabled=kind == torch.float16, init_scale=2.0**10)
+    scaler.scale(loss).backward()
+    optimizer = torch.optim.SGD(model.network.parameters(), lr=0.0)
+    scaler.unscale_(optimizer)
+    found = gradients(model)
+    assert {value.dtype for value in found.values()} == {torch.float32}
+    # Weights and activations keep 8 (bfloat16) or 11 bits.
+    bits = 4 * torch.finfo(kind).eps
+    for name in ("network.weight", "network.bias"):
+        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=bits * expected[name].abs().max().item())
+    assert loss.item() == pytest.approx(exact.item(), rel=bits)
+
+
+def test_a_scaler_skips_a_step_whose_gradient_is_infinite():
+    model = Proposer()
+    scaler = torch.amp.GradScaler("cpu", init_scale=2.0**8)
+    optimizer = torch.optim.SGD(model.network.parameters(), lr=0.1)
+    before = {name: p.detach().clone() for name, p in model.named_parameters()}
+
+    def step(factor):
+        optimizer.zero_grad()
+        accumulate(lambda part: factor * model(part, 0).mean(), [torch.ones(1, 5)] * 2, scaler=scaler)
+        scaler.step(optimizer)
+        scaler.update()
+        return all(torch.equal(p, before[name]) for name, p in model.network.named_parameters(prefix="network"))
+
+    assert step(float("inf"))
+    assert scaler.get_scale() == 2.0**7
+    assert not step(1.0)
+    assert scaler.get_scale() == 2.0**7
+
+
+def test_an_overflow_before_the_renderer_is_an_error_and_no_skipped_step(model):
+    with pytest.raises(UnitError, match="finite"):
+        model.renderer({COLOUR: torch.tensor([[float("inf"), 0.5, 0.5]], dtype=torch.float16)}, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: accumulate(torch.sum, []), ShapeError, "at least one part"),
+        (lambda: accumulate(torch.sum, [1, 2], weights=[1.0]), ShapeError, "each of 2 parts, got 1"),
+        (lambda: accumulate(torch.sum, [1], weights=[float("nan")]), UnitError, "finite"),
+        (lambda: accumulate(lambda _: torch.ones(2), [1]), ShapeError, r"got shape \(2,\)"),
+        (lambda: accumulate(lambda _: 1.0, [1]), ShapeError, "got float"),
+        (lambda: accumulate(torch.sum, [1], model=3), UnitError, "model as a module, got int"),
+    ],
+)
+def test_what_it_does_not_take(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,253 @@
+"""Checkpoints: a run that goes on is the run that was not stopped; what is no checkpoint is refused unexecuted."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import torchtransient as tt
+from torchtransient.errors import ShapeError, StorageError, TorchTransientWarning, UnitError
+from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
+from torchtransient.training import Batches, Seeds, checkpoint, load_checkpoint, save_checkpoint
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return tt.load(make_room(), variant=VARIANT)
+
+
+class Run:
+    """A network before the renderer and parameters in it, with whatever keeps a state."""
+
+    def __init__(self, scene):
+        torch.manual_seed(0)
+        renderer = tt.TransientRenderer(scene, parameters=[COLOUR, "light.intensity.value"], spp=4)
+        network = nn.Sequential(nn.Linear(6, 8), nn.BatchNorm1d(8), nn.Dropout(0.5), nn.Linear(8, 3))
+        self.model = nn.ModuleDict({"network": network, "renderer": renderer})
+        self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=1e-2)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimizer, 1e-2, total_steps=50)
+        self.scaler = torch.amp.GradScaler("cpu", init_scale=8.0, growth_interval=2)
+        self.noise = torch.Generator().manual_seed(5)
+        self.batches, self.seeds = Batches(12, 4), Seeds(0)
+        self.parts = {
+            name: getattr(self, name) for name in ("model", "optimizer", "schedule", "scaler", "noise", "batches")
+        }
+
+    def go(self, first, last):
+        for step in range(first, last):
+            samples = self.batches.samples(step)
+            given = torch.randn(4, 6, generator=self.noise) + random.random() + np.random.rand()  # noqa: NPY002
+            colour = torch.sigmoid(self.model["network"](given))
+            out = self.model["renderer"]({COLOUR: colour}, seed=self.seeds(step, samples))
+            self.optimizer.zero_grad()
+            self.scaler.scale(out.transient.square().mean()).backward()
+            self.scaler.step(self.optimizer)
+            self.scaler.update()
+            self.schedule.step()
+            self.batches.step = step + 1
+
+
+def seed_all():
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    torch.manual_seed(1)
+
+
+def assert_same(first, second):
+    for one, other in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(first.buffers(), second.buffers(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_goes_on_to_the_bit(tmp_path, scene):
+    with tt.threads(1):
+        whole = Run(scene)
+        seed_all()
+        whole.go(0, 6)
+        stopped = Run(scene)
+        seed_all()
+        stopped.go(0, 3)
+        save_checkpoint(tmp_path / "run.pt", stopped.parts, step=3, values={"losses": [1.0, np.float64(2.0)]})
+        # Elsewhere: other random numbers, and a scene of its own that has rendered nothing.
+        resumed = Run(tt.load(make_room(), variant=VARIANT))
+        random.seed(77)
+        np.random.seed(77)  # noqa: NPY002
+        torch.manual_seed(77)
+        found = load_checkpoint(tmp_path / "run.pt", resumed.parts)
+        assert (found.step, found.values, found.ranks) == (3, {"losses": [1.0, 2.0]}, 1)
+        assert found.libraries["torch"] == torch.__version__
+        resumed.go(found.step, 6)
+    assert_same(whole.model, resumed.model)
+    assert whole.scaler.get_scale() == resumed.scaler.get_scale() > 8
+    assert whole.schedule.get_last_lr() == resumed.schedule.get_last_lr()
+    # Without the random numbers it is another run, so that the test can fail.
+    other = Run(scene)
+    load_checkpoint(tmp_path / "run.pt", other.parts, random=False)
+    other.go(3, 6)
+    assert not torch.equal(other.model["network"][0].weight, whole.model["network"][0].weight)
+
+
+def tiny(parameter=1.0):
+    model = nn.Linear(2, 1)
+    nn.init.constant_(model.weight, parameter)
+    return model
+
+
+def test_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+
+    def interrupted(*arguments):
+        raise OSError("no space left on device")
+
+    for name in ("fsync", "replace"):
+        with monkeypatch.context() as patch:
+            patch.setattr(checkpoint.os, name, interrupted)
+            with pytest.raises(StorageError, match="cannot be written: no space left"):
+                save_checkpoint(path, {"model": tiny(2.0)}, step=2)
+        model = tiny(0.0)
+        assert load_checkpoint(path, {"model": model}).step == 1
+        assert model.weight[0, 0] == 1.0
+    save_checkpoint(path, {"model": tiny(2.0)}, step=2)
+    assert load_checkpoint(path, {"model": tiny()}).step == 2
+    with pytest.raises(StorageError, match="cannot be written"):
+        save_checkpoint(tmp_path / "nowhere" / "run.pt", {}, step=0)
+
+
+def test_torn_and_damaged_files(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    written = path.read_bytes()
+    for size in (0, 1, len(written) // 2, len(written) - 1):
+        path.write_bytes(written[:size])
+        with pytest.raises(StorageError, match="torn, or no checkpoint"):
+            load_checkpoint(path, {"model": tiny()})
+    # One bit of a weight: the file can be opened, its sum is wrong.
+    place = written.index(np.array([1.0, 1.0], dtype=np.float32).tobytes())
+    path.write_bytes(written[:place] + bytes([written[place] ^ 1]) + written[place + 1 :])
+    model = tiny(3.0)
+    with pytest.raises(StorageError, match="is damaged: the sum of"):
+        load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 3.0
+    with pytest.raises(StorageError, match="is not there"):
+        load_checkpoint(tmp_path / "other.pt", {})
+    with pytest.raises(StorageError, match="cannot be read"):
+        load_checkpoint(tmp_path, {})
+
+
+class _Harmful:
+    """What a pickle of strangers may do."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_files_of_others_are_not_executed(tmp_path):
+    path, victim = tmp_path / "run.pt", tmp_path / "victim"
+    torch.save({"format": "torchtransient checkpoint", "version": 1, "step": _Harmful(victim)}, path)
+    with pytest.raises(StorageError, match="would have to be executed"):
+        load_checkpoint(path, {})
+    assert not victim.exists()
+    torch.save({"weights": torch.ones(2)}, path)
+    with pytest.raises(StorageError, match="no checkpoint of save_checkpoint"):
+        load_checkpoint(path, {})
+    for content, message in (({"version": 2}, "version 2, expected 1"), ({"version": 1}, "lacks step, parts")):
+        torch.save({"format": "torchtransient checkpoint", **content}, path)
+        with pytest.raises(StorageError, match=message):
+            load_checkpoint(path, {})
+
+
+def test_checkpoints_of_other_runs_change_nothing(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0), "noise": torch.Generator()}, step=1)
+    model, noise, state = tiny(3.0), torch.Generator(), torch.get_rng_state()
+    wrong = [
+        ({"model": model}, StorageError, "has the parts model, noise, expected model"),
+        ({"model": nn.Linear(2, 1, bias=False), "noise": noise}, StorageError, "lacks nothing and has bias beyond"),
+        ({"model": nn.Sequential(model), "noise": noise}, StorageError, "lacks 0.bias, 0.weight and has bias, weight"),
+        ({"model": nn.Linear(3, 1), "noise": noise}, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
+        ({"noise": model, "model": noise}, StorageError, "no state of a generator|of another module"),
+        ([model], StorageError, "parts as a dictionary"),
+    ]
+    torch.rand(1)
+    state = torch.get_rng_state()
+    for parts, error, message in wrong:
+        with pytest.raises(error, match=message):
+            load_checkpoint(path, parts)
+    assert model.weight[0, 0] == 3.0
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_of_other_numbers_of_ranks(tmp_path, monkeypatch):
+    path, model = tmp_path / "run.pt", tiny(3.0)
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    monkeypatch.setattr(checkpoint, "_size", lambda: 2)
+    with pytest.raises(StorageError, match="random numbers of 1 ranks, expected those of 2"):
+        load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 3.0
+    assert load_checkpoint(path, {"model": model}, random=False).step == 1
+    assert model.weight[0, 0] == 1.0
+
+
+def test_other_libraries_are_told(tmp_path, monkeypatch):
+    path = tmp_path / "run.pt"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_libraries", lambda: {"torch": "1.0"})
+        save_checkpoint(path, {}, step=1)
+    with pytest.warns(TorchTransientWarning, match=r"torch 1\.0 \(here 2.*not to the bit"):
+        load_checkpoint(path, {})
+
+
+class _Kept:
+    """A part whose state is as given."""
+
+    def __init__(self, state):
+        self.state = state
+
+    def state_dict(self):
+        return self.state
+
+    def load_state_dict(self, state):
+        self.state = state
+
+
+def test_states_are_data(tmp_path):
+    path = tmp_path / "run.pt"
+    state = {
+        "number": np.float32(0.5), "array": np.arange(3), "several": (1, [2.0, None, "x"]), 3: {True, False},
+        "of": defaultdict(int, a=1), "place": torch.device("cpu"), "parameter": nn.Parameter(torch.ones(2)),
+    }  # fmt: skip
+    save_checkpoint(path, {"kept": _Kept(state)}, step=0)
+    kept = _Kept(None)
+    load_checkpoint(path, {"kept": kept})
+    assert kept.state["number"] == 0.5 and type(kept.state["number"]) is float
+    assert kept.state["array"].tolist() == [0, 1, 2]
+    assert (kept.state["several"], kept.state["of"], kept.state[3]) == ((1, [2.0, None, "x"]), {"a": 1}, {True, False})
+    for state, place in (({"a": [1, print]}, r"kept\['a'\]\[1\] is a builtin"), ({object(): 1}, "a key of kept")):
+        with pytest.raises(StorageError, match=place):
+            save_checkpoint(path, {"kept": _Kept(state)}, step=0)
+    for parts, message in (({"x": 3}, "Plain data belong into values"), ([3], "parts as a dictionary")):
+        with pytest.raises(StorageError, match=message):
+            save_checkpoint(path, parts, step=0)
+    with pytest.raises(UnitError, match="step"):
+        save_checkpoint(path, {}, step=-1)
+    # None of these has touched the file.
+    assert load_checkpoint(path, {"kept": kept}).step == 0
+
+
+def test_a_part_that_does_not_take_its_state(tmp_path):
+    path, model = tmp_path / "run.pt", tiny()
+    save_checkpoint(path, {"optimizer": torch.optim.SGD(model.parameters())}, step=0)
+    other = torch.optim.SGD([{"params": [model.weight]}, {"params": [model.bias]}])
+    with pytest.raises(StorageError, match=r"'optimizer' does not take its state: .*made anew"):
+        load_checkpoint(path, {"optimizer": other})

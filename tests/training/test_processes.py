@@ -1,0 +1,93 @@
+"""``tt.training.ranks`` without other processes: settings of torchrun, threads, devices."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+import torch.distributed as dist
+
+import torchtransient as tt
+from torchtransient.errors import DeviceError, UnitError
+from torchtransient.training import ranks, worker_init
+
+
+@pytest.fixture(autouse=True)
+def no_torchrun(monkeypatch):
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def torchrun(monkeypatch, rank, size):
+    values = {"RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size}
+    for name, value in values.items():
+        monkeypatch.setenv(name, str(value))
+
+
+def test_alone():
+    before = tt.threads()
+    with ranks(threads=3) as found:
+        assert (found.rank, found.size, found.local, found.local_size, found.is_first) == (0, 1, 0, 1, True)
+        assert (found.device, found.variant_prefix) == (torch.device("cpu"), "llvm_ad_")
+        assert found.mean(3.5) == 3.5
+        assert not dist.is_initialized()
+        assert (tt.threads().torch, tt.threads().drjit) == (3, 3)
+    assert tt.threads() == before
+
+
+def test_cores_are_shared(monkeypatch):
+    torchrun(monkeypatch, 0, 1)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    monkeypatch.setattr("torchtransient.training.processes._cores", lambda: 7)
+    with ranks():
+        assert tt.threads().drjit == 3
+    monkeypatch.setattr("torchtransient.training.processes._cores", lambda: 1)
+    with ranks():
+        assert tt.threads().drjit == 1
+
+
+def test_worker_init_takes_one_thread():
+    with tt.threads(3):
+        worker_init(0)
+        assert (tt.threads().torch, tt.threads().drjit) == (1, 1)
+
+
+def test_broken_settings(monkeypatch):
+    with pytest.raises(UnitError, match="'cpu' or 'cuda', got 'tpu'"), ranks("tpu"):
+        pass
+    monkeypatch.setenv("RANK", "0")
+    with pytest.raises(UnitError, match="RANK are set and WORLD_SIZE, LOCAL_RANK, LOCAL_WORLD_SIZE not"), ranks():
+        pass
+    torchrun(monkeypatch, 0, 1)
+    monkeypatch.setenv("WORLD_SIZE", "two")
+    with pytest.raises(UnitError, match="WORLD_SIZE: expected a whole number of at least 1, got 'two'"), ranks():
+        pass
+
+
+@pytest.mark.parametrize(("seen", "shown"), [(None, "1"), ("4,6", "6")])
+def test_a_rank_is_shown_its_own_device(monkeypatch, seen, shown):
+    torchrun(monkeypatch, 1, 2)
+    if seen is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    begun = []
+    monkeypatch.setattr(dist, "init_process_group", lambda backend, timeout: begun.append(backend))
+    with ranks("cuda") as found:
+        assert (os.environ["CUDA_VISIBLE_DEVICES"], found.variant_prefix) == (shown, "cuda_ad_")
+    assert begun == ["nccl"]
+
+
+def test_devices_that_cannot_be_had(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DeviceError, match="torch finds none"), ranks("cuda"):
+        pass
+    torchrun(monkeypatch, 1, 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    with pytest.raises(DeviceError, match="2 ranks on this machine and 1 devices"), ranks("cuda"):
+        pass
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    with pytest.raises(DeviceError, match="before anything uses CUDA"), ranks("cuda"):
+        pass

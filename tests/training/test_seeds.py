@@ -1,0 +1,98 @@
+"""``tt.training.Seeds``: a function of run, step and sample; no collisions in a step, no correlated renders."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchtransient as tt
+from torchtransient.errors import UnitError
+from torchtransient.testing.small_room import VARIANT, make_room
+from torchtransient.training import Seeds
+
+
+def test_a_function_of_run_step_and_sample_alone():
+    whole = Seeds(3)(7, range(10))
+    assert Seeds(3)(7, torch.arange(10)) == whole
+    # However a batch is divided, and in whatever order it comes.
+    assert Seeds(3)(7, [5, 2]) + Seeds(3)(7, [9]) == [whole[5], whole[2], whole[9]]
+    others = {tuple(s) for s in (whole, Seeds(4)(7, range(10)), Seeds(3)(8, range(10)), Seeds(3, "b")(7, range(10)))}
+    assert len(others) == 4
+    # Written down: a run that is resumed years later draws the same.
+    assert Seeds(0)(0, [0, 1, 2]) == [1099802580, 340961415, 818740969]
+    assert Seeds(0).generator(0).initial_seed() == 4575342053079085010
+
+
+def test_no_collisions_in_a_step():
+    seeds = Seeds(0)(12, range(200_000))
+    # Of so many random numbers 4.7 pairs would collide, exp(-4.7) = 0.009 is the chance of none.
+    assert len(set(seeds)) == len(seeds)
+    assert 0 <= min(seeds) <= max(seeds) < 2**32
+
+
+def test_over_steps_they_collide_as_random_numbers_do():
+    drawn = [seed for step in range(400) for seed in Seeds(1)(step, range(250))]
+    # 1e5^2 / 2 / 2^32 = 1.16 pairs; eight or more have a chance of 1e-4.
+    assert len(drawn) - len(set(drawn)) < 8
+
+
+@pytest.mark.parametrize(("a", "b"), [((0, 0), (0, 1)), ((0, 0), (1, 0)), ((5, 2), (6, 1))])
+def test_bits_of_neighbours_are_unrelated(a, b):
+    count = 4000
+    first = torch.tensor([Seeds(n)(a[0], [a[1]])[0] for n in range(count)])
+    second = torch.tensor([Seeds(n)(b[0], [b[1]])[0] for n in range(count)])
+    differing = ((first ^ second).unsqueeze(1) >> torch.arange(32)) & 1
+    # 32 shares of a binomial of standard error 0.5 / sqrt(n): five of them are never reached.
+    assert (differing.double().mean(0) - 0.5).abs().max() < 5 * 0.5 / count**0.5
+
+
+def test_renders_of_neighbours_are_uncorrelated():
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), spp=4)
+    draws = 200
+
+    def noise(seeds):
+        with torch.no_grad():
+            cubes = torch.stack([renderer(seed=seed).transient.double().flatten() for seed in seeds])
+        cubes = cubes[:, cubes.std(0) > 0]
+        return (cubes - cubes.mean(0)) / cubes.std(0)
+
+    of_samples = noise(Seeds(0)(3, range(draws)))
+    of_steps = noise([Seeds(0)(step, [3])[0] for step in range(draws)])
+    for residuals in (of_samples, of_steps):
+        for lag in (1, 2):
+            products = (residuals[:-lag] * residuals[lag:]).mean(1)
+            # Bins of a render depend on each other: the spread over pairs of renders tells how much. The mean that
+            # is taken off makes -1 / draws of a zero, which is a sixth of the bound.
+            assert products.mean().abs() < 4 * products.std() / (draws - lag) ** 0.5
+    # A render is fully correlated with itself, so that the test can fail.
+    assert noise([1, 2, 1, 2])[0].mul(noise([1, 2, 1, 2])[2]).mean() > 0.5
+
+
+def test_generators():
+    seeds = Seeds(0)
+
+    def draw(*arguments):
+        return torch.rand(3, generator=seeds.generator(*arguments)).tolist()
+
+    assert draw(4) == draw(4, 0)
+    assert len({tuple(draw(*a)) for a in ((4,), (5,), (4, 1))}) == 3
+    assert Seeds(0, "other").generator(4).initial_seed() != seeds.generator(4).initial_seed()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Seeds(-1), "seed: expected a whole number of at least 0, got -1"),
+        (lambda: Seeds(0, 3), "purpose as a text"),
+        (lambda: Seeds(0)(-1, [0]), "step: expected a whole number"),
+        (lambda: Seeds(0)(0, [0.5]), "sample: expected a whole number"),
+        (lambda: Seeds(0)(0, [2**32]), "below 2\\^32"),
+        (lambda: Seeds(0)(0, 3), r"write \[3\]"),
+        (lambda: Seeds(0)(0, torch.tensor([1.0])), "torch.float32"),
+        (lambda: Seeds(0)(0, torch.tensor(1)), r"shape \(B,\)"),
+        (lambda: Seeds(0).generator(0, -1), "sample: expected"),
+    ],
+)
+def test_what_they_do_not_take(call, message):
+    with pytest.raises(UnitError, match=message):
+        call()

@@ -1,0 +1,70 @@
+"""Samples of a recipe by number, rendered where and when they are read: nothing is stored, and nothing is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import count, shown
+
+_WHAT = "RecipeDataset"
+
+
+class RecipeDataset(Dataset[dict[str, Any]]):
+    """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders, of ``size`` samples from ``first`` on.
+
+    A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
+    by name, ``values`` by key, ``index`` in the recipe. It depends on recipe and number alone: a run that reads it in
+    the order of :class:`torchtransient.training.Batches` can be stopped and goes on to the bit, which one with
+    :class:`OnlineDataset`, whose order depends on how fast samples are made, cannot. Each sample is rendered every time
+    that it is read; where that is what a step waits for, use OnlineDataset, or generate the data set.
+
+    ``DataLoader(data, num_workers=2, multiprocessing_context="spawn", persistent_workers=True,
+    worker_init_fn=torchtransient.training.worker_init)`` renders beside the training; processes that were forked raise
+    VariantError. ``transform``: function of the transient, without gradients; its result stands under ``measurement``.
+
+    It pickles, without what it has built. ``close()`` lets go of that; it is built again when a sample is read. Raises
+    UnitError for sizes, IndexError beyond them, and what the render of a sample raises.
+    """
+
+    def __init__(
+        self, recipe: Any, size: int, *, first: int = 0, transform: Callable[[torch.Tensor], Any] | None = None
+    ) -> None:
+        self.recipe, self.transform = recipe, transform
+        self.size = count(f"{_WHAT}: size", size, 1, UnitError)
+        self.first = count(f"{_WHAT}: first", first, 0, UnitError)
+        self._maker: Any = None
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        if isinstance(number, slice) or not -self.size <= number < self.size:
+            raise IndexError(f"{_WHAT}: expected a number from 0 to {self.size - 1}, got {shown(number)}.")
+        if self._maker is None:
+            self._maker = self.recipe.maker()
+        made = self._maker.sample(self.first + int(number) % self.size)
+        found: dict[str, Any] = {name: torch.from_numpy(np.array(array)) for name, array in made.arrays.items()}
+        if self.transform is not None:
+            if "transient" not in found:
+                raise ShapeError(f"{_WHAT}: transform= is for transients, and samples have {', '.join(found)}.")
+            with torch.no_grad():
+                found["measurement"] = self.transform(found["transient"])
+        values = made.values.items()
+        found["values"] = {key: v if isinstance(v, str) else torch.from_numpy(np.array(v)) for key, v in values}
+        found["index"] = made.index
+        return found
+
+    def close(self) -> None:
+        """Let go of the scenes that were built."""
+        if self._maker is not None:
+            self._maker.close()
+            self._maker = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_maker": None}

@@ -1,0 +1,141 @@
+"""Intrinsics and extrinsics of Mitsuba's perspective cameras, as kornia has them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.quantities import count, real_array, shown
+
+FovAxis = Literal["x", "y", "diagonal", "smaller", "larger"]
+# From Mitsuba's camera, x to the left and y up, to kornia's, x to the right and y down; and back.
+_HALF_TURN = (-1.0, -1.0, 1.0, 1.0)
+
+
+def intrinsics(
+    fov_deg: float | Tensor,
+    size: Sequence[int],
+    fov_axis: FovAxis = "x",
+    principal_point_offset: Any = (0.0, 0.0),
+    crop_offset: Sequence[int] = (0, 0),
+) -> Tensor:
+    """Camera matrix (3, 3) of a `perspective` or `thinlens` sensor, in pixels; (..., 3, 3) of angles (...).
+
+    `fov_deg`: angle of view along `fov_axis`, degrees, 0 to 180; a tensor keeps its gradient (`x_fov` of a scene is
+    along "x"). `size`: (height, width) of the whole film. `principal_point_offset`: Mitsuba's
+    `principal_point_offset_x` and `_y`, shares of the film's width and height by which the axis goes to the left and
+    up, (2,) or (..., 2). `crop_offset`: `crop_offset_x` and `_y` of a film with a crop window, in pixels; the matrix is
+    that of the window.
+
+    Pixels are square. The first pixel's centre is (0, 0). Raises UnitError, ShapeError, SceneError.
+    """
+    where = "intrinsics"
+    height, width = _size(size, where)
+    if fov_axis not in get_args(FovAxis):
+        raise SceneError(f"{where}: expected fov_axis among {', '.join(get_args(FovAxis))}, got {shown(fov_axis)}.")
+    fov = _number_tensor(fov_deg, "fov_deg", where)
+    if not bool(((fov > 0) & (fov < 180)).all()):
+        raise UnitError(f"{where}: expected an angle of view between 0 and 180 degrees, got {shown(fov_deg)}.")
+    offset = _number_tensor(principal_point_offset, "principal_point_offset", where).to(fov.device, fov.dtype)
+    if offset.shape[-1:] != (2,) or not bool(torch.isfinite(offset).all()):
+        got = shown(principal_point_offset)
+        raise ShapeError(f"{where}: expected principal_point_offset as two finite numbers, got {got}.")
+    crop = [count(f"{where}: crop_offset", one, 0) for one in crop_offset]
+    if len(crop) != 2:
+        raise ShapeError(f"{where}: expected crop_offset as (x, y), got {shown(crop_offset)}.")
+    spans = {"x": width, "y": height, "diagonal": math.hypot(width, height)}
+    spans |= {"smaller": min(width, height), "larger": max(width, height)}
+    focal = spans[fov_axis] / 2 / torch.tan(torch.deg2rad(fov) / 2)
+    centre_u = width / 2 - 0.5 - crop[0] - offset[..., 0] * width
+    centre_v = height / 2 - 0.5 - crop[1] - offset[..., 1] * height
+    none = 0 * (focal + centre_u)
+    rows = [focal + none, none, centre_u + none, none, focal + none, centre_v + none, none, none, none + 1]
+    return torch.stack(rows, -1).reshape(*none.shape, 3, 3)
+
+
+def extrinsics(to_world: Any) -> Tensor:
+    """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError."""
+    matrix = transforms(to_world, "extrinsics")
+    rotation = matrix[..., :3, :3].mT
+    back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
+    return _half_turn(matrix)[:, None] * torch.cat([back, matrix[..., 3:, :]], -2)
+
+
+def to_world_from_extrinsics(extrinsics: Any) -> Tensor:
+    """A sensor's `to_world` of what takes the world to kornia's camera, a rigid motion. Raises ShapeError."""
+    matrix = transforms(extrinsics, "to_world_from_extrinsics")
+    rotation = matrix[..., :3, :3].mT
+    back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
+    return torch.cat([back, matrix[..., 3:, :]], -2) * _half_turn(matrix)
+
+
+def camera_to_world(to_world: Any) -> Tensor:
+    """Kornia's camera to the world, (..., 4, 4), of a sensor's `to_world`: the inverse of `extrinsics`."""
+    matrix = transforms(to_world, "camera_to_world")
+    return matrix * _half_turn(matrix)
+
+
+def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) -> Any:
+    """`kornia.geometry.PinholeCamera` of intrinsics (..., 3, 3) and a sensor's `to_world` (..., 4, 4), a batch of one
+    or more. `size`: (height, width) of the image. Its `project` and `unproject` take points of the world and pixels as
+    said above. Raises ShapeError.
+    """
+    from kornia.geometry.camera import PinholeCamera
+
+    height, width = _size(size, "pinhole_camera")
+    matrix = camera_matrices(camera_matrix, "pinhole_camera")
+    outside = extrinsics(to_world).to(matrix.device, matrix.dtype)
+    inside = torch.nn.functional.pad(matrix, (0, 1, 0, 1)) + torch.diag(matrix.new_tensor([0.0, 0.0, 0.0, 1.0]))
+    both = torch.zeros_like(inside) + torch.zeros_like(outside)
+    inside, outside = ((one + both).reshape(-1, 4, 4) for one in (inside, outside))
+    full = matrix.new_ones(inside.shape[0])
+    return PinholeCamera(inside, outside, full * height, full * width)
+
+
+# ------------------------------------------------------------------------------------------------------------- checks
+
+
+def camera_matrices(given: Any, where: str) -> Tensor:
+    """Camera matrices (..., 3, 3). Raises ShapeError for others and for those without an inverse."""
+    matrix = _number_tensor(given, "intrinsics", where)
+    if matrix.ndim < 2 or matrix.shape[-2:] != (3, 3):
+        raise ShapeError(f"{where}: expected intrinsics (..., 3, 3), got {tuple(matrix.shape)}.")
+    if not bool((torch.linalg.det(matrix.detach().double()).abs() > 0).all()):
+        raise ShapeError(f"{where}: expected intrinsics with an inverse, got {shown(given)}.")
+    return matrix
+
+
+def transforms(given: Any, where: str) -> Tensor:
+    """Transforms (..., 4, 4). Raises ShapeError."""
+    matrix = _number_tensor(getattr(given, "matrix", given), "to_world", where)
+    if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
+        raise ShapeError(f"{where}: expected a transform (..., 4, 4), got {tuple(matrix.shape)}.")
+    return matrix
+
+
+def _number_tensor(given: Any, name: str, where: str) -> Tensor:
+    """A floating tensor; float32 of numbers and whole numbers, float64 of arrays that are."""
+    if isinstance(given, Tensor) and given.is_floating_point():
+        return given
+    array = real_array(given)
+    if array is None:
+        raise ShapeError(f"{where}: expected {name} as numbers, got {shown(given)}.")
+    double = "float64" in str(getattr(given, "dtype", ""))
+    return torch.tensor(array, dtype=torch.float64 if double else torch.float32)
+
+
+def _half_turn(like: Tensor) -> Tensor:
+    return torch.tensor(_HALF_TURN, dtype=like.dtype, device=like.device)
+
+
+def _size(size: Any, where: str) -> tuple[int, int]:
+    numbers = list(size) if isinstance(size, Sequence) and not isinstance(size, str) else []
+    if len(numbers) != 2:
+        raise ShapeError(f"{where}: expected size as (height, width), got {shown(size)}.")
+    height, width = (count(f"{where}: size", one, 1, ShapeError) for one in numbers)
+    return height, width

@@ -1,0 +1,95 @@
+"""Spectra that are positive, or shares of the light, and smooth over the wavelength."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.parametrize.bounded import Albedo, floating
+from torchtransient.parametrize.positive import Positive
+from torchtransient.quantities import count, real_array, shown
+
+
+def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:
+    """(N, K) values of K cubic B-splines with equal knots over the range of N wavelengths; each row has the sum 1.
+
+    A curve of coefficients (..., K) is `coefficients @ basis.T`; it has two continuous derivatives. 4 <= K <= N.
+    Raises ShapeError, UnitError.
+    """
+    where = "spline_basis"
+    wavelengths = real_array(wavelengths_nm)
+    if wavelengths is None or wavelengths.ndim != 1 or wavelengths.size < 4:
+        raise ShapeError(f"{where}: expected four wavelengths (N,) at least, got {shown(wavelengths_nm)}.")
+    if not (np.isfinite(wavelengths).all() and (np.diff(wavelengths) > 0).all()):
+        raise UnitError(f"{where}: expected finite wavelengths in rising order, in nanometres.")
+    number = count(f"{where}: coefficients", coefficients, 4, ShapeError)
+    if number > wavelengths.size:
+        raise ShapeError(
+            f"{where}: expected at most one coefficient for each of {wavelengths.size} wavelengths, got {number}."
+        )
+    span = wavelengths[-1] - wavelengths[0]
+    place = (wavelengths - wavelengths[0]) / span * (number - 3)
+    t = np.abs(place[:, None] - (np.arange(number) - 1))
+    return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.where(t < 2, (2 - t) ** 3 / 6, 0.0))
+
+
+class _SmoothSpectrum(nn.Module):
+    """A spline over the wavelength, and a function that takes it into the range."""
+
+    basis: Tensor
+    inverse: Tensor
+
+    def __init__(self, wavelengths_nm: Any, coefficients: int, outer: Albedo | Positive) -> None:
+        super().__init__()
+        basis = spline_basis(wavelengths_nm, coefficients)
+        self.outer = outer
+        self.register_buffer("basis", torch.tensor(basis), persistent=False)
+        self.register_buffer("inverse", torch.tensor(np.linalg.pinv(basis)), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        name = type(self).__name__
+        x = floating(x, name)
+        if x.ndim < 1 or x.shape[-1] != self.basis.shape[1]:
+            raise ShapeError(f"{name}: expected coefficients (..., {self.basis.shape[1]}), got {tuple(x.shape)}.")
+        values: Tensor = self.outer(x @ self.basis.to(x.device, x.dtype).mT)
+        return values
+
+    def right_inverse(self, values: Tensor) -> Tensor:
+        """Coefficients of the curve that is nearest to `values` (..., N) before the function is applied: what is
+        rougher than the splines is smoothed. Raises ShapeError, and UnitError for values outside of the range.
+        """
+        name = type(self).__name__
+        values = floating(values, name)
+        if values.ndim < 1 or values.shape[-1] != self.basis.shape[0]:
+            raise ShapeError(
+                f"{name}: expected values of {self.basis.shape[0]} wavelengths, (..., {self.basis.shape[0]}), got "
+                f"{tuple(values.shape)}."
+            )
+        return self.outer.right_inverse(values) @ self.inverse.to(values.device, values.dtype).mT
+
+    def extra_repr(self) -> str:
+        return f"{self.basis.shape[0]} wavelengths, {self.basis.shape[1]} coefficients"
+
+
+class PositiveSpectrum(_SmoothSpectrum):
+    """A positive, smooth spectrum: `scale * exp(spline)`, of K coefficients (..., K) values (..., N) at wavelengths.
+
+    `wavelengths_nm`: (N,) in rising order, those of the plugin's `values` (`regular` spectra: its range in equal
+    steps). `coefficients`: K >= 4; fewer are smoother, one for every (last - first) / (K - 3) nanometres. `scale`: what
+    is typical of the values. For light, extinction, `eta` and `k` of metals; lines narrower than the steps are lost.
+    """
+
+    def __init__(self, wavelengths_nm: Any, coefficients: int = 8, scale: float = 1.0) -> None:
+        super().__init__(wavelengths_nm, coefficients, Positive(0.0, scale, "exp"))
+
+
+class ReflectanceSpectrum(_SmoothSpectrum):
+    """A smooth spectrum between 0 and 1, otherwise as `PositiveSpectrum`. `margin`: as of `Bounded`."""
+
+    def __init__(self, wavelengths_nm: Any, coefficients: int = 8, margin: float | None = None) -> None:
+        super().__init__(wavelengths_nm, coefficients, Albedo(margin=margin))

@@ -1,0 +1,78 @@
+"""The gradient of a batch, computed part by part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
+from typing import Any, TypeVar
+
+import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import as_number
+
+Part = TypeVar("Part")
+
+
+def accumulate(
+    loss_of: Callable[[Part], torch.Tensor],
+    parts: Iterable[Part],
+    *,
+    weights: Sequence[float] | None = None,
+    model: nn.Module | None = None,
+    scaler: torch.amp.GradScaler | None = None,
+) -> float:
+    """Add the gradient of ``sum_k w_k loss_of(part_k)`` to the parameters, and return that sum.
+
+    Each part is rendered, differentiated and forgotten before the next, so that memory is that of the largest part:
+    views, sensors or pieces of a batch whose cubes do not fit side by side. Gradients are those of the sum in one piece
+    but for the order of float sums. ::
+
+        optimizer.zero_grad()
+        loss = tt.training.accumulate(lambda view: loss_fn(renderer(seed=view), measured[view]), range(8))
+        optimizer.step()
+
+    ``loss_of``: gives a scalar tensor. ``weights``: one for each part; None takes 1 / number of parts, which gives the
+    gradient of a mean over parts of one size. Parts of other sizes of a mean over samples: ``[len(p) / total ...]``.
+    ``model``: a DistributedDataParallel, whose ranks exchange gradients once, at the last part, instead of at each one.
+    ``scaler``: scales losses before they are differentiated; the sum that is returned is not scaled.
+
+    Raises ShapeError for no parts, weights that do not match them and losses that are no scalars, UnitError for weights
+    that are not finite. Nothing has been differentiated then, except by parts that came before the wrong loss.
+    """
+    listed = list(parts)
+    if not listed:
+        raise ShapeError("accumulate: expected at least one part, got none.")
+    shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
+    if len(shares) != len(listed):
+        raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
+    if model is not None and not isinstance(model, nn.Module):
+        raise UnitError(f"accumulate: expected model as a module, got {type(model).__name__}.")
+    values = []
+    for n, (part, share) in enumerate(zip(listed, shares, strict=True)):
+        waits = isinstance(model, DistributedDataParallel) and n + 1 < len(listed)
+        # The forward pass stands inside: DDP prepares there for what its backward pass does.
+        with _no_exchange(model) if waits else nullcontext():
+            loss = loss_of(part)
+            if not isinstance(loss, torch.Tensor) or loss.numel() != 1:
+                came = f"shape {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
+                raise ShapeError(f"accumulate: expected the loss of a part as one number in a tensor, got {came}.")
+            scaled = loss.reshape(()) * share
+            (scaled if scaler is None else scaler.scale(scaled)).backward()  # type: ignore[no-untyped-call]
+            values.append(scaled.detach())
+            del loss, scaled
+    return math.fsum(float(value) for value in values)
+
+
+def _no_exchange(model: Any) -> Any:
+    return model.no_sync()
+
+
+def _weight(value: Any) -> float:
+    number = as_number(value)
+    if number is None or not math.isfinite(number):
+        raise UnitError(f"accumulate: expected weights as finite numbers, got {value!r}.")
+    return number

@@ -1,0 +1,284 @@
+"""Checkpoints of a run: written whole or not at all, read without executing anything."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import warnings
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+
+from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, UnitError
+from torchtransient.quantities import count, shown
+from torchtransient.training.plain_state import plain
+from torchtransient.training.random_states import random_state, set_random_state
+
+_FORMAT, _VERSION = "torchtransient checkpoint", 1
+_ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint says beside the states of its parts.
+
+    ``step``: the number of steps that are done, which is the step to go on with. ``values``: as they were given.
+    ``libraries``: versions that wrote it, by name. ``ranks``: how many processes.
+    """
+
+    step: int
+    values: dict[str, Any] = field(default_factory=dict)
+    libraries: dict[str, str] = field(default_factory=dict)
+    ranks: int = 1
+
+
+def save_checkpoint(
+    path: str | os.PathLike[str], parts: Mapping[str, Any], *, step: int, values: Mapping[str, Any] | None = None
+) -> None:
+    """Write the state of a run, from which :func:`load_checkpoint` goes on to the bit. ::
+
+        parts = {"model": model, "optimizer": optimizer, "schedule": schedule, "batches": batches, "noise": generator}
+        tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
+
+    ``parts``: by name, whatever has ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
+    GradScaler, :class:`Batches`), and generators of torch. A DistributedDataParallel is stored as its module, so that
+    the checkpoint can be read with and without it. ``step``: steps that are done. ``values``: plain data (numbers,
+    texts, tensors, lists, dictionaries) that come back. Beside them: the random numbers of Python, NumPy, torch and
+    CUDA of this process, and versions of libraries.
+
+    Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a run is killed,
+    ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and the first one
+    writes; parts are its own, random numbers those of every rank.
+
+    Not in it: what the network's data come from beyond their position, buffers that modules do not put into their
+    state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
+    executing something, and where nothing can be written.
+    """
+    number = count("save_checkpoint: step", step, 0, UnitError)
+    states = {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()}
+    content = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "step": number,
+        "parts": states,
+        "values": plain(dict(values or {}), "values"),
+        "random": _of_all_ranks(random_state()),
+        "libraries": _libraries(),
+    }
+    failure: str | None = None
+    if _rank() == 0:
+        try:
+            _write(Path(path), content)
+        except OSError as error:
+            failure = str(error)
+    failure = _told_by_first(failure)
+    if failure is not None:
+        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}")
+
+
+def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
+    """Put the state of a run back into its parts, and return the step to go on with.
+
+    ``parts``: those of :func:`save_checkpoint`, made anew, under the same names. ``random``: whether the random numbers
+    of this process are put back, which takes as many ranks as have written it; with False, and all draws made by
+    :class:`Seeds`, the number of ranks may change.
+
+    A run that was stopped and goes on ends with the same weights as one that was not, to the bit, where a step depends
+    on parts, random numbers and step alone, and sums are added in the same order: same libraries and machine,
+    ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
+
+    Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
+    its sums, format, names of parts, and names and shapes of the tensors of modules. Every rank reads it. Raises
+    StorageError for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
+    """
+    given, where = _named(parts, "load_checkpoint"), os.fspath(path)
+    content = _read(Path(path))
+    states, ranks = content["parts"], len(content["random"])
+    if states.keys() != given.keys():
+        raise StorageError(
+            f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
+        )
+    for name, part in given.items():
+        _check(name, part, states[name])
+    if random and ranks != _size():
+        raise StorageError(
+            f"load_checkpoint: {where} has the random numbers of {ranks} ranks, expected those of {_size()}. Start as "
+            "many, or use random=False."
+        )
+    _compare(where, content["libraries"])
+    for name, part in given.items():
+        _put_back(name, part, states[name])
+    # Last: putting other states back may draw.
+    if random:
+        set_random_state(content["random"][_rank()])
+    return Checkpoint(content["step"], content["values"], content["libraries"], ranks)
+
+
+# ------------------------------------------------------------------------------------------------------------ parts
+
+
+def _named(parts: Any, who: str) -> dict[str, Any]:
+    if not isinstance(parts, Mapping) or not all(isinstance(name, str) for name in parts):
+        raise StorageError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
+    return dict(parts)
+
+
+def _inner(part: Any) -> Any:
+    return part.module if isinstance(part, DistributedDataParallel) else part
+
+
+def _state_of(name: str, part: Any) -> Any:
+    part = _inner(part)
+    if isinstance(part, torch.Generator):
+        return {"generator": part.get_state(), "device": part.device.type}
+    if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
+        raise StorageError(
+            f"save_checkpoint: expected the part {name!r} to have state_dict and load_state_dict, or to be a generator "
+            f"of torch, got {type(part).__name__}. Plain data belong into values."
+        )
+    return plain(part.state_dict(), name)
+
+
+def _check(name: str, part: Any, state: Any) -> None:
+    """What can be told before anything is changed."""
+    part = _inner(part)
+    if isinstance(part, torch.Generator):
+        if not isinstance(state, dict) or state.get("device") != part.device.type or "generator" not in state:
+            raise StorageError(f"load_checkpoint: the part {name!r} is no state of a generator on {part.device.type}.")
+    elif isinstance(part, nn.Module):
+        expected = part.state_dict()
+        if not isinstance(state, dict) or state.keys() != expected.keys():
+            own = set(state) if isinstance(state, dict) else set()
+            lacks, has = sorted(expected.keys() - own), sorted(own - expected.keys())
+            raise StorageError(
+                f"load_checkpoint: the state of {name!r} is of another module: it lacks "
+                f"{', '.join(lacks) or 'nothing'} and has {', '.join(map(str, has)) or 'nothing'} beyond."
+            )
+        for key, tensor in expected.items():
+            if isinstance(tensor, torch.Tensor) and tensor.shape != getattr(state[key], "shape", None):
+                came = tuple(getattr(state[key], "shape", ()))
+                raise ShapeError(
+                    f"load_checkpoint: {key!r} of {name!r}: expected shape {tuple(tensor.shape)}, the file has {came}."
+                )
+
+
+def _put_back(name: str, part: Any, state: Any) -> None:
+    part = _inner(part)
+    try:
+        if isinstance(part, torch.Generator):
+            part.set_state(state["generator"])
+        else:
+            part.load_state_dict(state)
+    except TorchTransientError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise StorageError(
+            f"load_checkpoint: the part {name!r} does not take its state: {error}. It and what follows it have to be "
+            "made anew."
+        ) from error
+
+
+# ------------------------------------------------------------------------------------------------------------- file
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    part = path.with_name(path.name + ".part")
+    with open(part, "wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+    # The name, too, has to reach the disk.
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    def refused(why: str, error: BaseException | None = None) -> StorageError:
+        found = StorageError(f"load_checkpoint: {path} {why}")
+        found.__cause__ = error
+        return found
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        content = None if damaged else torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise refused("is not there.", error) from None
+    except OSError as error:
+        raise refused(f"cannot be read: {error}", error) from None
+    except pickle.UnpicklingError as error:
+        raise refused("holds objects that would have to be executed: it is no checkpoint of ours.", error) from None
+    except (zipfile.BadZipFile, RuntimeError, EOFError, ValueError, KeyError, NotImplementedError) as error:
+        raise refused("is torn, or no checkpoint. Take an earlier one.", error) from None
+    if damaged:
+        raise refused(f"is damaged: the sum of {damaged} is wrong. Take an earlier one.")
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise refused("is a file of torch, and no checkpoint of save_checkpoint.")
+    if content.get("version") != _VERSION:
+        raise refused(f"is a checkpoint of version {content.get('version')}, expected {_VERSION}.")
+    missing = [name for name in _ENTRIES if name not in content]
+    if missing:
+        raise refused(f"lacks {', '.join(missing)}.")
+    return content
+
+
+def _libraries() -> dict[str, str]:
+    import torchtransient
+
+    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy")}
+    return {"torchtransient": torchtransient.__version__, **others}
+
+
+def _compare(where: str, written: Mapping[str, str]) -> None:
+    here = _libraries()
+    others = [f"{name} {written.get(name)} (here {own})" for name, own in here.items() if written.get(name) != own]
+    if others:
+        warnings.warn(
+            f"load_checkpoint: {where} was written with {', '.join(others)}: the run goes on, but not to the bit.",
+            TorchTransientWarning,
+            stacklevel=3,
+        )
+
+
+# ------------------------------------------------------------------------------------------------------------ ranks
+
+
+def _in_group() -> bool:
+    return dist.is_available() and dist.is_initialized()
+
+
+def _rank() -> int:
+    return dist.get_rank() if _in_group() else 0
+
+
+def _size() -> int:
+    return dist.get_world_size() if _in_group() else 1
+
+
+def _of_all_ranks(state: dict[str, Any]) -> list[dict[str, Any]]:
+    if not _in_group():
+        return [state]
+    found: list[Any] = [None] * _size()
+    dist.all_gather_object(found, state)
+    return found
+
+
+def _told_by_first(failure: str | None) -> str | None:
+    """What went wrong in the first rank; all wait for it, so that the file is there when they go on."""
+    if not _in_group():
+        return failure
+    said = [failure]
+    dist.broadcast_object_list(said, src=0)
+    return said[0]

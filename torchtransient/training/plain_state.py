@@ -1,0 +1,46 @@
+"""States as plain data, which `torch.load(weights_only=True)` reads without executing anything."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchtransient.errors import StorageError
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, torch.Size, torch.dtype, torch.device)
+
+
+def plain(value: Any, where: str) -> Any:
+    """``value`` with mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch, and tensors
+    detached. Raises StorageError, which names the place, for anything that is no data.
+    """
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, torch.Tensor):
+        return value.detach()
+    if isinstance(value, np.generic):
+        return plain(value.item(), where)
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+        return torch.from_numpy(value.copy())
+    if isinstance(value, Mapping):
+        items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
+        return OrderedDict(items) if isinstance(value, OrderedDict) else items
+    if type(value) in (list, tuple, set, frozenset):
+        entries = [plain(entry, f"{where}[{n}]") for n, entry in enumerate(value)]
+        return entries if type(value) is list else set(entries) if type(value) in (set, frozenset) else tuple(entries)
+    raise StorageError(
+        f"save_checkpoint: {where} is a {type(value).__name__}, expected data: numbers, texts, tensors, lists, "
+        "dictionaries. Anything else would have to be executed when it is read."
+    )
+
+
+def _key(key: Any, where: str) -> Any:
+    if type(key) in (str, int, bool, float, bytes, type(None)):
+        return key
+    if isinstance(key, tuple):
+        return tuple(_key(entry, where) for entry in key)
+    raise StorageError(f"save_checkpoint: a key of {where} is a {type(key).__name__}, expected a text or a number.")

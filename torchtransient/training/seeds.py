@@ -1,0 +1,95 @@
+"""Random numbers of a run as a function of its seed, the step and the sample, whoever computes them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+
+from torchtransient.errors import UnitError
+from torchtransient.quantities import count
+
+_BITS = 2**32
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Seeds of the renders of a run, and generators of its noise.
+
+    They depend on the run's ``seed``, the step and the number of the sample, not on the rank, the number of ranks, the
+    place in a batch or what was drawn before: 1 and 2 ranks render the same sample with the same random numbers, and a
+    run that is resumed at a step goes on as one that was not stopped. ::
+
+        seeds = tt.training.Seeds(0)
+        out = renderer(values, seed=seeds(step, batch["index"]))
+        counts = sensor(out.transient, generator=seeds.generator(step))
+
+    Within a step, samples of different numbers have different seeds: those are a permutation of the 32-bit numbers
+    (Even and Mansour 1997, with the integer hash of C. Wellons), whose keys are a hash of seed and step (BLAKE2b).
+    Between steps equal seeds are as rare as of random numbers, 2^-32 a pair.
+
+    ``seed``: a whole number from 0 on. ``purpose``: tells apart what a run draws several of, the two renders of an
+    unbiased loss for instance: ``Seeds(0, "second render")``. Raises UnitError.
+    """
+
+    seed: int
+    purpose: str = "render"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", count("Seeds: seed", self.seed, 0, UnitError))
+        if not isinstance(self.purpose, str):
+            raise UnitError(f"Seeds: expected purpose as a text, got {self.purpose!r}.")
+
+    def __call__(self, step: int, samples: Iterable[int] | torch.Tensor) -> list[int]:
+        """One seed for each of the ``samples``, their numbers in the data set: what ``renderer(..., seed=)`` takes.
+
+        ``samples``: whole numbers from 0 to 2^32 - 1, or a tensor (B,) of them.
+        """
+        first, second, third = self._keys(step)
+        return [_permuted(_permuted(n ^ first) ^ second) ^ third for n in _numbers(samples)]
+
+    def generator(self, step: int, sample: int = 0, device: torch.device | str = "cpu") -> torch.Generator:
+        """A generator of torch for what else a step draws, sensor noise for instance.
+
+        One generator for a whole batch makes noise that depends on who has which part of it. ``sample``: the number of
+        the one sample that it is for, where it shall not; or the rank, so that ranks draw different numbers.
+        """
+        number = count("Seeds: sample", sample, 0, UnitError)
+        digest = self._digest(step, f"generator/{number}")
+        # torch takes 64 bits; the sign stays clear for what stores seeds as int64.
+        return torch.Generator(device).manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+    def _keys(self, step: int) -> tuple[int, int, int]:
+        digest = self._digest(step, "samples")
+        first, second, third = (int.from_bytes(digest[n : n + 4], "little") for n in (0, 4, 8))
+        return first, second, third
+
+    def _digest(self, step: int, what: str) -> bytes:
+        number = count("Seeds: step", step, 0, UnitError)
+        return hashlib.blake2b(f"{self.seed}/{number}/{what}/{self.purpose}".encode(), digest_size=16).digest()
+
+
+def _numbers(samples: Iterable[int] | torch.Tensor) -> list[int]:
+    if isinstance(samples, torch.Tensor):
+        if samples.ndim != 1 or samples.is_floating_point() or samples.is_complex() or samples.dtype == torch.bool:
+            raise UnitError(
+                f"Seeds: expected samples as whole numbers of shape (B,), got {samples.dtype} {tuple(samples.shape)}."
+            )
+        samples = samples.tolist()
+    try:
+        listed = list(samples)
+    except TypeError:
+        raise UnitError(f"Seeds: expected several samples, got {samples!r}; write [{samples!r}].") from None
+    numbers = [count("Seeds: sample", n, 0, UnitError) for n in listed]
+    if numbers and max(numbers) >= _BITS:
+        raise UnitError(f"Seeds: expected samples below 2^32, got {max(numbers)}.")
+    return numbers
+
+
+def _permuted(x: int) -> int:
+    """A permutation of the 32-bit numbers: `lowbias32` (C. Wellons 2018, "Prospecting for hash functions")."""
+    x = ((x ^ (x >> 16)) * 0x7FEB352D) % _BITS
+    x = ((x ^ (x >> 15)) * 0x846CA68B) % _BITS
+    return x ^ (x >> 16)
