@@ -50,7 +50,7 @@ class Sizes:
     true_spp: int = 2048
 
 
-SMOKE = Sizes(learnt=64, held=12, captures=12, test=3, network=60, together=12, fit=8, true_spp=256)
+SMOKE = Sizes(learnt=64, held=12, captures=12, test=3, network=40, together=10, fit=8, true_spp=256)
 
 
 def train_together(fit: Fit, first: Network, sigma: Tensor, steps: int) -> Network:

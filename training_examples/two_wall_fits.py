@@ -152,7 +152,8 @@ def draw_errors(axes: Any, table: Table, names: dict[str, str]) -> None:
     axes.set(yscale="log", ylabel="mean error, % of the range", title="errors by unknown")
     plain_ticks(axes.yaxis)
     axes.set_xticks(range(6), [name.split(",")[0].replace(" ", "\n") for name in NAMES], fontsize=8)
-    axes.legend(fontsize=8)
+    axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
+    axes.legend(fontsize=8, loc="upper left")
 
 
 def draw_histograms(upper: Any, lower: Any, counts: Tensor, means: dict[str, tuple[Tensor, str]]) -> None:
@@ -164,7 +165,10 @@ def draw_histograms(upper: Any, lower: Any, counts: Tensor, means: dict[str, tup
         upper.plot(AXIS.centers_opl, expected, color=colour, linewidth=1.3, label=name)
         lower.plot(AXIS.centers_opl, (total - expected) / expected.sqrt(), color=colour, linewidth=1)
     upper.set(yscale="log", ylabel="counts a bin", title="histogram of one scene, all pixels")
-    upper.legend(fontsize=8)
+    upper.set_ylim(top=12 * float(total.max()))
+    upper.legend(fontsize=8, loc="upper left")
     lower.axhspan(-2, 2, color="0.9")
     lower.set(xlabel="path, m", ylabel="residual,\nstd. dev.")
     lower.set_yscale("symlog", linthresh=5)
+    lower.set_yticks([-30, -5, 0, 5, 30], ["-30", "-5", "0", "5", "30"])
+    lower.set_ylim(min(-6, lower.get_ylim()[0]), max(6, lower.get_ylim()[1]))

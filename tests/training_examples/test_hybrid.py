@@ -36,7 +36,7 @@ def test_the_renderer_corrects_the_network(example, tmp_path, capsys):
     table = amortised.main(["--smoke", "--seeds", "0", "--output", str(tmp_path)])
     network, hybrid = table.percent(amortised.NETWORK), table.percent(amortised.HYBRID)
     assert hybrid < 0.9 * network
-    assert hybrid < table.percent(amortised.BEST)
+    assert hybrid < 0.7 * table.percent(amortised.BEST)
     # It ends near what the counts can say only where it starts there.
     assert table.percent("renderer from the truth, 512 spp") < 0.5 * hybrid
     expected = [hybrid / table.percent(name) for name in (amortised.TWICE, amortised.BEST)]
