@@ -29,10 +29,10 @@ def counts_come_back():
 
 
 def run(script, *, code=0):
-    """What a fresh interpreter prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=240, check=False
-    )
+    """What a fresh interpreter prints. Numbers of threads are the script's alone."""
+    own = {name: value for name, value in os.environ.items() if name not in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, env=own)
     assert done.returncode == code, f"exit code {done.returncode}: {done.stderr[-3000:]}"
     return done.stdout.split()
 
