@@ -76,7 +76,9 @@ def main() -> None:
     figure.axes[1].legend(fontsize=8)
     path = HERE / "images" / "parametrize.png"
     save_figure(figure, path, "make_parametrize_picture")
-    print(path, {kind: [round(number(run[-1]), 4) for run in runs for _, number, _ in panels] for kind, runs in found.items()})
+    for kind, runs in found.items():
+        print(kind, [[round(number(run[-1]), 4) for _, number, _ in panels] for run in runs])
+    print(path)
 
 
 if __name__ == "__main__":
