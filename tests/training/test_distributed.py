@@ -85,6 +85,14 @@ SCRIPT = """
         found["same random numbers"] = torch.rand(1).item() == drawn
         found["drawn"] = drawn
         found["weights"] = {name: p.detach() for name, p in model.named_parameters()}
+        # What goes wrong in one rank is told to all: none waits for the others.
+        found["refused"] = []
+        odd = {"odd": object() if ranks.rank == ranks.size - 1 else 0}
+        for where, values in ((path, odd), (f"{folder}/no/x.pt", {})):
+            try:
+                tt.training.save_checkpoint(where, parts, step=5, values=values)
+            except tt.errors.StorageError as error:
+                found["refused"].append(str(error))
         torch.save(found, f"{folder}/{ranks.size}-{ranks.rank}.pt")
 """
 EPS = torch.finfo(torch.float32).eps
@@ -120,3 +128,6 @@ def test_two_ranks_are_one_rank_on_the_joined_batch(tmp_path):
     assert first["same random numbers"]
     assert second["same random numbers"]
     assert first["drawn"] != second["drawn"]
+    assert "values['odd'] is a object" in one["refused"][0] and one["refused"][1].count("cannot be written") == 1
+    assert "was not written. rank 1: " in first["refused"][0] and "values['odd'] is a object" in second["refused"][0]
+    assert first["refused"][1] == second["refused"][1] == one["refused"][1]
