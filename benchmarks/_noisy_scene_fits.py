@@ -1,4 +1,4 @@
-"""Stochastic fits of `noisy_renders.py` through the renderer itself: what a straight line near the truth cannot show."""
+"""Stochastic fits of `noisy_renders.py` through the renderer: what a straight line near the truth cannot show."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from _linear_fits import Linear, Scene, two_walls
 from torch import Tensor
 from tqdm import tqdm
-from two_wall_fits import Fit, roots, running_sums, weighted
+from two_wall_fits import Fit, roots, weighted
 
 from torchtransient import losses
 
@@ -35,7 +35,7 @@ def stochastic(
 ) -> dict[str, Any]:
     """Adam from the truth to exact targets; the mean of the last third of the steps, `copies` of every truth.
 
-    Steps are in units in which one capture's best fit has a covariance of one. With `grad_seed="same"` as the scene has.
+    Steps are in units in which the best fit to one capture has a covariance of one.
     """
     misfit, renders = MISFITS[name]
     truth = torch.stack([line.truth for line in lines]).repeat_interleave(copies, 0).float()
@@ -98,7 +98,7 @@ def line_of(label: str, found: dict[str, Any]) -> str:
     return f"{label:<50} {found['rms']:.2f}±{found['error']:.2f}, hidden albedo {hidden}, CPU {found['CPU s']} s a fit"
 
 
-# How wrong a network of `two_wall_fits.py` is, standard deviations in shares of the ranges: the prior of `amortised.py`.
+# How wrong the network of `amortised.py` is: standard deviations, in shares of the ranges.
 NETWORK = torch.tensor([0.0085, 0.023, 0.031, 0.033, 0.019, 0.05])
 
 
@@ -120,12 +120,9 @@ def priors(scene: Scene, *, quick: bool) -> dict[str, Any]:
         ways: dict[str, tuple[Any, int, int | None]] = {
             "weighted squares, 64 samples": (squares, 64, None),
             "`poisson_loss`, 64": (poisson, 64, None),
-            "`poisson_loss`, 256": (poisson, 256, None),
             "`poisson_loss`, 64 then 1024": (poisson, 64, 1024),
             "`expected_root_loss`, 64": (roots, 64, None),
-            "`expected_root_loss`, 256": (roots, 256, None),
             "`expected_root_loss`, 64 then 1024": (roots, 64, 1024),
-            "`cumulative_loss`, 64": (running_sums, 64, None),
         }
         errors.setdefault("the start", []).append(percent(start, truth))
         for name, (misfit, spp, late) in ways.items():

@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 from _runner import arguments, environment
+
 from _linear_fits import GROUPS, Linear, Loss, Scene, two_walls  # isort: skip  (what is measured comes by `_runner`)
 from _noisy_scene_fits import fits, priors
 from torch import Tensor
@@ -116,10 +117,10 @@ class Size:
     """`captures`: single ones, for the spread; `many`: those that are fitted together, without noise of renders."""
 
     spp: tuple[int, ...] = (1, 4, 16, 64, 256)
-    truths: int = 3
-    draws: int = 128
-    captures: int = 32
-    many: int = 256
+    truths: int = 2
+    draws: int = 64
+    captures: int = 24
+    many: int = 128
     exact_spp: int = 4096
     exact_renders: int = 32
 

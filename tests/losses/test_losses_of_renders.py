@@ -189,7 +189,7 @@ PAIRS = 100
 
 @pytest.fixture(scope="module")
 def draws(renderer, converged):
-    """Values and slopes of pairs of renders, (2, PAIRS), with two seeds and with one seed twice; and what they should be.
+    """Values and slopes of pairs of renders, (2, PAIRS), of two seeds and of one seed twice; and what they should be.
 
     The target is half as bright again as the light of 0.45.
     """
