@@ -24,21 +24,23 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from tilted_walls import (
+    AXIS,
     KEY,
     NETWORK,
+    PIXELS,
     PLANE,
     SMOKE,
     UNTRAINED,
     Reader,
     Sizes,
-    draw,
     folder_of,
     loss_of,
     measured,
     plane_fit,
     report,
     truth_of,
-)  # fmt: skip
+    wall_to_world,
+)
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
@@ -115,8 +117,39 @@ def train(options: argparse.Namespace, sizes: Sizes, seed: int) -> WallReader:
         found[NETWORK] = module.reader.propose(counts)
     report(f"seed {seed}", found, truth)
     print(f"seed {seed}, {time.process_time() - begin:.0f} s of the CPU for {trainer.global_step} steps")
-    draw(found, truth, module.losses, options.output / "lightning_fit.png")
+    draw(batch["transient"], counts, module.reader, options.output / "lightning_fit.png")
     return module
+
+
+def columns(transient: Tensor) -> Tensor:
+    """Mean optical path (B, W) of the light of each column of pixels, of transients (B, 1, T, H, W)."""
+    light = transient.sum((1, 3))
+    times = AXIS.start_opl + AXIS.bin_width_opl * (torch.arange(AXIS.num_bins) + 0.5)
+    return (light * times[:, None]).sum(1) / light.sum(1)
+
+
+def draw(light: Tensor, counts: Tensor, reader: Reader, path: Path) -> None:
+    """Four walls: counts by column and time, where their light is, and where that of the proposed wall is."""
+    from matplotlib.figure import Figure
+
+    chosen = torch.arange(4)
+    with torch.no_grad():
+        pose = wall_to_world(*reader.propose(counts[chosen]))
+        proposed = columns(reader.renderer({KEY: pose}, seed=0, spp=256).transient)
+    figure = Figure(figsize=(10, 3.3), layout="constrained")
+    end = AXIS.start_opl + AXIS.bin_width_opl * AXIS.num_bins
+    for n, axes in enumerate(figure.subplots(1, len(chosen), sharey=True)):
+        image = counts[n].sum((0, 2))
+        extent = (-0.5, PIXELS - 0.5, AXIS.start_opl, end)
+        drawn = axes.imshow(image, cmap="gray_r", vmin=0, vmax=12, aspect="auto", origin="lower", extent=extent)
+        axes.plot(columns(light[n : n + 1])[0], color="tab:orange", lw=3, label="true wall")
+        axes.plot(proposed[n], color="tab:blue", ls="--", label="network's wall")
+        axes.set(xlabel="column of pixels", ylim=(7.1, 8.9))
+    figure.axes[0].set_ylabel("optical path length [m]")
+    figure.axes[0].legend(fontsize=8, loc="lower left")
+    figure.colorbar(drawn, ax=figure.axes, label="counts of a column")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
 
 
 def main(argv: Sequence[str] | None = None) -> WallReader:
