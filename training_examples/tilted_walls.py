@@ -110,7 +110,8 @@ class Proposer(nn.Module):
         pixels, half = PIXELS**2, 4
         self.layers = nn.Sequential(
             nn.Conv1d(pixels, channels, 2 * half + 1, padding=half), nn.SiLU(),
-            nn.Conv1d(channels, channels, 2 * half + 1, padding=half), nn.SiLU(), nn.Conv1d(channels, pixels, 1),
+            nn.Conv1d(channels, channels, 2 * half + 1, padding=half), nn.SiLU(),
+            nn.Conv1d(channels, pixels, 1, bias=False),  # a softmax does not see what is added to all of its entries
         )  # fmt: skip
         self.plane = nn.Sequential(nn.Linear(pixels, 64), nn.SiLU(), nn.Linear(64, 2), nn.Tanh())
         self.register_buffer("time", torch.linspace(-1, 1, AXIS.num_bins))

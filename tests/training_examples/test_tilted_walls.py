@@ -31,13 +31,11 @@ def weights_of(folder):
 
 
 def assert_same_up_to_sums(found, expected):
-    """20 steps of Adam, whose first ones are as long whatever the size of a gradient: sums in another order move
-    weights by a part in 1e4 of what they have moved, and more where a gradient is next to zero.
-    """
+    """Of 20 steps of Adam, whose length is 3e-3 whatever the size of a gradient, a part in 600 (measured: 1.2e-5)."""
     assert found.keys() == expected.keys()
     for name, weight in expected.items():
         if weight.is_floating_point():
-            assert float((found[name] - weight).abs().max()) <= 2e-4, name
+            assert float((found[name] - weight).abs().max()) <= 1e-4, name
 
 
 def test_the_plane_fit_finds_planes(example):
