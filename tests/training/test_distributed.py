@@ -103,8 +103,8 @@ def test_two_ranks_are_one_rank_on_the_joined_batch(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(textwrap.dedent(SCRIPT))
     for count in (1, 2):
-        torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
-        command = [*torchrun, "--master-port", str(29500 + 7 * count), str(script), str(tmp_path)]
+        torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+        command = [*torchrun, str(script), str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == 0, done.stderr[-4000:]
     one, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1-0", "2-0", "2-1"))
