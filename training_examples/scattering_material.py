@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -28,9 +28,24 @@ import torchtransient as tt
 from torchtransient import sensing
 
 TRUTH, START = (200.0, 6.0), (100.0, 15.0)  # scattering, absorption, per metre
-FULL = argparse.Namespace(steps=45, spp=4096, target_spp=1 << 18)
-SMOKE = argparse.Namespace(steps=45, spp=512, target_spp=1 << 14)
-METHODS = {"transient": (False, False), "steady": (True, False), "steady, power known": (True, True)}
+FULL = argparse.Namespace(steps=80, spp=1024, target_spp=1 << 18)
+SMOKE = argparse.Namespace(steps=30, spp=512, target_spp=1 << 14)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Whether counts are summed over time and whether the power is known; how many times the steps the fit gets."""
+
+    steady: bool
+    power_known: bool
+    times: int = 1
+
+
+METHODS = {
+    "transient": Camera(False, False),
+    "steady": Camera(True, False, 4),
+    "steady, power known": Camera(True, True),
+}
 DIFFUSION = "diffusion theory"
 
 
@@ -40,33 +55,34 @@ class Fit:
 
     way: list[list[float]]
     found: Tensor
-    seconds: float = 0.0
-    errors: list[float] = field(default_factory=list)
+    seconds: float
 
-    def __post_init__(self) -> None:
-        self.errors = [100 * abs(float(x) / truth - 1) for x, truth in zip(self.found, TRUTH, strict=True)]
+    @property
+    def errors(self) -> list[float]:
+        """Of both coefficients, per cent."""
+        return [100 * abs(float(x) / truth - 1) for x, truth in zip(self.found, TRUTH, strict=True)]
 
 
 def fit(counts: Tensor, per_light: float, sizes: argparse.Namespace, seed: int, method: str) -> Fit:
     """`per_light`: counts of a unit of light, which is used only where the power is known."""
-    steady, known = METHODS[method]
-    model, began = Block(START), time.process_time()
+    camera, model, began = METHODS[method], Block(START), time.process_time()
+    steps = camera.times * sizes.steps
     optimizer = torch.optim.Adam(model.parameters(), lr=0.08, betas=(0.8, 0.95))
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, sizes.steps, 0.005)
-    measured = counts.sum(1, keepdim=True) if steady else counts
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, 0.005)
+    measured = counts.sum(1, keepdim=True) if camera.steady else counts
     before = None  # mean of the renders before this one, of whose noise it does not depend
     way = [list(START)]
-    bar = tqdm(range(sizes.steps), desc=f"seed {seed}, {method}", unit="step")
+    bar = tqdm(range(steps), desc=f"seed {seed}, {method}", unit="step")
     for step in bar:
         light = model(seed * 100_000 + step, sizes.spp)
-        light = light.sum(1, keepdim=True) if steady else light
+        light = light.sum(1, keepdim=True) if camera.steady else light
         now = light.detach()
         before = now if before is None else before
-        factor = per_light if known else float(counts.sum() / before.sum())
+        factor = per_light if camera.power_known else float(counts.sum() / before.sum())
         expected = factor * before
         weight = 1 / (expected + 1)
         residual = factor * light - measured
-        if not known:  # what another power would do is no error
+        if not camera.power_known:  # what another power would do is no error
             residual = residual - expected * (weight * expected * residual).sum() / (weight * expected**2).sum()
         loss = (weight * residual.square()).mean()
         before = 0.8 * before + 0.2 * now
@@ -76,7 +92,7 @@ def fit(counts: Tensor, per_light: float, sizes: argparse.Namespace, seed: int, 
         schedule.step()
         way.append(model.coefficients.detach().tolist())
         bar.set_postfix(scattering=f"{way[-1][0]:.1f}", absorption=f"{way[-1][1]:.2f}")
-    last = torch.tensor(way[-max(1, sizes.steps // 4):])
+    last = torch.tensor(way[-max(1, steps // 4) :])
     return Fit(way, last.log().mean(0).exp(), time.process_time() - began)
 
 
@@ -108,7 +124,7 @@ def draw(light: Tensor, counts: Tensor, fits: dict[str, Fit], path: Path) -> Non
     over_time, over_x, plane = figure.subplots(1, 3)
     total = counts.sum()
     with torch.no_grad():
-        start = Block(START)(77, 4096)
+        start = Block(START)(77, 1 << 14)
     start = start * (total / start.sum())
     x = 1000 * PIXEL * (torch.arange(PIXELS) - PIXELS / 2 - 1.5)
     seconds = 1e9 * AXIS.centers_s
@@ -166,7 +182,7 @@ def main(argv: Sequence[str] | None = None) -> list[dict[str, Fit]]:
         f"{sum(r[name].errors[1] for r in results) / len(results):.1f}" for name in results[0]))  # fmt: skip
     model = Block(results[-1]["transient"].found.tolist())
     with torch.no_grad():
-        light = model(88, sizes.target_spp // 16)
+        light = model(88, 1 << 14)
     draw(light * (counts.sum() / light.sum()), counts, results[-1], options.output / "scattering_material.png")
     return results
 
