@@ -196,7 +196,7 @@ def draw_gradients(texture: torch.Tensor, gradients: list[torch.Tensor], path: P
     """The floor's texture and, for every window of time, how much each texel adds to the light in it."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.5, 3.3), layout="constrained")
+    figure = Figure(figsize=(2.7 * (1 + len(gradients)), 3.3), layout="constrained")
     grid = figure.subplots(1, 1 + len(gradients))
     grid[0].imshow(colours(texture.permute(2, 0, 1)[:, ::3, ::3]))
     grid[0].set_title("texture of the floor", fontsize=10)
