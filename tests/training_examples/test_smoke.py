@@ -28,6 +28,8 @@ def test_what_is_no_script_is_shared_by_some(part):
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_the_small_run_is_called_smoke(script):
     text = script.read_text(encoding="utf-8")
+    # Of the script, or of a part that it shares with others.
+    text += "".join(part.read_text(encoding="utf-8") for part in FILES if f"from {part.stem} import " in text)
     assert '"--smoke"' in text
     assert '"--quick"' not in text
 
