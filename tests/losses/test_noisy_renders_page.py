@@ -29,7 +29,7 @@ def names():
 
 def test_its_blocks_say_what_noise_adds(names):
     """The squared error of one render is above that of two by their variance, which is positive."""
-    assert float(names["squares"]) > 0 and float(names["noise"]) > 0
+    assert names["squares"].item() > 0 and names["noise"].item() > 0
     values = names["renderer"].values[names["key"]]
     assert bool(torch.isfinite(values).all()) and bool(torch.isfinite(values.grad).all())
 
