@@ -21,7 +21,7 @@ BENCHMARKS = sorted((TESTS.parent / "benchmarks").glob("*.py"))
 LEVEL = {
     "errors": 0, "_llvm": 0, "_collection": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0, "pulses": 0,
     "gates": 0, "stokes": 0, "tensor_record": 0, "quantities": 0, "volume_methods": 0,
-    "transform_bins": 0, "yaml_numbers": 0,
+    "transform_bins": 0, "yaml_numbers": 0, "floating": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -40,6 +40,7 @@ FORBIDDEN = {
     "volume_methods": {"torch", *MITSUBA},
     "transform_bins": {"torch", *MITSUBA},
     "yaml_numbers": {"torch", *MITSUBA},
+    "floating": MITSUBA,
     "units": MITSUBA,
     "axes": MITSUBA,
     "capture": MITSUBA,
@@ -156,7 +157,7 @@ def is_below(other, room):
     # likelihoods are those of the sensors; captures are records with axes; simulated ones have files, data sets both.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
+        ("capture", "tensor_record"), ("capture", "quantities"), ("floating", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 

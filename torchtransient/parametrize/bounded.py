@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_number, real_array, shown
+from torchtransient.floating import floating, holds, number_tensor, without_autocast
+from torchtransient.parametrize.settings import Settings
+from torchtransient.quantities import as_number, shown
 
 Bound = float | Tensor
 # What single precision makes of the ends of a range, as a share of it.
@@ -17,15 +19,17 @@ _SLACK = 1e-5
 LEAST_PRINCIPLED = 0.0317
 
 
+@without_autocast
 def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
     """`low + (high - low) / (1 + exp(-x))`, of any real `x`; never beyond the bounds, and on them only where the
     precision of `x` has nothing in between.
 
-    `low`, `high`: finite numbers, or tensors that broadcast to `x`, low < high. Raises UnitError, ShapeError.
+    `low`, `high`: finite numbers, or tensors that broadcast to `x`, low < high. Raises UnitError, ShapeError. Values of
+    bounds are not looked at inside of `torch.func.vmap` and `torch.compile`.
     """
     where = "bounded"
     x = floating(x, where)
-    _check_order(_bound(low, where), _bound(high, where), where)
+    _check_given(low, high, where)
     return _between(x, low, high, where)
 
 
@@ -36,15 +40,17 @@ def _between(x: Tensor, low: Bound, high: Bound, where: str) -> Tensor:
     return torch.where(x < 0, below + width * torch.sigmoid(x), above - width * torch.sigmoid(-x))
 
 
+@without_autocast
 def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, margin: float | None = None) -> Tensor:
     """The `x` of which `bounded` makes `value`.
 
     At the bounds themselves there is none: UnitError, unless `margin` says how near a value may come to them, as a
-    share of the range between 0 and 0.5; what is nearer is moved there. Values beyond the bounds by more than rounding,
-    and such as are not finite, raise UnitError in any case.
+    share of the range between 0 and 0.5; what is nearer is moved there, and no nearer than the precision of `value`
+    tells from the bound. Values beyond the bounds by more than rounding, and such as are not finite, raise UnitError in
+    any case; so do bounds between which that precision has no number.
     """
     where = "bounded_inverse"
-    _check_order(_bound(low, where), _bound(high, where), where)
+    _check_given(low, high, where)
     return _inverse(value, low, high, checked_margin(margin, where), where)
 
 
@@ -53,24 +59,35 @@ def _inverse(value: Tensor, low: Bound, high: Bound, margin: float | None, where
     below, above = _ends(value, low, high, where)
     width = above - below
     share = (value - below) / width
-    if not bool(((share >= -_SLACK) & (share <= 1 + _SLACK)).all()):
+    if not holds((share >= -_SLACK) & (share <= 1 + _SLACK)):
         raise UnitError(f"{where}: expected values between {_said(low)} and {_said(high)}, got {_span(value)}.")
     if margin is not None:
-        value = torch.minimum(torch.maximum(value, below + margin * width), above - margin * width)
-    elif not bool(((value > below) & (value < above)).all()):
+        least, most = (torch.maximum(margin * width, _step(end)) for end in (below, above))
+        value = torch.minimum(torch.maximum(value, below + least), above - most)
+    if not holds((value > below) & (value < above)):
+        ends = f"{_said(low)} and {_said(high)}"
+        if margin is not None:
+            raise UnitError(f"{where}: {value.dtype} has no number between {ends}. Convert the value with .double().")
         raise UnitError(
-            f"{where}: no finite number stands for the bounds {_said(low)} and {_said(high)} themselves, got "
-            f"{_span(value)}. Start from values inside, or give margin=1e-3 to move them inside by that share."
+            f"{where}: no finite number stands for the bounds {ends} themselves, got {_span(value)}. Start from values "
+            "inside, or give margin=1e-3 to move them inside by that share."
         )
     return torch.log((value - below) / (above - value))
 
 
-class Bounded(nn.Module):
+def _step(end: Tensor) -> Tensor:
+    """At least the distance to the next number."""
+    kind = torch.finfo(end.dtype)
+    return (kind.eps * end.abs()).clamp_min(kind.tiny)
+
+
+class Bounded(Settings):
     """`bounded` as a parametrization: `forward` from all real numbers into (low, high), `right_inverse` back.
 
     `low`, `high`: numbers or tensors that broadcast to the parameter. `margin`: as in `bounded_inverse`. The slope is
-    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are not
-    part of `state_dict`.
+    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are part of
+    `state_dict`: a state that is loaded brings its own, of the same shapes. They stay float64 when the module is made
+    half. Raises ShapeError, and UnitError for bounds further apart than float32 has numbers.
     """
 
     low: Tensor
@@ -82,13 +99,15 @@ class Bounded(nn.Module):
         self.margin = checked_margin(margin, name)
         ends = [_bound(given, name) for given in (low, high)]
         _check_order(ends[0], ends[1], name)
-        self.register_buffer("low", ends[0], persistent=False)
-        self.register_buffer("high", ends[1], persistent=False)
+        self._keep("low", ends[0])
+        self._keep("high", ends[1])
 
+    @without_autocast
     def forward(self, x: Tensor) -> Tensor:
         # The bounds were looked at when they were given: looking at them again would wait for a GPU.
         return _between(floating(x, type(self).__name__), self.low, self.high, type(self).__name__)
 
+    @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
         """Raises UnitError as `bounded_inverse`."""
         return _inverse(value, self.low, self.high, self.margin, type(self).__name__)
@@ -99,9 +118,6 @@ class Bounded(nn.Module):
 
 class Albedo(Bounded):
     """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes."""
-
-    def __init__(self, low: Any = 0.0, high: Any = 1.0, margin: float | None = None) -> None:
-        super().__init__(low, high, margin)
 
 
 class Roughness(Bounded):
@@ -144,26 +160,20 @@ class Anisotropy(Bounded):
 # ------------------------------------------------------------------------------------------------------------- checks
 
 
-def floating(x: Tensor, where: str) -> Tensor:
-    """The tensor. Raises ShapeError for what is none of floating numbers."""
-    if not isinstance(x, Tensor) or not x.is_floating_point():
-        got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
-        raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
-    return x
+def _check_given(low: Bound, high: Bound, where: str) -> None:
+    # Numbers of bounds would break the graph of a compiler in two.
+    if not torch.compiler.is_compiling():
+        _check_order(_bound(low, where), _bound(high, where), where)
 
 
 def _bound(given: Any, where: str) -> Tensor:
-    if isinstance(given, Tensor) and given.is_floating_point():
-        return given.detach().clone()
-    array = real_array(given)
-    if array is None:
-        raise UnitError(f"{where}: expected bounds as numbers or tensors of numbers, got {shown(given)}.")
-    return torch.tensor(array)
+    return number_tensor(given, f"{where}: expected bounds as numbers or tensors of numbers", UnitError).detach()
 
 
 def _check_order(low: Tensor, high: Tensor, where: str) -> None:
     try:
-        ordered = bool((torch.isfinite(low) & torch.isfinite(high) & (low < high)).all())
+        ordered = holds(torch.isfinite(low) & torch.isfinite(high) & (low < high))
+        wide = not holds(high.double() - low.double() <= torch.finfo(torch.float32).max)
     except RuntimeError:
         raise ShapeError(
             f"{where}: expected bounds of shapes that broadcast, got {tuple(low.shape)} and {tuple(high.shape)}."
@@ -173,6 +183,8 @@ def _check_order(low: Tensor, high: Tensor, where: str) -> None:
             f"{where}: expected finite bounds, low < high, got {_said(low)} and {_said(high)}. Use Positive for values "
             "that have a lower bound alone."
         )
+    if wide:
+        raise UnitError(f"{where}: float32 has not the range from {_said(low)} to {_said(high)}.")
 
 
 def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Tensor]:
@@ -185,6 +197,9 @@ def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Te
             raise ShapeError(
                 f"{where}: expected bounds that broadcast to {tuple(like.shape)}, got {tuple(end.shape)}."
             ) from None
+    # Half precision ends at 65504. Elsewhere a look would make a GPU wait for nothing.
+    if like.dtype == torch.float16 and not holds(torch.isfinite(ends[1] - ends[0])):
+        raise UnitError(f"{where}: float16 has not the range from {_said(low)} to {_said(high)}; use bfloat16.")
     return ends[0], ends[1]
 
 
@@ -200,8 +215,10 @@ def checked_margin(margin: Any, where: str) -> float | None:
 
 def _said(bound: Bound) -> str:
     if isinstance(bound, Tensor):
-        return f"{bound.item():g}" if bound.numel() == 1 else f"[{bound.min():g} ... {bound.max():g}]"
-    return f"{bound:g}"
+        if bound.numel() < 2:
+            return f"{bound.item():g}" if bound.numel() else "[]"
+        return f"[{bound.min():g} ... {bound.max():g}]"
+    return shown(bound)
 
 
 def _span(value: Tensor) -> str:

@@ -11,18 +11,24 @@ import math
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.parametrize.bounded import floating
+from torchtransient.floating import floating, holds, number_tensor, single, without_autocast
+from torchtransient.parametrize.settings import Settings, choice_code, choice_of
 from torchtransient.quantities import positive, real_array, shown
 
 Frame = Literal["world", "local"]
+_FRAMES: tuple[str, ...] = get_args(Frame)
+_KINDS = ("AxisAnglePose", "SE3Pose")
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 # How far a matrix may be from a rotation: products of float32 with some hundred between the scales of a base.
 _TOLERANCE = 1e-4
 
 
+@without_autocast
 def pose_from_axis_angle(x: Tensor) -> Tensor:
     """(..., 4, 4) of (..., 6): turned about the origin by `x[..., :3]`, axis times angle in radians, right-handed, then
     moved by `x[..., 3:]`. Raises ShapeError.
@@ -30,17 +36,22 @@ def pose_from_axis_angle(x: Tensor) -> Tensor:
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
     x = _six(x, "pose_from_axis_angle")
-    flat = x.reshape(-1, 6)
-    return _assembled(axis_angle_to_rotation_matrix(flat[:, :3]), flat[:, 3:]).reshape(*x.shape[:-1], 4, 4)
+    flat = single(x).reshape(-1, 6)
+    pose = _assembled(axis_angle_to_rotation_matrix(flat[:, :3]), flat[:, 3:])
+    return pose.reshape(*x.shape[:-1], 4, 4).to(x.dtype)
 
 
+@without_autocast
 def axis_angle_from_pose(pose: Tensor) -> Tensor:
     """(..., 6) of rigid motions (..., 4, 4), angles up to pi; the inverse of `pose_from_axis_angle`. At half a turn the
-    sign of the axis is free, and derivatives jump. Raises ShapeError, UnitError for matrices that are no rigid motion.
+    sign of the axis is free, and derivatives jump. Raises ShapeError, UnitError for matrices that are no rigid motion
+    (a turn, with the last row 0, 0, 0, 1), to 1e-4 or what half precision has.
     """
-    return torch.cat([_rotation_vector(pose, "axis_angle_from_pose"), pose[..., :3, 3]], -1)
+    _check_rigid(pose, "axis_angle_from_pose")
+    return _axis_angle_of(single(pose)).to(pose.dtype)
 
 
+@without_autocast
 def pose_from_twist(x: Tensor) -> Tensor:
     """Exponential of SE(3), (..., 4, 4) of (..., 6): `x[..., :3]` the rotation (axis times angle, radians),
     `x[..., 3:]` the translation per unit of time of a screw motion, at time 1. Raises ShapeError.
@@ -48,76 +59,106 @@ def pose_from_twist(x: Tensor) -> Tensor:
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
     x = _six(x, "pose_from_twist")
-    flat = x.reshape(-1, 6)
+    flat = single(x).reshape(-1, 6)
     turn = flat[:, :3]
     shift = (_jacobian(turn) @ flat[:, 3:, None])[..., 0]
-    return _assembled(axis_angle_to_rotation_matrix(turn), shift).reshape(*x.shape[:-1], 4, 4)
+    return _assembled(axis_angle_to_rotation_matrix(turn), shift).reshape(*x.shape[:-1], 4, 4).to(x.dtype)
 
 
+@without_autocast
 def twist_from_pose(pose: Tensor) -> Tensor:
     """Logarithm of SE(3), (..., 6) of rigid motions (..., 4, 4), angles up to pi; the inverse of `pose_from_twist`.
     Raises ShapeError, UnitError as `axis_angle_from_pose`.
     """
-    turn = _rotation_vector(pose, "twist_from_pose")
+    _check_rigid(pose, "twist_from_pose")
+    return _twist_of(single(pose)).to(pose.dtype)
+
+
+def _axis_angle_of(pose: Tensor) -> Tensor:
+    return torch.cat([_rotation_vector(pose), pose[..., :3, 3]], -1)
+
+
+def _twist_of(pose: Tensor) -> Tensor:
+    turn = _rotation_vector(pose)
     return torch.cat([turn, torch.linalg.solve(_jacobian(turn), pose[..., :3, 3:])[..., 0]], -1)
 
 
-class _RigidPose(nn.Module):
+class _RigidPose(Settings):
     """A rigid motion of a base matrix. Subclasses say how six numbers make one."""
 
     base: Tensor
     centre: Tensor
+    length_scale: Tensor
 
     def __init__(
         self, base: Any = None, about: Any = "self", frame: Frame = "world", length_scale: float = 1.0
     ) -> None:
         super().__init__()
         name = type(self).__name__
-        if frame not in get_args(Frame):
+        if frame not in _FRAMES:
             raise SceneError(f"{name}: expected frame 'world' or 'local', got {shown(frame)}.")
         matrix = torch.eye(4) if base is None else _matrices(base, name)
-        self.frame: Frame = frame
-        self.length_scale = positive(f"{name}: length_scale", length_scale)
-        self.register_buffer("base", matrix, persistent=False)
-        self.register_buffer("centre", _centre(about, matrix, frame, name), persistent=False)
+        self.frame: str = frame
+        self._keep("length_scale", positive(f"{name}: length_scale", length_scale))
+        self._keep("base", matrix)
+        self._keep("centre", _centre(about, self.base, frame, name))
 
+    _kind: str
     _to_matrix: Callable[[Tensor], Tensor]
     _from_matrix: Callable[[Tensor], Tensor]
 
+    @without_autocast
     def forward(self, x: Tensor) -> Tensor:
         name = type(self).__name__
-        x = _six(x, name)
-        base, centre = self.base.to(x.device, x.dtype), self.centre.to(x.device, x.dtype)
-        delta = type(self)._to_matrix(torch.cat([x[..., :3], self.length_scale * x[..., 3:]], -1))
+        exact = single(_six(x, name))
+        base, centre, unit = (one.to(exact) for one in (self.base, self.centre, self.length_scale))
+        delta = type(self)._to_matrix(torch.cat([exact[..., :3], unit * exact[..., 3:]], -1))
         rotation = delta[..., :3, :3]
         try:
             # About the centre: T(centre) delta T(-centre).
             shift = delta[..., :3, 3] + centre - (rotation @ centre[..., None])[..., 0]
             motion = _assembled(rotation, shift)
-            return motion @ base if self.frame == "world" else base @ motion
+            return (motion @ base if self.frame == "world" else base @ motion).to(x.dtype)
         except RuntimeError:
             raise ShapeError(
                 f"{name}: expected (..., 6) that goes with a base {tuple(base.shape)}, got {tuple(x.shape)}."
             ) from None
 
+    @without_autocast
     def right_inverse(self, pose: Tensor) -> Tensor:
         """The six numbers of which `forward` makes `pose`. Raises ShapeError, and UnitError for a pose that is no rigid
         motion of the base.
         """
         name = type(self).__name__
-        matrix, base, centre = (t.to(torch.float64) for t in (floating(pose, name), self.base, self.centre))
-        if matrix.shape[-2:] != (4, 4):
-            raise ShapeError(f"{name}: expected transforms (..., 4, 4), got {tuple(matrix.shape)}.")
+        matrix = _four_by_four(pose, name).to(torch.float64)
+        base, centre = self.base.to(matrix.device), self.centre.to(matrix.device)
         inverse = torch.linalg.inv(base)
-        motion = matrix @ inverse if self.frame == "world" else inverse @ matrix
-        _check_rigid(motion, name, "of the base; give base=renderer.values[key] to keep its scale")
+        try:
+            motion = matrix @ inverse if self.frame == "world" else inverse @ matrix
+        except RuntimeError:
+            raise ShapeError(
+                f"{name}: expected transforms that go with a base {tuple(base.shape)}, got {tuple(matrix.shape)}."
+            ) from None
+        what = "of the base; give base=renderer.values[key] to keep its scale"
+        _check_rigid(motion, name, what, _tolerance(pose.dtype))
         rotation = motion[..., :3, :3]
         shift = motion[..., :3, 3] - centre + (rotation @ centre[..., None])[..., 0]
         x = type(self)._from_matrix(_assembled(rotation, shift))
-        return torch.cat([x[..., :3], x[..., 3:] / self.length_scale], -1).to(pose.dtype)
+        return torch.cat([x[..., :3], x[..., 3:] / self.length_scale.to(x.device)], -1).to(pose.dtype)
+
+    def get_extra_state(self) -> Tensor:
+        return torch.stack([choice_code(_KINDS, self._kind), choice_code(_FRAMES, self.frame)])
+
+    def set_extra_state(self, state: Any) -> None:
+        name = type(self).__name__
+        kind, frame = torch.as_tensor(state).tolist()
+        if choice_of(_KINDS, kind, name) != self._kind:
+            # The same six numbers are another motion.
+            raise SceneError(f"{name}: the state is one of {choice_of(_KINDS, kind, name)}, expected {self._kind}.")
+        self.frame = choice_of(_FRAMES, frame, name)
 
     def extra_repr(self) -> str:
-        return f"frame={self.frame!r}, length_scale={self.length_scale:g}"
+        return f"frame={self.frame!r}, length_scale={self.length_scale.item():g}"
 
 
 class AxisAnglePose(_RigidPose):
@@ -130,11 +171,14 @@ class AxisAnglePose(_RigidPose):
     `base` (`base @ motion`, in its units of length). `length_scale`: metres (with
     "local", units of `base`) for 1 in the last three numbers, so that one learning rate fits turns and moves.
 
-    Turns by more than pi are taken, and come back as smaller ones. Raises SceneError, ShapeError, UnitError.
+    Turns by more than pi are taken, and come back as smaller ones. All but `about` itself is part of `state_dict` (the
+    point in its place), in float64, also when the module is made half: a state that is loaded brings its own base.
+    Raises SceneError (also of a state of the other kind of pose), ShapeError, UnitError.
     """
 
+    _kind = "AxisAnglePose"
     _to_matrix = staticmethod(pose_from_axis_angle)
-    _from_matrix = staticmethod(axis_angle_from_pose)
+    _from_matrix = staticmethod(_axis_angle_of)
 
 
 class SE3Pose(_RigidPose):
@@ -142,8 +186,9 @@ class SE3Pose(_RigidPose):
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.
     """
 
+    _kind = "SE3Pose"
     _to_matrix = staticmethod(pose_from_twist)
-    _from_matrix = staticmethod(twist_from_pose)
+    _from_matrix = staticmethod(_twist_of)
 
 
 # ------------------------------------------------------------------------------------------------------------- parts
@@ -159,7 +204,7 @@ def _six(x: Tensor, where: str) -> Tensor:
 def _assembled(rotation: Tensor, shift: Tensor) -> Tensor:
     """(..., 4, 4) of its parts."""
     upper = torch.cat([rotation, shift[..., None]], -1)
-    last = upper.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*upper.shape[:-2], 1, 4)
+    last = upper.new_tensor(_LAST_ROW).expand(*upper.shape[:-2], 1, 4)
     return torch.cat([upper, last], -2)
 
 
@@ -183,41 +228,48 @@ def _jacobian(turn: Tensor) -> Tensor:
     return torch.eye(3, dtype=turn.dtype, device=turn.device) + first * cross + second * cross @ cross
 
 
-def _rotation_vector(pose: Tensor, where: str) -> Tensor:
+def _rotation_vector(pose: Tensor) -> Tensor:
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-    _check_rigid(pose, where)
     if not pose.numel():
         return pose.new_zeros(*pose.shape[:-2], 3)
     vector: Tensor = rotation_matrix_to_axis_angle(pose[..., :3, :3].reshape(-1, 3, 3))
     return vector.reshape(*pose.shape[:-2], 3)
 
 
-def _check_rigid(pose: Tensor, where: str, of_what: str = "") -> None:
+def _four_by_four(pose: Any, where: str) -> Tensor:
     pose = floating(pose, where)
     if pose.ndim < 2 or pose.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: expected transforms (..., 4, 4), got {tuple(pose.shape)}.")
-    rotation = pose.detach()[..., :3, :3]
-    off = (rotation.mT @ rotation - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().amax((-2, -1))
-    rigid = (off < _TOLERANCE) & (torch.linalg.det(rotation) > 0) & torch.isfinite(pose.detach()).all(-1).all(-1)
-    if not bool(rigid.all()):
-        said = of_what or "(rotation and translation, no scale, no mirror)"
+    return pose
+
+
+def _tolerance(dtype: torch.dtype) -> float:
+    return max(_TOLERANCE, 4 * torch.finfo(dtype).eps)
+
+
+def _check_rigid(pose: Tensor, where: str, of_what: str = "", tolerance: float | None = None) -> None:
+    known = single(_four_by_four(pose, where).detach())
+    rotation = known[..., :3, :3]
+    off = (rotation.mT @ rotation - torch.eye(3, dtype=known.dtype, device=known.device)).abs().amax((-2, -1))
+    # What a projection has in the last row, six numbers have no place for.
+    off = torch.maximum(off, (known[..., 3, :] - known.new_tensor(_LAST_ROW)).abs().amax(-1))
+    near = off < (_tolerance(pose.dtype) if tolerance is None else tolerance)
+    if not holds(near & (torch.linalg.det(rotation) > 0) & torch.isfinite(known).all(-1).all(-1)):
+        said = of_what or "(rotation and translation, no scale, no mirror, no projection)"
         raise UnitError(f"{where}: expected a rigid motion {said}, got a matrix that is off by {off.max().item():.2g}.")
 
 
 def _matrices(given: Any, where: str) -> Tensor:
-    if isinstance(given, Tensor) and given.is_floating_point():
-        matrix = given.detach().clone()
-    else:
-        array = real_array(getattr(given, "matrix", given))
-        if array is None:
-            raise ShapeError(f"{where}: expected base as a transform (..., 4, 4), got {shown(given)}.")
-        matrix = torch.tensor(array)
+    expected = f"{where}: expected base as a transform (..., 4, 4)"
+    matrix = number_tensor(getattr(given, "matrix", given), expected).detach().double()
     if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
-        raise ShapeError(f"{where}: expected base as a transform (..., 4, 4), got {tuple(matrix.shape)}.")
-    determinant = torch.linalg.det(matrix.double())
-    if not bool((torch.isfinite(determinant) & (determinant != 0)).all()):
+        raise ShapeError(f"{expected}, got {tuple(matrix.shape)}.")
+    determinant = torch.linalg.det(matrix)
+    if not holds(torch.isfinite(matrix).all(-1).all(-1) & (determinant != 0)):
         raise UnitError(f"{where}: expected a base with an inverse, got a determinant of {determinant.min().item():g}.")
+    if not holds((matrix[..., 3, :] - matrix.new_tensor(_LAST_ROW)).abs() < _TOLERANCE**2):
+        raise UnitError(f"{where}: expected a base with the last row 0, 0, 0, 1, got {matrix[..., 3, :].tolist()}.")
     return matrix
 
 
@@ -233,6 +285,8 @@ def _centre(about: Any, base: Tensor, frame: Frame, where: str) -> Tensor:
         array = real_array(about)
         if array is None or array.shape != (3,):
             raise ShapeError(f"{where}: expected about as a point [x, y, z], got {shown(about)}.")
+        if not np.isfinite(array).all():
+            raise UnitError(f"{where}: expected about as a point of finite numbers, got {shown(about)}.")
         point = torch.as_tensor(array, dtype=base.dtype, device=base.device)
     if frame == "world":
         return point.expand((*base.shape[:-2], 3)).clone()

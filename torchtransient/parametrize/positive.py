@@ -2,68 +2,97 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import UnitError
-from torchtransient.parametrize.bounded import floating
+from torchtransient.floating import floating, holds, without_autocast
+from torchtransient.parametrize.settings import Settings, choice_code, choice_of
 from torchtransient.quantities import finite, shown
 from torchtransient.quantities import positive as greater_than_zero
 
-Shape = Literal["softplus", "exp"]
+PositiveFunction = Literal["softplus", "exp"]
+_FUNCTIONS: tuple[str, ...] = get_args(PositiveFunction)
 
 
-def positive(x: Tensor, low: float = 0.0, scale: float = 1.0, function: Shape = "softplus") -> Tensor:
-    """`low + scale * log(1 + exp(x))`, or of `function="exp"` `low + scale * exp(x)`: above `low` for any real `x`.
+@without_autocast
+def positive(x: Tensor, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> Tensor:
+    """`low + scale * log(1 + exp(x))`, or of `function="exp"` `low + scale * exp(x)`.
+
+    Above `low`, of any real `x`, as far as the precision of `x` has numbers: `low` itself where it has none in between
+    (float32: below -103 with low=0, below -16 with low=1), and with "exp" infinite where it ends (float32: above 88).
 
     "softplus" is linear in `x` above `scale` and goes to `low` exponentially: steps of an optimiser are steps of the
     value. With "exp" steps are factors, for values whose order of magnitude is not known. `scale` > 0, in the unit of
     the value: what is typical of it. Raises UnitError, ShapeError.
     """
-    base, unit = _settings(low, scale, function, "positive")
-    x = floating(x, "positive")
+    base, unit = _checked(low, scale, function, "positive")
+    return _above(floating(x, "positive"), base, unit, function)
+
+
+def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str) -> Tensor:
     return base + unit * (torch.exp(x) if function == "exp" else nn.functional.softplus(x))
 
 
-def positive_inverse(value: Tensor, low: float = 0.0, scale: float = 1.0, function: Shape = "softplus") -> Tensor:
+@without_autocast
+def positive_inverse(
+    value: Tensor, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
+) -> Tensor:
     """The `x` of which `positive` makes `value`. Raises UnitError for values that are not finite and above `low`."""
-    return _inverse(value, low, scale, function, "positive_inverse")
+    where = "positive_inverse"
+    base, unit = _checked(low, scale, function, where)
+    return _inverse(floating(value, where), base, unit, function, where)
 
 
-def _inverse(value: Tensor, low: float, scale: float, function: Shape, where: str) -> Tensor:
-    base, unit = _settings(low, scale, function, where)
-    y = (floating(value, where) - base) / unit
-    if not bool(((y > 0) & torch.isfinite(y)).all()):
+def _inverse(value: Tensor, base: float | Tensor, unit: float | Tensor, function: str, where: str) -> Tensor:
+    y = (value - base) / unit
+    if not holds((y > 0) & torch.isfinite(y)):
         raise UnitError(
-            f"{where}: expected finite values above {base:g}, got some from {value.min().item():g} to "
+            f"{where}: expected finite values above {float(base):g}, got some from {value.min().item():g} to "
             f"{value.max().item():g}. Start from greater ones."
         )
     # log(exp(y) - 1), which neither overflows for large nor loses digits for small y.
     return torch.log(y) if function == "exp" else y + torch.log(-torch.expm1(-y))
 
 
-class Positive(nn.Module):
-    """`positive` as a parametrization: `forward` from all real numbers to above `low`, `right_inverse` back."""
+class Positive(Settings):
+    """`positive` as a parametrization: `forward` from all real numbers to above `low`, `right_inverse` back. All three
+    settings are part of `state_dict`.
+    """
 
-    def __init__(self, low: float = 0.0, scale: float = 1.0, function: Shape = "softplus") -> None:
+    low: Tensor
+    scale: Tensor
+
+    def __init__(self, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> None:
         super().__init__()
-        self.low, self.scale = _settings(low, scale, function, "Positive")
-        self.function: Shape = function
+        base, unit = _checked(low, scale, function, "Positive")
+        self._keep("low", base)
+        self._keep("scale", unit)
+        self.function: str = function
 
+    @without_autocast
     def forward(self, x: Tensor) -> Tensor:
-        return positive(x, self.low, self.scale, self.function)
+        return _above(floating(x, "Positive"), self.low.to(x), self.scale.to(x), self.function)
 
+    @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
         """Raises UnitError as `positive_inverse`."""
-        return _inverse(value, self.low, self.scale, self.function, "Positive")
+        value = floating(value, "Positive")
+        return _inverse(value, self.low.to(value), self.scale.to(value), self.function, "Positive")
+
+    def get_extra_state(self) -> Tensor:
+        return choice_code(_FUNCTIONS, self.function)
+
+    def set_extra_state(self, state: Any) -> None:
+        self.function = choice_of(_FUNCTIONS, state, "Positive")
 
     def extra_repr(self) -> str:
-        return f"above {self.low:g}, scale={self.scale:g}, {self.function}"
+        return f"above {self.low.item():g}, scale={self.scale.item():g}, {self.function}"
 
 
-def _settings(low: float, scale: float, function: str, where: str) -> tuple[float, float]:
-    if function not in get_args(Shape):
+def _checked(low: float, scale: float, function: str, where: str) -> tuple[float, float]:
+    if function not in _FUNCTIONS:
         raise UnitError(f"{where}: expected function 'softplus' or 'exp', got {shown(function)}.")
     return finite(f"{where}: low", low), greater_than_zero(f"{where}: scale", scale)

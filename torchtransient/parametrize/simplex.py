@@ -2,63 +2,92 @@
 
 from __future__ import annotations
 
+import operator
+from typing import Any
+
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.parametrize.bounded import checked_margin, floating
+from torchtransient.floating import floating, holds, without_autocast
+from torchtransient.parametrize.bounded import checked_margin
+from torchtransient.parametrize.settings import Settings
+from torchtransient.quantities import shown
 
 # What single precision makes of a sum of some hundred weights.
 _SLACK = 1e-4
 
 
+@without_autocast
 def simplex(x: Tensor, dim: int = -1) -> Tensor:
     """Weights between 0 and 1 with the sum 1 along `dim`, by softmax, of any real `x`. Raises ShapeError."""
-    return torch.softmax(_checked(x, dim, "simplex"), dim)
+    return torch.softmax(_checked(x, _dim(dim, "simplex"), "simplex"), dim)
 
 
+@without_autocast
 def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None) -> Tensor:
     """The `x`, zero on average along `dim`, of which `simplex` makes `weights`.
 
     A weight of zero has none: UnitError, unless `margin` says how small a weight may be, a share between 0 and 0.5 of
-    an equal weight; smaller ones are raised to it, and the sum is made 1 again. Raises UnitError for negative weights
-    and sums other than 1.
+    an equal weight; smaller ones are raised to it, and the sum is made 1 again (never below the smallest normal number
+    of the dtype). Raises UnitError for negative weights and sums other than 1.
     """
-    return _inverse(weights, dim, checked_margin(margin, "simplex_inverse"), "simplex_inverse")
+    return _inverse(weights, _dim(dim, "simplex_inverse"), checked_margin(margin, "simplex_inverse"), "simplex_inverse")
 
 
 def _inverse(weights: Tensor, dim: int, margin: float | None, where: str) -> Tensor:
     weights = _checked(weights, dim, where)
     sums = weights.sum(dim)
-    if not bool(((weights >= 0).all(dim) & ((sums - 1).abs() < _SLACK)).all()):
+    # Half precision cannot do better.
+    slack = max(_SLACK, weights.shape[dim] * torch.finfo(weights.dtype).eps)
+    if not holds((weights >= 0).all(dim) & ((sums - 1).abs() < slack)):
         raise UnitError(
             f"{where}: expected weights that are not negative and have the sum 1, got {weights.min().item():g} as the "
             f"smallest and sums from {sums.min().item():g} to {sums.max().item():g}. Divide them by their sum."
         )
     if margin is not None:
-        weights = weights.clamp_min(margin / weights.shape[dim])
-    elif not bool((weights > 0).all()):
+        weights = weights.clamp_min(max(margin / weights.shape[dim], torch.finfo(weights.dtype).tiny))
+    elif not holds(weights > 0):
         raise UnitError(f"{where}: no finite number stands for the weight 0; give margin=1e-3 to start above it.")
     logarithms = torch.log(weights)
     return logarithms - logarithms.mean(dim, keepdim=True)
 
 
-class Simplex(nn.Module):
-    """`simplex` as a parametrization along `dim`: weights of returns, materials or modes of one mixture."""
+class Simplex(Settings):
+    """`simplex` as a parametrization along `dim`: weights of returns, materials or modes of one mixture. `dim` is part
+    of `state_dict`.
+    """
 
     def __init__(self, dim: int = -1, margin: float | None = None) -> None:
         super().__init__()
-        self.dim, self.margin = int(dim), checked_margin(margin, "Simplex")
+        self.dim, self.margin = _dim(dim, "Simplex"), checked_margin(margin, "Simplex")
 
+    @without_autocast
     def forward(self, x: Tensor) -> Tensor:
         return simplex(x, self.dim)
 
+    @without_autocast
     def right_inverse(self, weights: Tensor) -> Tensor:
         """Raises UnitError as `simplex_inverse`."""
         return _inverse(weights, self.dim, self.margin, "Simplex")
 
+    def get_extra_state(self) -> Tensor:
+        return torch.tensor(self.dim)
+
+    def set_extra_state(self, state: Any) -> None:
+        self.dim = int(state)
+
     def extra_repr(self) -> str:
         return f"dim={self.dim}"
+
+
+def _dim(dim: Any, where: str) -> int:
+    try:
+        if not isinstance(dim, bool):
+            return operator.index(dim)
+    except TypeError:
+        pass
+    raise ShapeError(f"{where}: expected dim as a whole number, got {shown(dim)}.")
 
 
 def _checked(x: Tensor, dim: int, where: str) -> Tensor:

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.parametrize.bounded import Albedo, floating
+from torchtransient.floating import floating, single, without_autocast
+from torchtransient.parametrize.bounded import Albedo
 from torchtransient.parametrize.positive import Positive
+from torchtransient.parametrize.settings import Settings
 from torchtransient.quantities import count, real_array, shown
 
 
@@ -38,27 +40,27 @@ def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:
     return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.where(t < 2, (2 - t) ** 3 / 6, 0.0))
 
 
-class _SmoothSpectrum(nn.Module):
+class _SmoothSpectrum(Settings):
     """A spline over the wavelength, and a function that takes it into the range."""
 
     basis: Tensor
-    inverse: Tensor
 
     def __init__(self, wavelengths_nm: Any, coefficients: int, outer: Albedo | Positive) -> None:
         super().__init__()
-        basis = spline_basis(wavelengths_nm, coefficients)
         self.outer = outer
-        self.register_buffer("basis", torch.tensor(basis), persistent=False)
-        self.register_buffer("inverse", torch.tensor(np.linalg.pinv(basis)), persistent=False)
+        self._keep("basis", torch.tensor(spline_basis(wavelengths_nm, coefficients)))
 
+    @without_autocast
     def forward(self, x: Tensor) -> Tensor:
         name = type(self).__name__
         x = floating(x, name)
         if x.ndim < 1 or x.shape[-1] != self.basis.shape[1]:
             raise ShapeError(f"{name}: expected coefficients (..., {self.basis.shape[1]}), got {tuple(x.shape)}.")
-        values: Tensor = self.outer(x @ self.basis.to(x.device, x.dtype).mT)
-        return values
+        curve = single(x) @ self.basis.to(single(x)).mT
+        values: Tensor = self.outer(curve)
+        return values.to(x.dtype)
 
+    @without_autocast
     def right_inverse(self, values: Tensor) -> Tensor:
         """Coefficients of the curve that is nearest to `values` (..., N) before the function is applied: what is
         rougher than the splines is smoothed. Raises ShapeError, and UnitError for values outside of the range.
@@ -70,7 +72,8 @@ class _SmoothSpectrum(nn.Module):
                 f"{name}: expected values of {self.basis.shape[0]} wavelengths, (..., {self.basis.shape[0]}), got "
                 f"{tuple(values.shape)}."
             )
-        return self.outer.right_inverse(values) @ self.inverse.to(values.device, values.dtype).mT
+        curve = single(self.outer.right_inverse(values))
+        return (curve @ torch.linalg.pinv(self.basis).to(curve).mT).to(values.dtype)
 
     def extra_repr(self) -> str:
         return f"{self.basis.shape[0]} wavelengths, {self.basis.shape[1]} coefficients"
@@ -82,6 +85,7 @@ class PositiveSpectrum(_SmoothSpectrum):
     `wavelengths_nm`: (N,) in rising order, those of the plugin's `values` (`regular` spectra: its range in equal
     steps). `coefficients`: K >= 4; fewer are smoother, one for every (last - first) / (K - 3) nanometres. `scale`: what
     is typical of the values. For light, extinction, `eta` and `k` of metals; lines narrower than the steps are lost.
+    The splines are part of `state_dict`.
     """
 
     def __init__(self, wavelengths_nm: Any, coefficients: int = 8, scale: float = 1.0) -> None:

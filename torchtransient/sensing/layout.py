@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from typing import Concatenate, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import without_autocast as without_autocast
 from torchtransient.quantities import as_number, shown
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
@@ -19,29 +17,6 @@ _OTHER_FILMS = (
     "Render with time_axis=...; phasors (out.phasor) go to ItofCorrelation, as the first stage of Compose([...]), and "
     "gated images (out.gated) are no bins: only what follows a gate may take them."
 )
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-
-def without_autocast(
-    function: Callable[Concatenate[Tensor, Arguments], Result],
-) -> Callable[Concatenate[Tensor, Arguments], Result]:
-    """`function(x, ...)` in the dtype of `x` inside `torch.autocast` too.
-
-    Autocast makes bfloat16 or float16 of the operands of matrix products and convolutions. A network bears that; a
-    measurement loses 3e-3 of its value by it, and phases their millimetres.
-    """
-
-    @functools.wraps(function)
-    def run(x: Tensor, /, *args: Arguments.args, **keywords: Arguments.kwargs) -> Result:
-        kind = x.device.type if isinstance(x, Tensor) else "cpu"
-        if kind == "meta" or not torch.is_autocast_enabled(kind):
-            return function(x, *args, **keywords)
-        with torch.autocast(kind, enabled=False):
-            return function(x, *args, **keywords)
-
-    return run
 
 
 def check_tensor(x: object, where: str) -> Tensor:

@@ -1,0 +1,75 @@
+"""Tensors of floating numbers as people give them, in a precision of their own: half ones are computed in single, and
+autocast does not reach in.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import ShapeError, TorchTransientError
+from torchtransient.quantities import real_array, shown
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def without_autocast(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """A function or method, in the dtype of its tensors inside `torch.autocast` too.
+
+    Autocast makes bfloat16 or float16 of the operands of matrix products and convolutions. A network bears that; a
+    measurement loses 3e-3 of its value by it, phases their millimetres, and poses their centimetres.
+    """
+
+    @functools.wraps(function)
+    def run(*args: Arguments.args, **keywords: Arguments.kwargs) -> Result:
+        for kind in {"cpu"} | {x.device.type for x in (*args, *keywords.values()) if isinstance(x, Tensor)}:
+            if kind != "meta" and torch.is_autocast_enabled(kind):
+                with torch.autocast(kind, enabled=False):
+                    return run(*args, **keywords)
+        return function(*args, **keywords)
+
+    return run
+
+
+def floating(x: Any, where: str) -> Tensor:
+    """The tensor. Raises ShapeError for what is none of floating numbers."""
+    if not isinstance(x, Tensor) or not x.is_floating_point():
+        got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
+        raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
+    return x
+
+
+def number_tensor(given: Any, expected: str, error: type[TorchTransientError] = ShapeError) -> Tensor:
+    """A floating tensor as it is, with its gradient; float64 of other numbers. Raises `error`, which says what was
+    `expected`.
+    """
+    if isinstance(given, Tensor) and given.is_floating_point():
+        return given
+    array = real_array(given)
+    if array is None:
+        raise error(f"{expected}, got {shown(given)}.")
+    return torch.tensor(array)
+
+
+def single(x: Tensor) -> Tensor:
+    """In float32 or better: half precision has no linear algebra on the CPU, and products of it lose digits."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+
+
+def holds(condition: Tensor) -> bool:
+    """Whether it is true everywhere. True where nobody can look, which leaves checks of values out: inside of
+    `torch.func.vmap`, in `torch.compile` (whose graph would break), and of tensors without values.
+    """
+    if torch.compiler.is_compiling() or condition.device.type == "meta":
+        return True
+    try:
+        return bool(condition.all())
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return True

@@ -1,0 +1,41 @@
+"""What a parametrization was given, as part of its state."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import SceneError
+
+
+class Settings(nn.Module):
+    """Base of parametrizations. Numbers that the value depends on are buffers of `state_dict`, so that loading a state
+    brings the value back; they stay in double precision when the module is made half.
+    """
+
+    def _keep(self, name: str, numbers: Tensor | float) -> None:
+        self.register_buffer(name, torch.as_tensor(numbers).detach().to(torch.float64, copy=True))
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Self:
+        before = dict(self._buffers)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name, old in before.items():
+            new = self._buffers[name]
+            if old is not None and new is not None and new.dtype != old.dtype:
+                self._buffers[name] = old.to(new.device)
+        return self
+
+
+def choice_code(names: tuple[str, ...], chosen: str) -> Tensor:
+    """A choice in a `state_dict`: a number, which every format of files takes."""
+    return torch.tensor(names.index(chosen))
+
+
+def choice_of(names: tuple[str, ...], code: Any, where: str) -> str:
+    """The choice of a `state_dict`. Raises SceneError for none of `names`."""
+    number = int(code)
+    if not 0 <= number < len(names):
+        raise SceneError(f"{where}: expected the state of one of {', '.join(names)}, got number {number}.")
+    return names[number]
