@@ -157,7 +157,8 @@ def is_below(other, room):
     # likelihoods are those of the sensors; captures are records with axes; simulated ones have files, data sets both.
     within = {
         ("accuracy", "testing"), ("gates", "pulses"), ("losses", "sensing"), ("capture", "axes"),
-        ("capture", "tensor_record"), ("capture", "quantities"), ("floating", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
+        ("capture", "tensor_record"), ("capture", "quantities"), ("nlos", "files"), ("data", "files"), ("data", "nlos"),
+        ("floating", "quantities"),
     }  # fmt: skip
     return other in {"errors", "units"} or (room, other) in within
 

@@ -170,9 +170,11 @@ def test_functional_call(renderer):
 
 def test_inside_of_another_module_and_twice(scene):
     holder = nn.ModuleDict({"scene": tt.TransientRenderer(scene, [COLOUR], spp=4), "net": nn.Linear(2, 2)})
-    register(holder, COLOUR, Albedo(margin=1e-3))
+    before = holder["scene"].values[COLOUR].detach().clone()
+    register(holder, COLOUR, tt.parametrize.Bounded(-8.0, 8.0))
     register(holder, "net.weight", tt.parametrize.Bounded(-1.0, 1.0))
-    register(holder, COLOUR, tt.parametrize.Bounded(0.0, 1.0))  # of what the first one makes
+    register(holder, COLOUR, Albedo(margin=1e-3))  # of what the first one makes
+    assert torch.allclose(holder["scene"].values[COLOUR], before, rtol=1e-5)
     assert len(holder["scene"].parametrizations[COLOUR.replace(".", "/")]) == 2
     assert bool((holder["net"].weight.abs() < 1).all())
     twin = copy.deepcopy(holder)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.quantities import count, real_array, shown
+from torchtransient.floating import holds, number_tensor, single, without_autocast
+from torchtransient.quantities import count, shown
 
 FovAxis = Literal["x", "y", "diagonal", "smaller", "larger"]
 # From Mitsuba's camera, x to the left and y up, to kornia's, x to the right and y down; and back.
@@ -19,6 +20,7 @@ _HALF_TURN = (-1.0, -1.0, 1.0, 1.0)
 _RIGID = 1e-4
 
 
+@without_autocast
 def intrinsics(
     fov_deg: float | Tensor,
     size: Sequence[int],
@@ -34,22 +36,25 @@ def intrinsics(
     up, (2,) or (..., 2). `crop_offset`: `crop_offset_x` and `_y` of a film with a crop window, in pixels; the matrix is
     that of the window.
 
-    Pixels are square. The first pixel's centre is (0, 0). Raises UnitError, ShapeError, SceneError.
+    Pixels are square. The first pixel's centre is (0, 0). Half precision is computed in float32 and given back. Raises
+    UnitError, ShapeError, SceneError; values are not looked at inside of `torch.func.vmap` and `torch.compile`.
     """
     where = "intrinsics"
     height, width = image_size(size, where)
     if fov_axis not in get_args(FovAxis):
         raise SceneError(f"{where}: expected fov_axis among {', '.join(get_args(FovAxis))}, got {shown(fov_axis)}.")
-    fov = _number_tensor(fov_deg, "fov_deg", where)
-    if not bool(((fov > 0) & (fov < 180)).all()):
+    given = _numbers(fov_deg, "fov_deg", where)
+    fov = single(given)
+    if not holds((fov > 0) & (fov < 180)):
         raise UnitError(f"{where}: expected an angle of view between 0 and 180 degrees, got {shown(fov_deg)}.")
-    offset = _number_tensor(principal_point_offset, "principal_point_offset", where).to(fov.device, fov.dtype)
-    if offset.shape[-1:] != (2,) or not bool(torch.isfinite(offset).all()):
+    offset = _numbers(principal_point_offset, "principal_point_offset", where).to(fov)
+    if offset.shape[-1:] != (2,) or not holds(torch.isfinite(offset)):
         got = shown(principal_point_offset)
         raise ShapeError(f"{where}: expected principal_point_offset as two finite numbers, got {got}.")
-    crop = [count(f"{where}: crop_offset", one, 0) for one in crop_offset]
-    if len(crop) != 2:
+    pair = list(crop_offset) if isinstance(crop_offset, Iterable) and not isinstance(crop_offset, str) else []
+    if len(pair) != 2:
         raise ShapeError(f"{where}: expected crop_offset as (x, y), got {shown(crop_offset)}.")
+    crop = [count(f"{where}: crop_offset", one, 0) for one in pair]
     spans = {"x": width, "y": height, "diagonal": math.hypot(width, height)}
     spans |= {"smaller": min(width, height), "larger": max(width, height)}
     focal = spans[fov_axis] / 2 / torch.tan(torch.deg2rad(fov) / 2)
@@ -57,35 +62,35 @@ def intrinsics(
     centre_v = height / 2 - 0.5 - crop[1] - offset[..., 1] * height
     none = 0 * (focal + centre_u)
     rows = [focal + none, none, centre_u + none, none, focal + none, centre_v + none, none, none, none + 1]
-    return torch.stack(rows, -1).reshape(*none.shape, 3, 3)
+    return torch.stack(rows, -1).reshape(*none.shape, 3, 3).to(given.dtype)
 
 
+@without_autocast
 def extrinsics(to_world: Any) -> Tensor:
     """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError,
     UnitError.
     """
     matrix = _rigid(to_world, "extrinsics")
-    rotation = matrix[..., :3, :3].mT
-    back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
-    return _half_turn(matrix)[:, None] * torch.cat([back, matrix[..., 3:, :]], -2)
+    return _half_turn(matrix)[:, None] * _back(matrix)
 
 
+@without_autocast
 def to_world_from_extrinsics(extrinsics: Any) -> Tensor:
     """A sensor's `to_world` of what takes the world to kornia's camera, a rigid motion. Raises ShapeError,
     UnitError.
     """
     matrix = _rigid(extrinsics, "to_world_from_extrinsics")
-    rotation = matrix[..., :3, :3].mT
-    back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
-    return torch.cat([back, matrix[..., 3:, :]], -2) * _half_turn(matrix)
+    return _back(matrix) * _half_turn(matrix)
 
 
+@without_autocast
 def camera_to_world(to_world: Any) -> Tensor:
     """Kornia's camera to the world, (..., 4, 4), of a sensor's `to_world`: the inverse of `extrinsics`."""
     matrix = transforms(to_world, "camera_to_world")
     return matrix * _half_turn(matrix)
 
 
+@without_autocast
 def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) -> Any:
     """`kornia.geometry.PinholeCamera` of intrinsics (..., 3, 3) and a sensor's `to_world` (..., 4, 4), a batch of one
     or more. `size`: (height, width) of the image. Its `project` and `unproject` take points of the world and pixels as
@@ -108,17 +113,17 @@ def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) ->
 
 def camera_matrices(given: Any, where: str) -> Tensor:
     """Camera matrices (..., 3, 3). Raises ShapeError for others and for those without an inverse."""
-    matrix = _number_tensor(given, "intrinsics", where)
+    matrix = _numbers(given, "intrinsics", where)
     if matrix.ndim < 2 or matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"{where}: expected intrinsics (..., 3, 3), got {tuple(matrix.shape)}.")
-    if not bool((torch.linalg.det(matrix.detach().double()).abs() > 0).all()):
+    if not holds(torch.linalg.det(matrix.detach().double()).abs() > 0):
         raise ShapeError(f"{where}: expected intrinsics with an inverse, got {shown(given)}.")
     return matrix
 
 
 def transforms(given: Any, where: str) -> Tensor:
     """Transforms (..., 4, 4). Raises ShapeError."""
-    matrix = _number_tensor(getattr(given, "matrix", given), "to_world", where)
+    matrix = _numbers(getattr(given, "matrix", given), "to_world", where)
     if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: expected a transform (..., 4, 4), got {tuple(matrix.shape)}.")
     return matrix
@@ -130,24 +135,28 @@ def _rigid(given: Any, where: str) -> Tensor:
     known = matrix.detach().double()
     turn, last = known[..., :3, :3], known.new_tensor([0.0, 0.0, 0.0, 1.0])
     off = (turn @ turn.mT - torch.eye(3, dtype=turn.dtype, device=turn.device)).abs()
-    right = (off.amax((-2, -1)) < _RIGID) & (torch.linalg.det(turn) > 0) & (known[..., 3, :] == last).all(-1)
-    if not bool(right.all()):
+    near = off.amax((-2, -1)) < max(_RIGID, 4 * torch.finfo(matrix.dtype).eps)
+    right = near & (torch.linalg.det(turn) > 0) & (known[..., 3, :] == last).all(-1)
+    if not holds(right):
         raise UnitError(
-            f"{where}: expected a rigid motion (turn and shift, float32 or better), got {shown(given)}. Take scales "
-            "and mirrors out of the camera's to_world first."
+            f"{where}: expected a rigid motion (turn and shift), got {shown(given)}. Take scales and mirrors out of "
+            "the camera's to_world first."
         )
     return matrix
 
 
-def _number_tensor(given: Any, name: str, where: str) -> Tensor:
+def _back(matrix: Tensor) -> Tensor:
+    """The inverse of a rigid motion."""
+    exact = single(matrix)
+    rotation = exact[..., :3, :3].mT
+    back = torch.cat([rotation, -(rotation @ exact[..., :3, 3:])], -1)
+    return torch.cat([back, exact[..., 3:, :]], -2).to(matrix.dtype)
+
+
+def _numbers(given: Any, name: str, where: str) -> Tensor:
     """A floating tensor; float32 of numbers and whole numbers, float64 of arrays that are."""
-    if isinstance(given, Tensor) and given.is_floating_point():
-        return given
-    array = real_array(given)
-    if array is None:
-        raise ShapeError(f"{where}: expected {name} as numbers, got {shown(given)}.")
-    double = "float64" in str(getattr(given, "dtype", ""))
-    return torch.tensor(array, dtype=torch.float64 if double else torch.float32)
+    numbers = number_tensor(given, f"{where}: expected {name} as numbers")
+    return numbers if numbers is given or "float64" in str(getattr(given, "dtype", "")) else numbers.float()
 
 
 def _half_turn(like: Tensor) -> Tensor:

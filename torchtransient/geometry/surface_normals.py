@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
+from torchtransient.floating import single, without_autocast
 from torchtransient.geometry.distances import image_of, points_from_distance
 from torchtransient.geometry.pinhole import camera_to_world
 
 
+@without_autocast
 def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = None) -> Tensor:
     """Unit normals (..., 3, H, W), turned to the camera, of distances along the rays (..., H, W), the label `depth`: in
     kornia's camera, or in the world of a sensor's `to_world`.
@@ -26,12 +28,12 @@ def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = 
 
     if min(image_of(distance, "normals_from_distance")) < 2:
         raise ShapeError(f"normals_from_distance: expected two rows and columns at least, got {tuple(distance.shape)}.")
-    points = points_from_distance(distance, camera_matrix)
+    points = points_from_distance(single(distance), camera_matrix)
     size = points.shape[-2:]
     along = spatial_gradient(points.reshape(-1, 3, *size))
     normals = -torch.nn.functional.normalize(torch.linalg.cross(along[:, :, 0], along[:, :, 1], dim=1), dim=1)
     normals = normals.reshape(points.shape)
-    if to_world is None:
-        return normals
-    turn = camera_to_world(to_world).to(normals.device, normals.dtype)[..., :3, :3]
-    return (turn @ normals.flatten(-2)).reshape(normals.shape)
+    if to_world is not None:
+        turn = camera_to_world(to_world).to(normals)[..., :3, :3]
+        normals = (turn @ normals.flatten(-2)).reshape(normals.shape)
+    return normals.to(distance.dtype)

@@ -85,9 +85,9 @@ class Bounded(Settings):
     """`bounded` as a parametrization: `forward` from all real numbers into (low, high), `right_inverse` back.
 
     `low`, `high`: numbers or tensors that broadcast to the parameter. `margin`: as in `bounded_inverse`. The slope is
-    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are part of
-    `state_dict`: a state that is loaded brings its own, of the same shapes. They stay float64 when the module is made
-    half. Raises ShapeError, and UnitError for bounds further apart than float32 has numbers.
+    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are part
+    of `state_dict`: a state that is loaded brings its own, of the same shapes. They stay float64 when the module is
+    made half. Raises ShapeError, and UnitError for bounds further apart than float32 has numbers.
     """
 
     low: Tensor

@@ -1,37 +1,98 @@
 """Copies and pickles of modules with parametrizations, which torch alone does not make.
 
 `register_parametrization` gives a module a class of its own, with a property for each parametrized name. Torch refuses
-to pickle it, and a deep copy shares the class: what is removed from the copy is gone in the module it was copied from.
+to pickle it, and copies share the class: what is removed from the copy is gone in the module it was copied from.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import Any, Self
+import copyreg
+from typing import Any
 
 import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
+_CONTAINERS = ("_parameters", "_buffers", "_modules")
+
 
 class CopiesParametrized(nn.Module):
     """A module whose copies and pickles keep their parametrizations, each with a class of its own. Modules inherit from
-    it in place of `nn.Module`.
+    it in place of `nn.Module`, or are given their parametrizations by `register`.
+
+    `copy.copy` shares tensors, as copies of all modules do; parametrizations that one of both takes away stay in the
+    other.
     """
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         if not parametrize.is_parametrized(self):
             return super().__reduce_ex__(protocol)
-        # What the class itself would put away: torch's class on top refuses to.
-        own: Any = parametrize.type_before_parametrizations(self)
-        return _shell, _origin(self), own.__getstate__(self)
+        return _reduced(self, protocol)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        make, arguments, state = self.__reduce_ex__(4)[:3]
-        made: Self = make(*arguments)
-        memo[id(self)] = made
-        made.__setstate__(copy.deepcopy(state, memo))  # type: ignore[no-untyped-call]
-        return made
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return _deep(self, memo)
+
+    def __copy__(self) -> Any:
+        return _shallow(self)
+
+
+def let_copy(module: nn.Module) -> None:
+    """Copies and pickles of a parametrized module as of `CopiesParametrized`, unless its class has its own."""
+    own: Any = parametrize.type_before_parametrizations(module)
+    made: Any = type(module)
+    if made is own or isinstance(module, CopiesParametrized) or copyreg._slotnames(own):  # type: ignore[attr-defined]
+        return
+    # The class that torch has made for this one module.
+    if not hasattr(own, "__deepcopy__"):
+        made.__deepcopy__ = _deep
+    if not hasattr(own, "__copy__"):
+        made.__copy__ = _shallow
+    if own.__reduce_ex__ is object.__reduce_ex__ and own.__reduce__ is object.__reduce__:
+        made.__reduce_ex__ = _reduced
+
+
+def _reduced(module: nn.Module, _protocol: Any) -> tuple[Any, ...]:
+    # What the class itself would put away: torch's class on top refuses to.
+    own: Any = parametrize.type_before_parametrizations(module)
+    return _shell, _origin(module), own.__getstate__(module)
+
+
+def _parts(module: Any) -> tuple[Any, tuple[Any, ...], Any]:
+    make, arguments, state = module.__reduce_ex__(4)[:3]
+    return make, arguments, state
+
+
+def _deep(module: nn.Module, memo: dict[int, Any]) -> Any:
+    make, arguments, state = _parts(module)
+    made = make(*arguments)
+    memo[id(module)] = made
+    made.__setstate__(copy.deepcopy(state, memo))
+    return made
+
+
+def _shallow(module: nn.Module) -> Any:
+    make, arguments, state = _parts(module)
+    made = make(*arguments)
+    made.__setstate__(state)
+    _own_containers(made)
+    if parametrize.is_parametrized(made):
+        lists = made.parametrizations = _with_own_containers(made.parametrizations)
+        for name, one in lists.items():
+            lists[name] = _with_own_containers(one)
+    return made
+
+
+def _own_containers(module: nn.Module) -> None:
+    """The same tensors and modules in dictionaries of its own."""
+    module.__dict__.update({name: module.__dict__[name].copy() for name in _CONTAINERS})
+
+
+def _with_own_containers(module: Any) -> Any:
+    twin: Any = object.__new__(type(module))
+    twin.__dict__.update(module.__dict__)
+    _own_containers(twin)
+    return twin
 
 
 def _origin(module: nn.Module) -> tuple[type, tuple[str, ...]]:
@@ -48,4 +109,5 @@ def _shell(cls: Any, names: tuple[str, ...]) -> Any:
         for name in names:
             module.register_parameter(name, nn.Parameter(torch.zeros(())))
             parametrize.register_parametrization(module, name, nn.Identity())
+        let_copy(module)
     return module

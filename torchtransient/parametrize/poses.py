@@ -238,10 +238,10 @@ def _rotation_vector(pose: Tensor) -> Tensor:
 
 
 def _four_by_four(pose: Any, where: str) -> Tensor:
-    pose = floating(pose, where)
-    if pose.ndim < 2 or pose.shape[-2:] != (4, 4):
-        raise ShapeError(f"{where}: expected transforms (..., 4, 4), got {tuple(pose.shape)}.")
-    return pose
+    matrix = floating(pose, where)
+    if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
+        raise ShapeError(f"{where}: expected transforms (..., 4, 4), got {tuple(matrix.shape)}.")
+    return matrix
 
 
 def _tolerance(dtype: torch.dtype) -> float:

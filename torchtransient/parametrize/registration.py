@@ -2,67 +2,135 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.floating import without_autocast
 from torchtransient.parametrize.bounded import Roughness
+from torchtransient.parametrize.copies import let_copy
+from torchtransient.quantities import shown
 
 
+@without_autocast
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
     """`torch.nn.utils.parametrize.register_parametrization` by a key: of a renderer, or a module that holds one, a key
     of its scene, `"box.to_world"`; of other modules a path, `"encoder.weight"`; or one behind the other where a module
     holds several renderers. Returns the module.
 
-    The present value is where it starts, by `right_inverse`. Optimisers are made afterwards: `module.parameters()` has
-    the numbers behind the value (`original`), and `renderer.values[key]` the value. Another one on the same key is
-    applied after the first. Raises UnknownKeyError, the errors of `right_inverse`, ShapeError where it does not
-    fit, and SceneError for a `Roughness` of principled materials.
+    The present value is where it starts, by `right_inverse`; a parametrization without one takes it for the numbers
+    behind. Optimisers are made afterwards: `module.parameters()` has the numbers behind the value (`original`), and
+    `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each copy its own
+    (`CopiesParametrized`).
+
+    Another one on the same key is applied after those before it, and the value stays where it is. Raises SceneError,
+    and leaves everything as it was, for a kind that the key has already, and for one without `right_inverse` behind
+    others; with the errors of `right_inverse` where the two cannot have that value. Raises UnknownKeyError, the errors
+    of `right_inverse`, ShapeError where it does not fit, and SceneError for a `Roughness` of principled materials.
     """
     if not isinstance(parametrization, nn.Module):
         raise SceneError(
             f"register: expected a parametrization, an nn.Module, got {type(parametrization).__name__}; "
             "tt.parametrize.Albedo() for instance."
         )
+    owner, name = _place(module, key)
     if isinstance(parametrization, Roughness) and "roughness" in key.replace("/", ".").split("."):
         # The two clamps differ by a factor of 32, in between which a fit would stand still.
         raise SceneError(
             f"register: {key!r} is of a principled material: expected PrincipledRoughness, or Bounded, got Roughness."
         )
-    owner, name = _place(module, key)
+    kind = type(parametrization).__name__
     try:
-        parametrize.register_parametrization(owner, name, parametrization)
+        if parametrize.is_parametrized(owner, name):
+            _append(owner, name, key, parametrization)
+        else:
+            parametrize.register_parametrization(owner, name, parametrization)
     except TorchTransientError:
         raise
     except (ValueError, RuntimeError) as error:
-        kind = type(parametrization).__name__
         raise ShapeError(f"register: {kind} does not fit {key!r}: {error}") from error
+    let_copy(owner)
     return module
+
+
+def _append(owner: nn.Module, name: str, key: str, parametrization: nn.Module) -> None:
+    """One more on a key, of which the present value is made."""
+    chain = _chain(owner, name)
+    kind, before = type(parametrization), [type(one).__name__ for one in chain]
+    cure = f"tt.parametrize.remove(module, {key!r}) takes away what is there."
+    if kind in {type(one) for one in chain}:
+        raise SceneError(f"register: {key!r} has {kind.__name__} already, remove it first: {cure}")
+    for one in (parametrization, *chain):
+        if not hasattr(one, "right_inverse"):
+            raise SceneError(
+                f"register: {key!r} has {', '.join(before)} already, and another after it cannot keep its value: "
+                f"{type(one).__name__} has no right_inverse. {cure}"
+            )
+    value = getattr(owner, name).detach().clone()
+    numbers = [(one, one.detach().clone()) for one in _behind(chain)]
+    # Torch's own call leaves the numbers behind as they were, of which the two make another value.
+    chain.append(parametrization.train(owner.training))
+    try:
+        chain.right_inverse(value)
+        found = chain()
+        if found.shape != value.shape or found.dtype != value.dtype:
+            raise ShapeError(f"it makes {tuple(found.shape)} of {found.dtype}, expected the value's.")
+    except BaseException as error:
+        del chain[-1]
+        for one, old in numbers:
+            one.data = old
+        if not isinstance(error, (TorchTransientError, ValueError, RuntimeError)):
+            raise
+        wrong = type(error) if isinstance(error, TorchTransientError) else ShapeError
+        raise wrong(
+            f"register: {key!r} has {', '.join(before)} already, and with {kind.__name__} after it cannot keep its "
+            f"value: {error} {cure}"
+        ) from error
+
+
+def _behind(chain: Any) -> list[Tensor]:
+    """The tensors of which a chain makes its value: parameters, or buffers."""
+    return [*chain.parameters(recurse=False), *chain.buffers(recurse=False)]
 
 
 def original(module: nn.Module, key: str) -> nn.Parameter:
-    """The numbers behind a parametrized value, which optimisers change. Raises UnknownKeyError, and SceneError for a
-    key without a parametrization.
+    """The numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not. Raises
+    UnknownKeyError, and SceneError for a key without a parametrization, or of one that makes the value of several.
     """
     owner, name = _parametrized(module, key)
-    behind = owner.parametrizations[name].original  # type: ignore[index, union-attr]
-    assert isinstance(behind, nn.Parameter)
-    return behind
+    chain = _chain(owner, name)
+    if not chain.is_tensor:
+        names = ", ".join(f"original{k}" for k in range(chain.ntensors))
+        raise SceneError(f"{key!r} has several tensors behind its value: {names} of module.parametrizations[{name!r}].")
+    return cast(nn.Parameter, chain.original)
 
 
 def remove(module: nn.Module, key: str) -> nn.Module:
-    """Take the parametrizations of a key away. Its value stays as it is, in a new `nn.Parameter`: make optimisers
-    afterwards. Returns the module. Raises as `original`.
+    """Take the parametrizations of a key away. Its value stays as it is, in a new `nn.Parameter` (of a buffer, a
+    buffer): make optimisers afterwards. Returns the module. Raises UnknownKeyError, and SceneError for a key without a
+    parametrization.
     """
     owner, name = _parametrized(module, key)
+    chain = _chain(owner, name)
+    behind = [*chain.parameters(recurse=False)]
     with torch.no_grad():
         value = getattr(owner, name).detach().clone()
-    wanted = original(module, key).requires_grad
     # Torch writes the value into the tensor behind it, which is left with a shape of its own elsewhere.
-    parametrize.remove_parametrizations(owner, name, leave_parametrized=False)
-    owner.register_parameter(name, nn.Parameter(value, requires_grad=wanted))
+    parametrize.remove_parametrizations(owner, name, leave_parametrized=not chain.is_tensor)
+    delattr(owner, name)
+    if behind:
+        owner.register_parameter(name, nn.Parameter(value, requires_grad=any(one.requires_grad for one in behind)))
+    else:
+        owner.register_buffer(name, value)
     return module
+
+
+def _chain(owner: nn.Module, name: str) -> Any:
+    """Torch's list of the parametrizations of a name."""
+    return owner.parametrizations[name]  # type: ignore[index]
 
 
 def _parametrized(module: nn.Module, key: str) -> tuple[nn.Module, str]:
@@ -74,6 +142,10 @@ def _parametrized(module: nn.Module, key: str) -> tuple[nn.Module, str]:
 
 def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
     """The module that holds the parameter of a key, and its name there."""
+    if not isinstance(module, nn.Module):
+        raise SceneError(f"expected a module with parameters, an nn.Module, got {shown(module)}.")
+    if not isinstance(key, str):
+        raise UnknownKeyError(f"expected the key of a parameter as a text, got {shown(key)}.")
     # Torch forbids dots in names: renderers have slashes for them.
     parts = key.split(".")
     for k in range(len(parts)):
@@ -95,5 +167,5 @@ def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
 
 
 def _has(module: nn.Module, name: str) -> bool:
-    own = dict(module.named_parameters(recurse=False)) | dict(module.named_buffers(recurse=False))
+    own: dict[str, Tensor] = dict(module.named_parameters(recurse=False)) | dict(module.named_buffers(recurse=False))
     return name in own or parametrize.is_parametrized(module, name)

@@ -73,7 +73,8 @@ class _SmoothSpectrum(Settings):
                 f"{tuple(values.shape)}."
             )
         curve = single(self.outer.right_inverse(values))
-        return (curve @ torch.linalg.pinv(self.basis).to(curve).mT).to(values.dtype)
+        coefficients: Tensor = curve @ torch.linalg.pinv(self.basis).to(curve).mT
+        return coefficients.to(values.dtype)
 
     def extra_repr(self) -> str:
         return f"{self.basis.shape[0]} wavelengths, {self.basis.shape[1]} coefficients"
