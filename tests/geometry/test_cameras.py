@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import mitsuba as mi
@@ -179,7 +180,85 @@ def test_optical_path_is_where_the_light_arrives(seen):
 
 def test_a_path_that_is_too_short():
     setting = {"camera_matrix": geometry.intrinsics(50.0, (2, 2)), "to_world": np.eye(4), "light": [0.0, 0.0, 3.0]}
-    assert geometry.distance_from_opl(torch.full((2, 2), 2.9), **setting).isnan().all()
+    for opl in (2.9, 0.0, -5.0, torch.nan):
+        assert geometry.distance_from_opl(torch.full((2, 2), opl), **setting).isnan().all()
+    assert bool(geometry.distance_from_opl(torch.tensor([[-0.1, 0.0]])).isnan()[0, 0])
+
+
+@pytest.mark.parametrize("light", [None, [0.0, 1.0, 0.0]])
+def test_nothing_flows_back_from_a_path_that_is_too_short(light):
+    """Also of what the camera and the light depend on; elsewhere as if those pixels were not there."""
+
+    def slopes(opl):
+        leaves = [opl, torch.tensor(50.0), torch.eye(4), torch.tensor([0.0, 1.0, 0.0]), torch.tensor(1.2)]
+        leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+        opl, fov, pose, place, index = leaves
+        given = {"light": place} if light else {}
+        matrix = geometry.intrinsics(fov, (2, 3))
+        geometry.distance_from_opl(opl, matrix, pose, **given, index=index).nansum().backward()
+        return [torch.zeros(()) if leaf.grad is None else leaf.grad for leaf in leaves]
+
+    short = torch.tensor([[5.0, -5.0, 0.5], [torch.nan, -1.2, 6.0]])
+    if light is None:
+        short[0, 2] = -0.5
+    found = slopes(short)
+    assert all(bool(torch.isfinite(slope).all()) for slope in found)
+    assert torch.equal(found[0] != 0, torch.tensor([[True, False, False], [False, False, True]]))
+    assert found[4] != 0 and (light is None or (found[1] != 0 and bool((found[3] != 0).any())))
+    # The pixels that count are as if the others were long enough.
+    whole = slopes(torch.where(found[0] != 0, short, 50.0))
+    assert torch.equal(found[0][found[0] != 0], whole[0][found[0] != 0])
+
+
+@pytest.mark.parametrize(
+    ("function", "holes"),
+    [
+        (lambda d, matrix, *_: geometry.distance_from_z_depth(d, matrix), 2),
+        (lambda d, matrix, *_: geometry.z_depth_from_distance(d, matrix), 2),
+        (lambda d, matrix, pose, *_: geometry.points_from_distance(d, matrix, pose), 2),
+        (lambda d, matrix, pose, *_: geometry.normals_from_distance(d, matrix, pose), 9 + 4),
+        (lambda d, matrix, pose, place, index: geometry.opl_from_distance(d, matrix, pose, place, index), 2),
+        (lambda d, matrix, pose, place, index: geometry.opl_from_distance(d, index=index), 2),
+        (lambda d, matrix, pose, place, index: geometry.distance_from_opl(d + 4, matrix, pose, place, index), 2),
+        (lambda d, matrix, pose, place, index: geometry.distance_from_opl(d, index=index), 2),
+    ],
+)
+def test_nothing_flows_back_from_pixels_that_meet_nothing(function, holes):
+    """Slopes of all that it depends on are those of the sum over the other pixels."""
+    depth = torch.linspace(1.0, 3.0, 48).reshape(6, 8).double()
+
+    def slopes(depth, keep):
+        leaves = [depth, geometry.intrinsics(50.0, (6, 8)), torch.tensor(POSE), torch.tensor([0.3, 0.1, 2.0]),
+                  torch.tensor(1.2)]  # fmt: skip
+        leaves = [leaf.clone().double().requires_grad_() for leaf in leaves]
+        value = function(*leaves)
+        torch.where(keep, value, 0.0).sum().backward()
+        return value, [torch.zeros(()) if leaf.grad is None else leaf.grad for leaf in leaves]
+
+    torn = depth.clone()
+    torn[2, 3] = torn[0, 7] = torch.nan
+    seen = ~slopes(torn, torch.tensor(True))[0].isnan()
+    assert int((~seen).reshape(-1, 6, 8).any(0).sum()) == holes
+    (_, found), (_, known) = slopes(torn, seen), slopes(depth, seen)
+    known[0][torn.isnan()] = 0.0
+    for one, other in zip(found, known, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+
+
+def test_an_index_with_a_gradient():
+    depth = torch.linspace(1.0, 3.0, 12).double().reshape(3, 4)
+    setting = {"camera_matrix": geometry.intrinsics(50.0, (3, 4)).double(), "to_world": POSE, "light": [0.3, 0.1, 2.0]}
+    index = torch.tensor(1.3).double().requires_grad_()
+    many = torch.linspace(1.0, 1.5, 12).double().reshape(3, 4).requires_grad_()
+    for given in ({}, setting):
+        for one in (index, many):
+            there = functools.partial(geometry.opl_from_distance, depth, **given)
+            assert torch.autograd.gradcheck(lambda n, there=there: there(index=n), one)
+            opl = there(index=one)
+            assert torch.allclose(geometry.distance_from_opl(opl, **given, index=one), depth)
+    for wrong, error in ((torch.zeros(()), UnitError), (torch.ones(5), ShapeError), (torch.tensor(1j), UnitError)):
+        with pytest.raises(error, match="index"):
+            geometry.opl_from_distance(depth, index=wrong)
 
 
 def test_camera_of_takes_values_and_their_gradients(seen):
@@ -218,6 +297,8 @@ MATRIX, IMAGE = torch.eye(3), torch.ones(4, 5)
         (lambda: geometry.intrinsics(40.0, (4, 5), "z"), SceneError, "fov_axis"),
         (lambda: geometry.intrinsics(40.0, (4, 5), "x", (0.1,)), ShapeError, "two finite numbers"),
         (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset=(1,)), ShapeError, "crop_offset"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset=3), ShapeError, "crop_offset"),
+        (lambda: geometry.intrinsics(40.0, (4, 5), "x", crop_offset="ab"), ShapeError, "crop_offset"),
         (lambda: geometry.extrinsics(np.eye(3)), ShapeError, r"\(\.\.\., 4, 4\)"),
         (lambda: geometry.extrinsics(np.diag([2.0, 2.0, 2.0, 1.0])), UnitError, "a rigid motion"),
         (lambda: geometry.extrinsics(np.diag([-1.0, 1.0, 1.0, 1.0])), UnitError, "a rigid motion"),

@@ -46,6 +46,48 @@ def test_the_ends_need_a_margin(value):
     assert moved[1].item() == pytest.approx(0.01 if value[1] < 0.5 else 0.99, rel=1e-5)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("margin", [1e-30, 1e-8, 1e-4, 1e-3, 0.1])
+@pytest.mark.parametrize("low, high", [(0.0, 1.0), (1.0, 4.0), (-0.99, 0.99), (-7.0, -3.0), (1e-4, 1.0), (0.0, 500.0)])
+def test_a_margin_below_the_rounding(dtype, margin, low, high):
+    """No nearer than the dtype tells from the bound, and at most as far as two of its steps, or the margin."""
+    ends = torch.tensor([low, high], dtype=torch.float64).to(dtype)
+    x = bounded_inverse(ends, low, high, margin)
+    assert bool(torch.isfinite(x).all())
+    moved = (bounded(x, low, high) - ends).double().abs()
+    step = 2 * torch.finfo(dtype).eps * ends.double().abs() + torch.finfo(dtype).tiny
+    slack = 1 + 16 * torch.finfo(dtype).eps  # the number behind is up to 16, and rounded
+    assert bool((moved <= slack * step.clamp_min(margin * (high - low)) + step).all())
+    assert bool(torch.isfinite(simplex_inverse(torch.tensor([0.0, 1.0], dtype=dtype), margin=margin)).all())
+
+
+def test_ranges_that_the_precision_has_not():
+    for make in (lambda: parametrize.Bounded(0.0, 1e5)(torch.zeros(2).half()), lambda: parametrize.Bounded(-3e38, 3e38),
+                 lambda: bounded(torch.zeros(2).half(), -6e4, 6e4)):  # fmt: skip
+        with pytest.raises(UnitError, match="has not the range"):
+            make()
+    for margin in (None, 0.1):
+        with pytest.raises(UnitError):
+            bounded_inverse(torch.ones(2), 1.0, 1.0 + 1e-9, margin)
+        with pytest.raises(UnitError):
+            bounded_inverse(torch.ones(2), 1.0, 1.0 + 2**-23, margin)
+
+
+def test_bounds_of_nothing():
+    nothing = parametrize.Bounded(torch.empty(0), 1.0)
+    assert nothing(torch.empty(0)).shape == (0,) and nothing.right_inverse(torch.empty(0)).shape == (0,)
+    assert repr(nothing) == "Bounded([] to 1)"
+
+
+@pytest.mark.parametrize("dim", [None, 0.5, 0.7, "0", True, 1.0])
+def test_dimensions_that_are_none(dim):
+    weights = torch.tensor([[0.25, 0.75]])
+    for call in (lambda: parametrize.Simplex(dim), lambda: parametrize.simplex(weights, dim),
+                 lambda: simplex_inverse(weights, dim)):  # fmt: skip
+        with pytest.raises(ShapeError, match="dim as a whole number"):
+            call()
+
+
 @pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf])
 @pytest.mark.parametrize("margin", [None, 0.1])
 def test_beyond_the_bounds_no_margin_helps(value, margin):
@@ -82,6 +124,11 @@ def test_margins_that_are_none(margin):
 
 def test_positive_at_its_limits():
     assert positive(torch.tensor([-1e4, -20.0]))[0] >= 0
+    # Above the bound as far as the docstring says, and on it below.
+    assert positive(torch.tensor(-103.0)) > 0 and positive(torch.tensor(-15.0), low=1.0) > 1
+    assert positive(torch.tensor(-110.0)) == 0 and positive(torch.tensor(-20.0), low=1.0) == 1
+    found = positive(torch.tensor([88.0, 89.0]), function="exp")
+    assert found[0] < math.inf and found[1] == math.inf
     value = torch.tensor([1e-30, 1e-3, 1.0, 1e4, 1e30])
     for function in ("softplus", "exp"):
         back = positive(positive_inverse(value, function=function), function=function)

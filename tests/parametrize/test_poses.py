@@ -125,10 +125,18 @@ def test_batches_of_bases():
     assert torch.allclose(AxisAnglePose(bases).right_inverse(together), x, atol=1e-10)
     with pytest.raises(ShapeError, match="goes with a base"):
         AxisAnglePose(bases)(torch.zeros(3, 6))
+    with pytest.raises(ShapeError, match="that go with a base"):
+        AxisAnglePose(bases).right_inverse(torch.eye(4).expand(3, 4, 4))
 
 
 @pytest.mark.parametrize("function", [axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse])
-@pytest.mark.parametrize("matrix", [scale(1.1), scale([1.0, 1.0, -1.0]), np.full((4, 4), np.nan), scale([1, 2, 1])])
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        scale(1.1), scale([1.0, 1.0, -1.0]), np.full((4, 4), np.nan), scale([1, 2, 1]), np.diag([1.0, 1.0, 1.0, 2.0]),
+        np.eye(4) + 0.1 * np.eye(4, k=-3), np.eye(4) + np.eye(4, k=-1) * [0, 0, 0.01, 0],
+    ],
+)  # fmt: skip
 def test_what_is_no_rigid_motion(function, matrix):
     with pytest.raises(UnitError, match="expected a rigid motion"):
         function(torch.tensor(matrix))
@@ -145,6 +153,11 @@ def test_a_scale_needs_its_base():
     [
         ({"base": np.zeros((4, 4))}, UnitError, "with an inverse"),
         ({"base": np.eye(3)}, ShapeError, r"\(\.\.\., 4, 4\)"),
+        ({"base": np.diag([1.0, 1.0, 1.0, 2.0])}, UnitError, "last row 0, 0, 0, 1"),
+        ({"base": np.eye(4) + 0.1 * np.eye(4, k=-3)}, UnitError, "last row 0, 0, 0, 1"),
+        ({"base": np.where(np.eye(4, k=3), np.nan, np.eye(4))}, UnitError, "with an inverse"),
+        ({"about": [math.nan, 0.0, 0.0]}, UnitError, "finite numbers"),
+        ({"about": torch.tensor([0.0, math.inf, 0.0])}, UnitError, "finite numbers"),
         ({"base": "there"}, ShapeError, r"\(\.\.\., 4, 4\)"),
         ({"about": "there"}, SceneError, "'self', 'world' or a point"),
         ({"about": [1.0, 2.0]}, ShapeError, "point"),

@@ -1,8 +1,8 @@
 """Depth along the axis, distance along the ray, points, and the optical path of light that has met one surface.
 
 Images are (..., H, W). `camera_matrix` (3, 3) or (..., 3, 3) is that of `intrinsics`, of the same image. Lengths in
-metres. NaN, of pixels that meet nothing, stays NaN. Results have the dtype of the image; half precision is computed in
-float32.
+metres. NaN, of pixels that meet nothing, stays NaN, and nothing flows back from there. Results have the dtype of the
+image; half precision is computed in float32.
 """
 
 from __future__ import annotations
@@ -42,13 +42,17 @@ def _rays(matrix: Tensor, size: tuple[int, int], to_world: Any = None) -> Tensor
 @without_autocast
 def distance_from_z_depth(z_depth: Tensor, camera_matrix: Any) -> Tensor:
     """Distance from the pinhole along each pixel's ray (the label `depth`) of depth along the axis (`z_depth`)."""
-    return (z_depth / _cosines(z_depth, camera_matrix, "distance_from_z_depth")).to(z_depth.dtype)
+    cosines = _cosines(z_depth, camera_matrix, "distance_from_z_depth")
+    known, depth = without_nan(z_depth)
+    return torch.where(known, depth / cosines, torch.nan).to(z_depth.dtype)
 
 
 @without_autocast
 def z_depth_from_distance(distance: Tensor, camera_matrix: Any) -> Tensor:
     """Depth along the axis (the label `z_depth`) of distance along each pixel's ray (`depth`)."""
-    return (distance * _cosines(distance, camera_matrix, "z_depth_from_distance")).to(distance.dtype)
+    cosines = _cosines(distance, camera_matrix, "z_depth_from_distance")
+    known, along = without_nan(distance)
+    return torch.where(known, along * cosines, torch.nan).to(distance.dtype)
 
 
 @without_autocast
@@ -58,10 +62,11 @@ def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = N
     """
     size = image_of(distance, "points_from_distance")
     points = _rays(_like(camera_matrix, distance, "points_from_distance"), size, to_world)
-    points = points * distance[..., None, :, :]
+    known, along = without_nan(distance)
+    points = points * along[..., None, :, :]
     if to_world is not None:
         points = points + camera_to_world(to_world).to(points)[..., :3, 3, None, None]
-    return points.to(distance.dtype)
+    return torch.where(known[..., None, :, :], points, torch.nan).to(distance.dtype)
 
 
 @without_autocast
@@ -76,12 +81,13 @@ def opl_from_distance(
     ShapeError, UnitError.
     """
     image_of(distance, "opl_from_distance")
-    length, given = single(distance), _index(index, distance, "opl_from_distance")
+    given = _index(index, distance, "opl_from_distance")
+    known, length = without_nan(distance)
     if light is None:
-        return (2 * given * length).to(distance.dtype)
+        return torch.where(known, 2 * given * length, torch.nan).to(distance.dtype)
     rays, baseline = _triangle(distance, camera_matrix, to_world, light, "opl_from_distance")
     onward: Tensor = torch.linalg.vector_norm(rays * length[..., None, :, :] - baseline, dim=-3)
-    return (given * (length + onward)).to(distance.dtype)
+    return torch.where(known, given * (length + onward), torch.nan).to(distance.dtype)
 
 
 @without_autocast
@@ -96,15 +102,16 @@ def distance_from_opl(
     `opl_from_distance`.
     """
     image_of(opl, "distance_from_opl")
-    length = single(opl) / _index(index, opl, "distance_from_opl")
+    path, given = single(opl), _index(index, opl, "distance_from_opl")
     if light is None:
-        return torch.where(length >= 0, length / 2, torch.nan).to(opl.dtype)
+        return torch.where(path >= 0, torch.where(path >= 0, path, 0.0) / (2 * given), torch.nan).to(opl.dtype)
     rays, baseline = _triangle(opl, camera_matrix, to_world, light, "distance_from_opl")
     across = (rays * baseline).sum(-3)
     square = (baseline * baseline).sum(-3)
+    length = path / given
     long = (length > 0) & (length * length > square)
-    # Elsewhere some length that has a distance: the slope of what is not taken has to be finite, too.
-    length = torch.where(long, length, 1 + 2 * square.detach().sqrt())
+    # Elsewhere some path that has a distance: the slope of what is not taken has to be finite, too.
+    length = torch.where(long, path, given * (1 + 2 * square.sqrt()).detach()) / given
     # |d ray - baseline| = length - d, squared.
     distance = (length * length - square) / (2 * (length - across))
     return torch.where(long, distance, torch.nan).to(opl.dtype)
@@ -119,6 +126,14 @@ def image_of(image: Any, where: str) -> tuple[int, int]:
         got = f"{tuple(image.shape)} of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
         raise ShapeError(f"{where}: expected a floating image (..., H, W), got {got}.")
     return int(image.shape[-2]), int(image.shape[-1])
+
+
+def without_nan(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Where an image is no NaN; and the image, in single precision at least, with 1 elsewhere: a slope of zero times
+    NaN would be NaN, and reach cameras and lights.
+    """
+    known = ~torch.isnan(image)
+    return known, torch.where(known, single(image), 1.0)
 
 
 def _like(camera_matrix: Any, image: Tensor, where: str) -> Tensor:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.floating import single, without_autocast
-from torchtransient.geometry.distances import image_of, points_from_distance
+from torchtransient.floating import without_autocast
+from torchtransient.geometry.distances import image_of, points_from_distance, without_nan
 from torchtransient.geometry.pinhole import camera_to_world
 
 
@@ -28,7 +28,8 @@ def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = 
 
     if min(image_of(distance, "normals_from_distance")) < 2:
         raise ShapeError(f"normals_from_distance: expected two rows and columns at least, got {tuple(distance.shape)}.")
-    points = points_from_distance(single(distance), camera_matrix)
+    known, filled = without_nan(distance)
+    points = points_from_distance(filled, camera_matrix)
     size = points.shape[-2:]
     along = spatial_gradient(points.reshape(-1, 3, *size))
     normals = -torch.nn.functional.normalize(torch.linalg.cross(along[:, :, 0], along[:, :, 1], dim=1), dim=1)
@@ -36,4 +37,6 @@ def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = 
     if to_world is not None:
         turn = camera_to_world(to_world).to(normals)[..., :3, :3]
         normals = (turn @ normals.flatten(-2)).reshape(normals.shape)
-    return normals.to(distance.dtype)
+    unknown = (~known).to(normals).reshape(-1, 1, *size)
+    near = torch.nn.functional.max_pool2d(unknown, 3, stride=1, padding=1).reshape(*known.shape[:-2], 1, *size) > 0
+    return torch.where(near, torch.nan, normals).to(distance.dtype)

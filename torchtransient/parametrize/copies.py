@@ -21,8 +21,8 @@ class CopiesParametrized(nn.Module):
     """A module whose copies and pickles keep their parametrizations, each with a class of its own. Modules inherit from
     it in place of `nn.Module`, or are given their parametrizations by `register`.
 
-    `copy.copy` shares tensors, as copies of all modules do; parametrizations that one of both takes away stay in the
-    other.
+    `copy.copy` shares tensors, as copies of all modules do: parametrizations that one of both takes away stay in the
+    other, but one that is given to either changes the numbers of both.
     """
 
     def __reduce_ex__(self, protocol: Any) -> Any:

@@ -72,7 +72,7 @@ class _SmoothSpectrum(Settings):
                 f"{name}: expected values of {self.basis.shape[0]} wavelengths, (..., {self.basis.shape[0]}), got "
                 f"{tuple(values.shape)}."
             )
-        curve = single(self.outer.right_inverse(values))
+        curve = self.outer.right_inverse(single(values))
         coefficients: Tensor = curve @ torch.linalg.pinv(self.basis).to(curve).mT
         return coefficients.to(values.dtype)
 

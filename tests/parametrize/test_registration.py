@@ -1,0 +1,184 @@
+"""What `register`, `original` and `remove` do to any module: chains, buffers, copies, and what they refuse."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils import parametrizations as torchs_own
+from torch.nn.utils import parametrize as torch_parametrize
+
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.parametrize import (
+    Albedo,
+    AxisAnglePose,
+    Bounded,
+    IndexOfRefraction,
+    Positive,
+    Simplex,
+    original,
+    register,
+    remove,
+)
+
+# Kinds, and a value that each can have alone.
+KINDS = [
+    (Albedo(), (0.625, 0.625)), (Bounded(-6.0, 6.0), (0.625, 0.625)), (Bounded(0.5, 1.0), (0.625, 0.625)),
+    (Positive(), (0.625, 0.625)), (Positive(2.0), (2.625, 3.0)), (IndexOfRefraction(), (1.5, 1.6)),
+    (Simplex(), (0.25, 0.75)),
+]  # fmt: skip
+
+
+class Weights(nn.Module):
+    def __init__(self, value=(0.25, 0.75)):
+        super().__init__()
+        self.w = nn.Parameter(torch.tensor(value))
+        self.register_buffer("known", torch.tensor(value))
+
+
+@pytest.mark.parametrize(("first", "value"), KINDS, ids=repr)
+@pytest.mark.parametrize("second", [kind for kind, _ in KINDS], ids=repr)
+def test_a_second_one_keeps_the_value_or_is_refused(first, second, value):
+    module = register(Weights(value), "w", copy.deepcopy(first))
+    before, numbers = module.w.detach().clone(), original(module, "w").detach().clone()
+    said = ""
+    try:
+        register(module, "w", copy.deepcopy(second))
+    except TorchTransientError as error:
+        said = str(error)
+    same = type(first) is type(second)
+    assert len(module.parametrizations.w) == (1 if said else 2) and bool(said) >= same
+    if said:
+        assert ("already, remove it first" if same else "cannot keep its value") in said
+        assert type(first).__name__ in said and "remove(module, 'w')" in said
+        assert torch.equal(original(module, "w"), numbers)
+    assert torch.allclose(module.w, before, rtol=1e-5)
+
+
+def test_some_chains_are_kept():
+    """The test above would pass were all refused."""
+    module = register(register(Weights(), "w", Bounded(-6.0, 6.0)), "w", Albedo())
+    assert torch.allclose(module.w, torch.tensor([0.25, 0.75]))
+    register(module, "w", Positive(-0.5))
+    assert len(module.parametrizations.w) == 3
+    assert torch.allclose(module.w, torch.tensor([0.25, 0.75]))
+
+
+@pytest.mark.parametrize("second", [nn.Tanh(), nn.Flatten(0), nn.Linear(2, 2)])
+def test_what_cannot_put_the_value_back(second):
+    module = register(Weights(), "w", Albedo())
+    with pytest.raises(SceneError, match=r"has Albedo already.*has no right_inverse.*remove\(module, 'w'\)"):
+        register(module, "w", second)
+    assert torch.allclose(module.w, torch.tensor([0.25, 0.75]))
+
+
+def test_a_second_one_that_makes_another_shape():
+    module = register(Weights(), "w", Albedo())
+    before = original(module, "w").detach().clone()
+
+    class Twice(nn.Module):
+        def forward(self, x):
+            return torch.cat([x, x])
+
+        def right_inverse(self, value):
+            return value
+
+    with pytest.raises(ShapeError, match=r"has Albedo already.*makes \(4,\)"):
+        register(module, "w", Twice())
+    assert torch.equal(original(module, "w"), before)
+
+
+def test_buffers():
+    module = register(Weights(), "known", Albedo())
+    assert not isinstance(original(module, "known"), nn.Parameter)
+    assert [name for name, _ in module.named_parameters()] == ["w"]
+    remove(module, "known")
+    assert torch.allclose(dict(module.named_buffers())["known"], torch.tensor([0.25, 0.75]))
+
+
+def test_several_tensors_behind_a_value():
+    module = torchs_own.weight_norm(nn.Linear(3, 2))
+    value = module.weight.detach().clone()
+    with pytest.raises(SceneError, match="several tensors behind its value: original0, original1"):
+        original(module, "weight")
+    register(module, "weight", Bounded(-3.0, 3.0))
+    assert torch.allclose(module.weight, value, atol=1e-6)
+    remove(module, "weight")
+    assert isinstance(module.weight, nn.Parameter) and module.weight.requires_grad
+    assert torch.allclose(module.weight, value, atol=1e-6)
+    assert not torch_parametrize.is_parametrized(module)
+
+
+def test_removing_keeps_what_is_frozen():
+    module = Weights()
+    module.w.requires_grad_(False)
+    assert not remove(register(module, "w", Albedo()), "w").w.requires_grad
+
+
+@pytest.mark.parametrize("key", [None, 3, torch.ones(2), ("w",)])
+def test_keys_that_are_none(key):
+    for call in (lambda: register(Weights(), key, Albedo()), lambda: original(Weights(), key),
+                 lambda: remove(Weights(), key)):  # fmt: skip
+        with pytest.raises(UnknownKeyError, match="as a text"):
+            call()
+    with pytest.raises(SceneError, match="a module with parameters"):
+        register("w", "w", Albedo())
+
+
+HOW = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda module: pickle.loads(pickle.dumps(module)),
+    "copy of a deepcopy": lambda module: copy.copy(copy.deepcopy(module)),
+    "deepcopy of a copy": lambda module: copy.deepcopy(copy.copy(module)),
+}
+
+
+@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("keys", [["w"], ["w", "known"]])
+def test_copies_of_any_module_are_on_their_own(how, keys):
+    """Either one can take its parametrizations away, and the other keeps them."""
+    value = torch.tensor([0.25, 0.75])
+    for k in range(2):
+        module = Weights()
+        for key in keys:
+            register(module, key, Albedo())
+        both = [module, HOW[how](module)]
+        assert type(both[0]) is not type(both[1])
+        shared = how == "copy"
+        assert (original(both[0], "w") is original(both[1], "w")) == shared
+        for key in keys:
+            remove(both[k], key)
+        assert type(both[k]) is Weights and torch.allclose(both[k].w, value)
+        other = both[1 - k]
+        assert all(torch.allclose(getattr(other, key), value) for key in keys)
+        other.w.sum().backward()
+        assert bool((original(other, "w").grad != 0).all())
+        assert torch.allclose(pickle.loads(pickle.dumps(other)).w, value)
+
+
+def test_a_copy_is_parametrized_alone():
+    module = register(Weights(), "w", Bounded(-6.0, 6.0))
+    twin = copy.copy(module)
+    register(twin, "w", Albedo())
+    register(twin, "known", Albedo())
+    assert len(module.parametrizations.w) == 1 and len(twin.parametrizations.w) == 2
+    assert "known" in module._buffers and not torch_parametrize.is_parametrized(module, "known")
+
+
+def test_a_class_with_its_own_copies_keeps_them():
+    class Own(Weights):
+        def __deepcopy__(self, memo):
+            return "its own"
+
+    assert copy.deepcopy(register(Own(), "w", Albedo())) == "its own"
+
+
+def test_under_autocast():
+    for kind, value in ((Albedo(), (0.25, 0.75)), (AxisAnglePose(), torch.eye(4).tolist())):
+        with torch.autocast("cpu", torch.bfloat16):
+            module = register(Weights(value), "w", kind)
+            assert torch.allclose(module.w, torch.tensor(value), atol=1e-6) and module.w.dtype == torch.float32
