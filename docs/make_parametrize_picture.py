@@ -33,15 +33,13 @@ def page() -> dict[str, Any]:
 def fits(names: dict[str, Any]) -> dict[str, list[list[dict[str, torch.Tensor]]]]:
     """Values of every step, by kind and seed."""
     albedo, pose, index = names["ALBEDO"], names["POSE"], names["INDEX"]
-    found: dict[str, list[list[dict[str, torch.Tensor]]]] = {"parametrized": [], "free": []}
+    # The page's own fit is that of seed 0.
+    found: dict[str, list[list[dict[str, torch.Tensor]]]] = {"parametrized": [names["history"]], "free": []}
     for seed in SEEDS:
-        renderer = names["renderer_of"](**names["START"])
-        tt.parametrize.register(renderer, albedo, tt.parametrize.Albedo())
-        tt.parametrize.register(renderer, index, tt.parametrize.IndexOfRefraction(1.0, 2.0))
-        tt.parametrize.register(renderer, pose, tt.parametrize.AxisAnglePose(renderer.values[pose]))
-        original = {key: tt.parametrize.original(renderer, key) for key in (albedo, index, pose)}
-        groups = [{"params": [original[albedo], original[index]], "lr": 0.25}, {"params": [original[pose]], "lr": 0.03}]
-        found["parametrized"].append(list(names["fit"](renderer, groups, names["target"], seed)))
+        if seed:
+            renderer = names["renderer_of"](**names["START"])
+            groups = names["parametrized"](renderer)
+            found["parametrized"].append(list(names["fit"](renderer, groups, names["target"], seed)))
         free = names["renderer_of"](**names["START"])
         own = dict(zip(free.values, free.parameters(), strict=True))
         groups = [{"params": [own[albedo], own[index]], "lr": 0.04}, {"params": [own[pose]], "lr": 0.01}]

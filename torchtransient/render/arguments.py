@@ -143,7 +143,11 @@ def given_values(values: Any) -> dict[str, Any]:
 
 
 class Values(Mapping[str, nn.Parameter]):
-    """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does."""
+    """The renderer's parameters under their Mitsuba keys. Setting one writes into it, as ``load_state_dict`` does.
+
+    Of a key with a parametrization the value is computed at each look: setting it writes the numbers behind, and what
+    is written into it in place (``clamp_``, ``fill_``, ``copy_``) is lost.
+    """
 
     def __init__(self, module: nn.Module, names: Mapping[str, str]):
         self._module, self._names = module, names
