@@ -119,6 +119,8 @@ def test_states_that_do_not_fit(tmp_path):
         Holder(Positive(), colour).load_state_dict(three.state_dict())
     with pytest.raises(SceneError, match="SE3Pose: the state is one of AxisAnglePose"):
         SE3Pose().load_state_dict(AxisAnglePose().state_dict())
+    with pytest.raises(SceneError, match="expected the state of a pose"):
+        SE3Pose().load_state_dict(SE3Pose().state_dict() | {"_extra_state": torch.tensor(1)})
     with pytest.raises(SceneError, match="one of softplus, exp"):
         Positive().load_state_dict(Positive().state_dict() | {"_extra_state": torch.tensor(7)})
 

@@ -199,7 +199,7 @@ def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Te
             ) from None
     # Half precision ends at 65504. Elsewhere a look would make a GPU wait for nothing.
     if like.dtype == torch.float16 and not holds(torch.isfinite(ends[1] - ends[0])):
-        raise UnitError(f"{where}: float16 has not the range from {_said(low)} to {_said(high)}; use bfloat16.")
+        raise UnitError(f"{where}: float16 has not the range from {_said(low)} to {_said(high)}; use float32.")
     return ends[0], ends[1]
 
 

@@ -151,7 +151,10 @@ class _RigidPose(Settings):
 
     def set_extra_state(self, state: Any) -> None:
         name = type(self).__name__
-        kind, frame = torch.as_tensor(state).tolist()
+        codes = torch.as_tensor(state)
+        if codes.shape != (2,):
+            raise SceneError(f"{name}: expected the state of a pose, got {shown(state)}.")
+        kind, frame = codes.tolist()
         if choice_of(_KINDS, kind, name) != self._kind:
             # The same six numbers are another motion.
             raise SceneError(f"{name}: the state is one of {choice_of(_KINDS, kind, name)}, expected {self._kind}.")

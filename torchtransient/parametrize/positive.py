@@ -22,7 +22,7 @@ def positive(x: Tensor, low: float = 0.0, scale: float = 1.0, function: Positive
     """`low + scale * log(1 + exp(x))`, or of `function="exp"` `low + scale * exp(x)`.
 
     Above `low`, of any real `x`, as far as the precision of `x` has numbers: `low` itself where it has none in between
-    (float32: below -103 with low=0, below -16 with low=1), and with "exp" infinite where it ends (float32: above 88).
+    (float32: below -104 with low=0, below -17 with low=1), and with "exp" infinite where it ends (float32: above 88).
 
     "softplus" is linear in `x` above `scale` and goes to `low` exponentially: steps of an optimiser are steps of the
     value. With "exp" steps are factors, for values whose order of magnitude is not known. `scale` > 0, in the unit of
