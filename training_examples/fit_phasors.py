@@ -145,7 +145,7 @@ def fit(model: Model, measured: Tensor, seed: int, steps: int, seconds: float | 
 
 def draw(path: Path, naive: Tensor, flat: Tensor, fits: dict[str, Fit]) -> None:
     """Errors of the distances as pictures on one scale, and over the time of the processor."""
-    figure = figure_type()(figsize=(12, 3.5), layout="constrained")
+    figure = figure_type()(figsize=(12, 3.5), layout="compressed")
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.3))
     limit = 1e3 * float(naive.abs().max())
     shown = {"camera's own depth": naive, "plane through it": flat, "fit": fits["phasor film"].rest}

@@ -150,7 +150,7 @@ def fit(model: Model, counts: Tensor, shares: Tensor, seed: int, steps: int, spp
 
 def draw(path: Path, fits: dict[str, Fit]) -> None:
     """The reliefs under a slanting lamp, cut to what the camera sees, and the errors over the steps."""
-    figure = figure_type()(figsize=(12, 3.3), layout="constrained")
+    figure = figure_type()(figsize=(12, 3.5), layout="compressed")
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.2))
     shown = {"truth": true_heights(), **{name: one.heights for name, one in fits.items()}}
     for panel, (name, heights) in zip(panels, shown.items(), strict=False):
