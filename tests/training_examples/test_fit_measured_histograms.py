@@ -75,7 +75,8 @@ def test_measured_zones_are_predicted(example, tmp_path):
         pytest.fail(f"set {MEASURED} to the folder that holds consumer_lidar/ams_U_iter_0.npy", pytrace=False)
     counts = example.measured(folder)
     assert counts.shape == (9, 49)
-    # Means of twenty exposures.
-    assert float((20 * counts - (20 * counts).round()).abs().max()) <= 20 * float(counts.max()) * 2**-23
+    # Means of twenty exposures, where single precision tells whole numbers of twentieths.
+    few = 20 * counts[counts < 1e5]
+    assert float((few - few.round()).abs().max()) <= 20 * 1e5 * 2**-24
     (rows,) = example.main(["--smoke", "--measured", folder, "--output", str(tmp_path)])
     assert all(row[3] < 2 for row in rows[FIT])
