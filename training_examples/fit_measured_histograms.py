@@ -108,11 +108,11 @@ def draw(path: Path, counts: Tensor, zones: list[int], best: dict[str, list[Tens
         for name, colour in lines.items():
             panel.semilogy(range(FIRST, LAST), best[name][place], color=colour, label=name)
         panel.semilogy(range(FIRST, LAST), counts[zones[place]], "k.", markersize=4, label="measured")
-        panel.set(xlabel="bin", ylabel="counts", title=f"zone {zones[place]} left out")
+        panel.set(xlabel="bin", ylabel="counts", title=f"zone {zones[place]} left out", ylim=(100, None))
         panel.legend(fontsize=8)
     for offset, (name, colour) in zip((-0.2, 0.2), lines.items(), strict=True):
         bars.bar(torch.arange(len(zones)) + offset, [row[3] for row in rows[name]], 0.4, color=colour, label=name)
-    bars.set(xlabel="zone left out", title="squared error of the shape", xticks=range(len(zones)))
+    bars.set(xlabel="zone left out", title="squared error of the shape, mean of bins", xticks=range(len(zones)))
     bars.set_xticklabels(zones)
     bars.legend(fontsize=8)
     save_figure(figure, path, "fit_measured_histograms")
