@@ -13,7 +13,6 @@ these (scenes and training included, where there are any); and ratios. Draws wha
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,18 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from two_wall_fits import Fit, Network, Table, draw_errors, draw_histograms, in_ranges, plain_ticks, roots, train
+from two_wall_fits import (
+    Fit,
+    Network,
+    Table,
+    draw_errors,
+    draw_histograms,
+    in_ranges,
+    options_of,
+    plain_ticks,
+    roots,
+    train,
+)
 from two_walls import LOW, MIDDLE, SPAN, known_counter, renderer, scenes
 
 import torchtransient as tt
@@ -157,11 +167,7 @@ def draw(table: Table, shown: Shown, path: Path) -> None:
 
 def main(argv: Sequence[str] | None = None) -> Table:
     """Command line; returns the errors."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="(%(default)s)")
-    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
-    options = parser.parse_args(argv)
+    options = options_of(__doc__, argv)
     tt.threads(1)
     table = Table()
     shown = [run(seed, SMOKE if options.smoke else Sizes(), table) for seed in options.seeds]

@@ -13,7 +13,6 @@ and how wrong response and background are in the end. Draws what each part corre
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -24,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from tqdm import tqdm
-from two_wall_fits import Fit, Network, Table, draw_errors, draw_histograms, in_ranges, train, weighted
+from two_wall_fits import Fit, Network, Table, draw_errors, draw_histograms, in_ranges, options_of, train, weighted
 from two_walls import MIDDLE, known_counter, renderer, scenes
 from unknown_counters import LAGS, kernel_of, learnable_counter, level_of, random_counter, true_counter
 
@@ -171,11 +170,7 @@ def draw(table: Table, shown: Shown, path: Path) -> None:
 
 def main(argv: Sequence[str] | None = None) -> Table:
     """Command line; returns the errors."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="(%(default)s)")
-    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
-    options = parser.parse_args(argv)
+    options = options_of(__doc__, argv)
     tt.threads(1)
     table = Table()
     shown = [run(seed, SMOKE if options.smoke else Sizes(), table) for seed in options.seeds]

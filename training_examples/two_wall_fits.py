@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -172,3 +174,12 @@ def draw_histograms(upper: Any, lower: Any, counts: Tensor, means: dict[str, tup
     lower.set_yscale("symlog", linthresh=5)
     lower.set_yticks([-30, -5, 0, 5, 30], ["-30", "-5", "0", "5", "30"])
     lower.set_ylim(min(-6, lower.get_ylim()[0]), max(6, lower.get_ylim()[1]))
+
+
+def options_of(doc: str | None, argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line of both examples."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--smoke", action="store_true", help="small enough for seconds")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="(%(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="folder for the picture (%(default)s)")
+    return parser.parse_args(argv)

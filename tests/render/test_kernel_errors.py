@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -45,6 +46,28 @@ def test_forward_mode_after_an_error(unreadable):
     with pytest.raises(SceneError) as held:
         slope(unreadable)
     assert held.value is not None and slope(right) == pytest.approx(expected)
+
+
+def test_forward_mode_beside_a_scene_with_attached_values():
+    """Calls are built into all objects alive: the tangent runs into values that somebody else attached."""
+    key, right = "wall.bsdf.reflectance.value", tt.load(room(), variant="llvm_ad_rgb")
+    value = torch.tensor([0.5, 0.4, 0.3])
+
+    def slope():
+        return torch.func.jvp(lambda x: tt.render(right, {key: x}, spp=64, seed=0).steady.sum(), (value,), (value,))[1]
+
+    expected = slope()
+    theirs = mi.load_dict(room(), optimize=False)
+    params = mi.traverse(theirs)
+    scale = mi.Float(1.0)
+    dr.enable_grad(scale)
+    params["side.bsdf.reflectance.value"] *= scale
+    params.update()
+    with pytest.raises(GradientError, match=r"attached.*Detach them"):
+        slope()
+    params["side.bsdf.reflectance.value"] = dr.detach(params["side.bsdf.reflectance.value"])
+    params.update()
+    assert slope() == pytest.approx(expected)
 
 
 @named_errors()

@@ -29,10 +29,10 @@ def counts_come_back():
 
 
 def run(script, *, code=0):
-    """What a fresh interpreter prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=240, check=False
-    )
+    """What a fresh interpreter prints. Numbers of threads are the script's alone."""
+    own = {name: value for name, value in os.environ.items() if name not in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, env=own)
     assert done.returncode == code, f"exit code {done.returncode}: {done.stderr[-3000:]}"
     return done.stdout.split()
 
@@ -182,6 +182,28 @@ def test_drjit_computes_with_as_many_threads():
         print(*[b for b, _ in found], *[total - others for _, total in found])
     """
     assert run(script) == ["1", "3", "1", "2", "1", "3", "1", "2"]
+
+
+def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
+    """Mitsuba alone waits for ever: it leaves an OpenEXR file to other threads of the pool, and there is none."""
+    script = f"""
+        import numpy as np
+        import torchtransient as tt
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        grey = np.full((40, 60, 3), 0.25, np.float32)
+        with tt.threads(2):
+            mi.Bitmap(grey).write({str(tmp_path / "grey.exr")!r})
+        tt.threads(1)
+        picture = {{"type": "bitmap", "filename": {str(tmp_path / "grey.exr")!r}}}
+        light = {{"type": "envmap", "filename": {str(tmp_path / "grey.exr")!r}}}
+        ball = {{"type": "sphere", "center": [0, 0, -9], "bsdf": {{"type": "diffuse", "reflectance": picture}}}}
+        scene = tt.load({{"type": "scene", "sensor": {{"type": "perspective"}}, "light": light, "ball": ball}})
+        renderer = tt.TransientRenderer(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4))
+        print(round(float(renderer(spp=1, seed=0).steady.mean()), 2), tt.threads().drjit)
+        print(tt.plan(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4)).variant, tt.threads().drjit)
+    """
+    assert run(script) == ["0.25", "1", "llvm_ad_mono", "1"]
 
 
 def test_a_forked_child_of_a_process_with_a_pool_is_told():

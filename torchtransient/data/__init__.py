@@ -1,7 +1,8 @@
 """Data sets: randomised scenes, generation, storage and reading; and the files of renders and captures."""
 
 from torchtransient.data.augmentation.augment import Augment as Augment
-from torchtransient.data.augmentation.augment import Augmented as Augmented
+from torchtransient.data.augmentation.augmented import Augmented as Augmented
+from torchtransient.data.augmentation.augmented import AugmentedStream as AugmentedStream
 from torchtransient.data.augmentation.operations import Affine as Affine
 from torchtransient.data.augmentation.operations import Crop as Crop
 from torchtransient.data.augmentation.operations import Flip as Flip

@@ -47,6 +47,7 @@ from torchtransient.render.nodes import (
 )
 from torchtransient.render.physics import scene_findings
 from torchtransient.render.pulse_properties import PREFIXES, PROPERTIES, write_pulse
+from torchtransient.render.threads import threads_for_files
 
 # Steady integrators, and the transient ones for which their parameters mean the same.
 _COUNTERPARTS = {
@@ -136,7 +137,7 @@ def build(description: Description, variant: str, options: BuildOptions) -> Buil
     config.merge_equivalent = options.merge
     config.merge_meshes = options.merge
     try:
-        with description.resolved_files(), plugins.plugin_errors():
+        with description.resolved_files(), plugins.plugin_errors(), threads_for_files():
             state = description.parse(config)
             _check_root(state)
             name_nodes(state)

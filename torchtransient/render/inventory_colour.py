@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from torchtransient.render.threads import threads_for_files
+
 COLOUR, MEASURED = "colour", "measured"
 # Wavelengths (nm) that a constant table has to cover to be grey.
 _VISIBLE = (380.0, 780.0)
@@ -126,7 +128,8 @@ def _picture(props: Any, lookup: Callable[[str], Path]) -> Verdict | None:
     if path.stat().st_size > _PIXELS_WORTH_READING:
         return Verdict(COLOUR, f"picture {name!r}, taken as coloured without a look at its pixels")
     try:
-        pixels = np.array(mi.Bitmap(str(path)))
+        with threads_for_files():
+            pixels = np.array(mi.Bitmap(str(path)))
     except (RuntimeError, ValueError):
         return Verdict(COLOUR, f"picture {name!r}, which cannot be read")
     return None if _grey(pixels) else Verdict(COLOUR, f"coloured picture {name!r}")

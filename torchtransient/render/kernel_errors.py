@@ -23,14 +23,19 @@ def named_errors() -> Iterator[None]:
     except RuntimeError as error:
         chain = _chain(error)
         own = next((cause for cause in chain if isinstance(cause, TorchTransientError)), None)
-        if own is error or (own is None and _INSIDE not in str(error)):
+        if own is error or (own is None and not any(words in str(error) for words in (_INSIDE, _ACROSS))):
             raise
         # What is attached must not live on in the frames of a traceback: Dr.Jit would run into it.
         for cause in chain:
             traceback.clear_frames(cause.__traceback__)
         if own is not None:
             raise own from None
-        raise _named(chain[-1]) from error
+        raise _named(_reason(chain)) from error
+
+
+def _reason(chain: list[BaseException]) -> BaseException:
+    """The first cause that says more than that something happened inside."""
+    return next((cause for cause in reversed(chain) if "(see above)" not in str(cause)), chain[-1])
 
 
 def _named(reason: BaseException) -> TorchTransientError:
@@ -39,7 +44,9 @@ def _named(reason: BaseException) -> TorchTransientError:
         return GradientError(
             "forward mode: Dr.Jit cannot push the tangent of a value into the calls that read it (known of attributes "
             "of shapes with one number at each place, read as a roughness or the weight of a lobe). Use reverse mode, "
-            "or a 'bitmap' in the surface itself."
+            "or a 'bitmap' in the surface itself. Or another scene of this process holds values that are attached "
+            "(dr.enable_grad on its parameters, or values computed from such): Dr.Jit builds calls into all objects "
+            "alive. Detach them, or let that scene go."
         )
     if _EVALUATED in words:
         return SceneError(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import TracebackType
 
@@ -54,6 +56,10 @@ def threads(n: int | None = None) -> Threads:
     for the first time later; those that have computed before keep theirs. Neither reaches spawned processes: call it
     there. Only CPU variants compute with Dr.Jit's threads. No variant is needed, and none is activated.
 
+    Mitsuba hands OpenEXR files to Dr.Jit's threads and waits for them, for ever where there is but one. What this
+    library loads gets a second one meanwhile; for Mitsuba's own calls on such files (``mi.Bitmap``, ``mi.load_dict``)
+    write ``with tt.threads(2):`` around them.
+
     Raises ``UnitError`` for anything but such a number, ``DeviceError`` where the system or torch refuses so many
     threads (the counts stay what they were), ``VariantError`` in a process that was forked from one whose threads of
     Dr.Jit were at work.
@@ -64,6 +70,27 @@ def threads(n: int | None = None) -> Threads:
         if n is not None:
             _set(n, n)
         return Threads(*_counts(), before)
+
+
+@contextmanager
+def threads_for_files() -> Iterator[None]:
+    """Hold the engine lock with at least two threads of Dr.Jit: for blocks in which Mitsuba may read or write pictures.
+
+    Mitsuba (3.9 at least) submits the blocks of an OpenEXR file to Dr.Jit's pool and waits on a semaphore, without
+    taking part: a pool that is the calling thread alone never gets to them. Also on machines of one core.
+    """
+    import drjit as dr
+
+    with engine_lock:
+        before = dr.thread_count()
+        if before > 1:
+            yield
+            return
+        _set_drjit(2)
+        try:
+            yield
+        finally:
+            _set_drjit(before)
 
 
 def _check(n: int | None) -> None:

@@ -77,6 +77,7 @@ from torchtransient.sensing.photon_budget import photon_energy_j as photon_energ
 from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
 from torchtransient.sensing.polarization import Analysers as Analysers
 from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
+from torchtransient.sensing.polarization import analyse as analyse
 from torchtransient.sensing.polarization import circular_analysers as circular_analysers
 from torchtransient.sensing.polarization import demosaic as demosaic
 from torchtransient.sensing.polarization import linear_analysers as linear_analysers

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from torchtransient.data.augmentation.operations import Operation
 from torchtransient.data.augmentation.pixel_map import PixelMap
@@ -212,32 +210,3 @@ def _in_the_world(name: str, kind: Kind, image: Tensor, drawn: PixelMap, to_worl
     mirror = drawn.mirrored_world(to_world).to(image.device, image.dtype)
     moved = torch.matmul(mirror[..., :3, :3], image.flatten(-2)).reshape(image.shape)
     return moved if kind == "direction" else moved + mirror[..., :3, 3, None, None]
-
-
-class Augmented(Dataset[Any]):
-    """A map-style data set, and an :class:`Augment` of each of its samples.
-
-    ``seed``: each sample has a generator of its own, so that it comes out the same whoever reads it; None draws from
-    torch's, anew each time. :meth:`sample` tells epochs apart. Pickles; for workers that were forked or spawned.
-    """
-
-    def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
-        if not isinstance(augment, Augment):
-            raise SceneError(f"Augmented: expected an Augment, got {shown(augment)}.")
-        self.dataset, self.augment, self.seed = dataset, augment, seed
-
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, number: int) -> Any:
-        return self.sample(number)
-
-    def sample(self, number: int, epoch: int | None = None) -> Any:
-        """A sample; ``epoch`` tells the maps of one epoch from those of another."""
-        found = self.dataset[number]
-        if self.seed is None:
-            return self.augment(found)
-        place = number % max(len(self.dataset), 1)
-        key = np.random.SeedSequence([abs(self.seed), place, *([] if epoch is None else [epoch])])
-        generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-        return self.augment(found, generator=generator)

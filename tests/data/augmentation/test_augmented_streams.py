@@ -1,0 +1,107 @@
+"""Augmented streams: the same sample comes out the same, whoever reads it, and anew in each epoch and use."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from support.online_recipe import OnlineRecipe
+from support.stored_samples import folder
+from torchtransient.data import Augment, Augmented, AugmentedStream, Crop, Flip, OnlineDataset, TransientStream
+from torchtransient.errors import SceneError, UnitError
+
+N = 11
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return folder(tmp_path_factory.mktemp("data") / "set", N)
+
+
+def by_index(stream):
+    found = {}
+    for sample in stream:
+        found.setdefault(int(sample["index"]), []).append(sample["depth"])
+    return found
+
+
+def test_maps_belong_to_samples_and_epochs(data):
+    augment = Augment(Flip(p=0.5))
+    stream = AugmentedStream(TransientStream(data, fields=["depth"]), augment, seed=4)
+    first = by_index(stream)
+    plain = by_index(TransientStream(data, fields=["depth"]))
+    assert {i: len(one) for i, one in first.items()} == dict.fromkeys(range(N), 1)
+    flipped = {i: torch.equal(first[i][0], plain[i][0].flip(-1)) for i in range(N)}
+    assert set(flipped.values()) == {True, False}
+    assert all(done or torch.equal(first[i][0], plain[i][0]) for i, done in flipped.items())
+    # Other readers, other orders.
+    other = AugmentedStream(TransientStream(data, fields=["depth"], seed=9), augment, seed=4)
+    halves = [
+        by_index(AugmentedStream(TransientStream(data, fields=["depth"], rank=r, world_size=2), augment, seed=4))
+        for r in (0, 1)
+    ]
+    for found in (by_index(other), {**halves[0], **halves[1]}, by_index(pickle.loads(pickle.dumps(stream)))):
+        assert all(torch.equal(found[i][0], first[i][0]) for i in range(N))
+    stream.set_epoch(1)
+    second = by_index(stream)
+    assert stream.num_samples == N and stream.epoch == 1
+    assert any(not torch.equal(second[i][0], first[i][0]) for i in range(N))
+    assert any(not torch.equal(by_index(AugmentedStream(stream.dataset, augment, seed=5))[i][0], second[i][0])
+               for i in range(N))  # fmt: skip
+    sizes = {tuple(batch["depth"].shape) for batch in DataLoader(stream, batch_size=N)}
+    assert sizes == {(N, *plain[0][0].shape)}
+
+
+class Again(torch.utils.data.IterableDataset):
+    """The same sample again and again."""
+
+    def __iter__(self):
+        yield from ({"index": 3, "depth": torch.arange(6.0).reshape(2, 3)} for _ in range(40))
+
+
+def test_samples_that_are_used_again_are_turned_anew():
+    def found(seed):
+        return [sample["depth"][0, 0].item() for sample in AugmentedStream(Again(), Augment(Flip(p=0.5)), seed=seed)]
+
+    # 40 tosses of a coin are all alike once in 5e11 seeds.
+    assert set(found(0)) == {0.0, 2.0}
+    assert found(0) == found(0) != found(1)
+
+
+def test_samples_that_are_rendered_meanwhile():
+    with OnlineDataset(OnlineRecipe(), capacity=4, warm=4, uses=8.0) as online:
+        stream = AugmentedStream(online, Augment(Crop((1, 1))), seed=0)
+        given = list(itertools.islice(stream, 24))
+        assert all(sample["transient"].shape[-2:] == (1, 1) for sample in given)
+        assert all((sample["transient"] == sample["index"]).all() for sample in given)
+        assert stream.drawn >= 24
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda data: Augmented(TransientStream(data), Augment(Flip())), SceneError, "AugmentedStream"),
+        (lambda data: AugmentedStream([1], Augment(Flip())), SceneError, "expected a stream.*Augmented"),
+        (lambda data: AugmentedStream(TransientStream(data), "flip"), SceneError, "expected an Augment"),
+        (lambda data: AugmentedStream(TransientStream(data), Augment(Flip()), seed=-1), UnitError, "seed"),
+        (lambda data: Augmented([1], Augment(Flip()), seed=0.5), UnitError, "seed"),
+        (lambda data: AugmentedStream(TransientStream(data), Augment(Flip())).nothing, AttributeError, "nothing"),
+    ],
+)
+def test_what_it_refuses(data, call, error, message):
+    with pytest.raises(error, match=message):
+        call(data)
+
+
+def test_a_seed_needs_an_index():
+    class Unnumbered(torch.utils.data.IterableDataset):
+        def __iter__(self):
+            yield {"depth": torch.ones(2, 2)}
+
+    assert len(list(AugmentedStream(Unnumbered(), Augment(Flip())))) == 1
+    with pytest.raises(SceneError, match="index"):
+        list(AugmentedStream(Unnumbered(), Augment(Flip()), seed=0))
