@@ -59,6 +59,8 @@ def test_a_state_of_another_order():
             other.load_state_dict(state)
     with pytest.raises(StorageError, match="expected the order"):
         Batches(10, 4).load_state_dict({})
+    with pytest.raises(StorageError, match="expected a state"):
+        Batches(10, 4).load_state_dict(None)
 
 
 def test_its_loader_leaves_random_numbers_alone():
@@ -122,6 +124,13 @@ def test_places_are_apart_where_numbers_come_twice():
     assert len(set(samples)) < 8 == len(set(seeds(1, batches.places(1))))
     parts = [Batches(12, 8, rank=rank, world_size=2).places(1) for rank in (0, 1)]
     assert parts[0] + parts[1] == batches.places(1)
+
+
+def test_large_seeds_and_few_workers():
+    batches = Batches(3, 1, seed=2**64)
+    assert next(iter(batches.loader([1.0, 2.0, 3.0]))) == batches.samples(0)[0] + 1
+    with pytest.raises(UnitError, match="workers"):
+        batches.loader([1.0, 2.0, 3.0], workers=-1)
 
 
 @pytest.mark.parametrize("options", [{"num_workers": 2}, {"batch_size": 3}, {"shuffle": True}])

@@ -360,3 +360,41 @@ def test_generators_are_those_of_every_rank(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "_size", lambda: 2)
     with pytest.raises(StorageError, match="a generator of each of 1 ranks, expected 2"):
         load_checkpoint(path, {"noise": noise}, random=False)
+
+
+class _Converted(nn.Linear):
+    """Its weights of version 1 were transposed."""
+
+    _version = 2
+
+    def __init__(self):
+        super().__init__(2, 2, bias=False)
+
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *others):
+        if local_metadata.get("version", 1) < 2:
+            state_dict[prefix + "weight"] = state_dict[prefix + "weight"].T
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *others)
+
+
+def test_versions_of_modules_come_along(tmp_path):
+    path, module, other = tmp_path / "run.pt", _Converted(), _Converted()
+    save_checkpoint(path, {"m": nn.Sequential(module)}, step=0)
+    load_checkpoint(path, {"m": nn.Sequential(other)})
+    assert torch.equal(other.weight, module.weight)
+
+
+def test_what_cannot_be_written_or_read(tmp_path):
+    path, itself = tmp_path / "run.pt", []
+    itself.append(itself)
+    for where, parts, values, message in (
+        (path, {}, [1, 2], "values as a dictionary"),
+        (path, {}, {"a": itself}, "hold themselves"),
+        (path, {"m": nn.LazyLinear(2)}, {}, "has no shape yet"),
+        (".", {}, {}, "no name of a file"),
+        (tmp_path, {}, {}, "cannot be written"),
+    ):
+        with pytest.raises(StorageError, match=message):
+            save_checkpoint(where, parts, step=0, values=values)
+    save_checkpoint(path, {"m": tiny(1.0).double()}, step=0)
+    with pytest.raises(ShapeError, match=r"expected torch\.float32, the file has torch\.float64"):
+        load_checkpoint(path, {"m": tiny()})

@@ -94,6 +94,7 @@ class Batches(Sampler[list[int]]):
         batches, the rank, and the position at which the loader was made, and begins anew with each iterator: give noise
         a seed of its own, as ``TransientDataset(seed=)`` does. ``options``: others of the DataLoader. Raises UnitError.
         """
+        processes = count(f"{_WHAT}: workers", workers, 0, UnitError)
         if isinstance(data, IterableDataset):
             raise UnitError(
                 f"{_WHAT}: expected a map-style data set, got {shown(data)}, which has an order of its own; use "
@@ -106,9 +107,9 @@ class Batches(Sampler[list[int]]):
         if size != self.size:
             raise UnitError(f"{_WHAT}: they are of {self.size} samples, the data set has {size}.")
         own: dict[str, Any] = {"generator": self._of_workers()}
-        if workers and renders:
+        if processes and renders:
             own |= {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
-        return DataLoader(data, batch_sampler=self, num_workers=workers, **{**own, **options})
+        return DataLoader(data, batch_sampler=self, num_workers=processes, **{**own, **options})
 
     def epoch(self, step: int) -> float:
         """How many times the data set has been gone through when a step begins."""
@@ -134,6 +135,8 @@ class Batches(Sampler[list[int]]):
 
     def check_state_dict(self, state: dict[str, Any]) -> None:
         """Raise what :meth:`load_state_dict` would, and change nothing."""
+        if not isinstance(state, dict):
+            raise StorageError(f"{_WHAT}: expected a state as of state_dict(), got {shown(state)}.")
         order = {name: value for name, value in state.items() if name != "step"}
         if order != self._order() or "step" not in state:
             raise StorageError(

@@ -137,9 +137,18 @@ def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[st
         "version": _VERSION,
         "step": count("save_checkpoint: step", step, 0, UnitError),
         "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
-        "values": plain(dict(values or {}), "values"),
+        "values": _plain_values(values),
         "libraries": _libraries(),
     }
+
+
+def _plain_values(values: Any) -> Any:
+    if values is not None and not isinstance(values, Mapping):
+        raise StorageError(f"save_checkpoint: expected values as a dictionary from names, got {shown(values)}.")
+    try:
+        return plain(dict(values or {}), "values")
+    except RecursionError:
+        raise StorageError("save_checkpoint: values hold themselves, or are nested too deeply.") from None
 
 
 def _named(parts: Any, who: str) -> dict[str, Any]:
@@ -208,6 +217,11 @@ def _check(name: str, part: Any, state: Any, is_same_torch: bool) -> None:
                 raise ShapeError(
                     f"load_checkpoint: {key!r} of {name!r}: expected shape {tuple(tensor.shape)}, the file has {came}."
                 )
+            if known and tensor.dtype != state[key].dtype:
+                raise ShapeError(
+                    f"load_checkpoint: {key!r} of {name!r}: expected {tensor.dtype}, the file has {state[key].dtype}; "
+                    "load into a module of that precision, and convert it afterwards."
+                )
 
 
 def _put_back(name: str, part: Any, state: Any) -> None:
@@ -231,6 +245,8 @@ def _put_back(name: str, part: Any, state: Any) -> None:
 
 def _written(path: Path, content: dict[str, Any]) -> Exception | None:
     """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
+    if not path.name:
+        return OSError(f"{os.fspath(path)!r} is no name of a file")
     part = path.with_name(path.name + ".part")
     try:
         _write(path, part, content)
