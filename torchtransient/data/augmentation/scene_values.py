@@ -23,8 +23,8 @@ UNAFFECTED = frozenset(
         "alpha", "alpha_u", "alpha_v", "roughness", "longitudinal_roughness", "azimuthal_roughness", "eumelanin",
         "pheomelanin", "sigma_a", "eta", "k", "int_ior", "ext_ior", "material", "delta", "lifetime", "albedo",
         "sigma_t", "scale", "g", "radiance", "intensity", "irradiance", "energy", "sky_scale", "sun_scale", "turbidity",
-        "temperature", "cutoff_angle", "beam_width", "radius", "aperture_radius", "focus_distance", "near_clip",
-        "far_clip",
+        "temperature", "wavelengths", "cutoff_angle", "beam_width", "radius", "aperture_radius", "focus_distance",
+        "near_clip", "far_clip",
     )
 )  # fmt: skip
 # Pictures of these are thrown by a projector, and lie in its frame.
@@ -35,7 +35,8 @@ OF_THE_WORLD = frozenset(
         "position", "positions", "direction", "center", "p0", "p1", "vertex_positions", "vertex_normals",
         "vertex_texcoords", "control_points", "data", "grid", "extent", "opacities", "value", "values", "sun_direction",
         "theta", "left_handed", "normalmap", "nested_texture", "texture", "S", "to_uv", "filename", "bsdf",
-        "scale_tilt", *_THROWN,
+        "scale_tilt", "volume", "color0", "color1", "latitude", "longitude", "timezone", "year", "month", "day", "hour",
+        "minute", "second", *_THROWN,
     )
 )  # fmt: skip
 # A camera may have them, and everything else.
@@ -51,7 +52,7 @@ OF_DEVICES = frozenset(
         "repetition_rate_hz", "exposure_s", "quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz",
         "full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits",
         "black_level_dn", "shot_noise", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins", "f_number",
-        "transmission", "pixel_area_m2", "solid_angle_sr",
+        "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
     )
 )  # fmt: skip
 # Under which plugins keep the numbers of a texture, spectrum or volume.
