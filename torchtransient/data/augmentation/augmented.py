@@ -40,7 +40,7 @@ class Augmented(Dataset[Any]):
 
     def sample(self, number: int, epoch: int | None = None) -> Any:
         """A sample; ``epoch`` tells the maps of one epoch from those of another, and the noise of a data set of this
-        library that has a seed of its own.
+        library that has a seed of its own; None is 0.
         """
         place = sample_number("Augmented", number, len(self.dataset))
         generator = sample_generator("Augmented", self.seed, place, epoch)

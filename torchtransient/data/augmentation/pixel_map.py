@@ -42,8 +42,7 @@ class PixelMap:
             raise ShapeError(
                 f"PixelMap: expected an affine matrix (3, 3), its last row 0, 0, 1, got {shown(self.matrix)}."
             )
-        determinant = np.linalg.det(matrix)
-        if not np.isfinite(matrix).all() or abs(determinant) < 1e-6:
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
             raise UnitError(f"PixelMap: expected a matrix with an inverse, got {matrix.tolist()}.")
         object.__setattr__(self, "matrix", matrix)
         for name in ("size", "new_size"):

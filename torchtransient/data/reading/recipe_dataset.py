@@ -70,7 +70,7 @@ class RecipeDataset(Dataset[dict[str, Any]]):
         return self.sample(number)
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
-        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another."""
+        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""
         index = self.first + sample_number(_WHAT, number, self.size)
         generator = sample_generator(_WHAT, self.seed, index, epoch)
         if self._maker is None:

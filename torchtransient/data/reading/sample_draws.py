@@ -33,7 +33,7 @@ def checked_seed(what: str, seed: Any) -> int | None:
 
 
 def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None, *more: int) -> torch.Generator | None:
-    """The generator of one sample in one epoch; None without a seed. Raises UnitError for what is no epoch."""
+    """The generator of one sample in one epoch, None being 0; none without a seed. Raises UnitError for others."""
     places = [] if epoch is None else [count(f"{what}: epoch", epoch, 0, UnitError)]
     if seed is None:
         return None

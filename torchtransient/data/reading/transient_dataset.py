@@ -99,7 +99,7 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return torch.from_numpy(self._table.shard.copy())
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
-        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another."""
+        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""
         number = sample_number(WHAT, number, len(self._table))
         place, row = int(self._table.shard[number]), int(self._table.row[number])
         shard = self._table.open(place)
