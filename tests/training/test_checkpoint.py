@@ -247,7 +247,116 @@ def test_states_are_data(tmp_path):
 
 def test_a_part_that_does_not_take_its_state(tmp_path):
     path, model = tmp_path / "run.pt", tiny()
-    save_checkpoint(path, {"optimizer": torch.optim.SGD(model.parameters())}, step=0)
-    other = torch.optim.SGD([{"params": [model.weight]}, {"params": [model.bias]}])
+    save_checkpoint(path, {"optimizer": _Kept({"a": 1})}, step=0)
+
+    class Other(_Kept):
+        def load_state_dict(self, state):
+            raise KeyError("b")
+
+    other = Other({"b": model})
     with pytest.raises(StorageError, match=r"'optimizer' does not take its state: .*made anew"):
         load_checkpoint(path, {"optimizer": other})
+
+
+def test_a_full_disk(tmp_path):
+    """Torch's writer has an error of its own for what the system refuses in the middle of a file."""
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))
+    try:
+        with pytest.raises(StorageError, match="cannot be written"):
+            save_checkpoint(path, {"model": nn.Linear(600, 600)}, step=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert load_checkpoint(path, {"model": tiny()}).step == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["run.pt"]
+
+
+def test_numbers_of_other_kinds(tmp_path):
+    path = tmp_path / "run.pt"
+    values = {"big": np.arange(3, dtype=">f4"), "part": np.arange(8)[::-2], "words": np.uint32([7])}
+    values["no"] = np.bool_(True)
+    save_checkpoint(path, {}, step=0, values=values)
+    found = load_checkpoint(path, {}).values
+    assert found["big"].tolist() == [0.0, 1.0, 2.0] and found["part"].tolist() == [7, 5, 3, 1]
+    assert found["words"].tolist() == [7] and found["no"] is True
+    for odd in (np.longdouble(1), np.datetime64("2020-01-01"), np.arange(3, dtype=np.longdouble), np.array(["a"])):
+        with pytest.raises(StorageError, match=r"values\['odd'\] is a"):
+            save_checkpoint(path, {}, step=0, values={"odd": odd})
+
+
+def test_lazy_modules(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": nn.Linear(3, 2)}, step=1)
+    lazy = nn.LazyLinear(2)
+    load_checkpoint(path, {"model": lazy})
+    assert lazy.weight.shape == (2, 3)
+
+
+def stepped(kind, model, **options):
+    """An optimiser that has made a step."""
+    optimizer = kind(model.parameters(), lr=0.1, **options)
+    model(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    return optimizer
+
+
+def test_what_one_part_refuses_changes_no_other(tmp_path):
+    """Also what torch would take, and fail with at the next step."""
+    path, donor = tmp_path / "run.pt", tiny(1.0)
+    adam = stepped(torch.optim.Adam, donor)
+    weight = float(donor.weight[0, 0].detach())
+    save_checkpoint(path, {"model": donor, "other": adam, "batches": Batches(10, 4)}, step=1)
+    model, order = tiny(3.0), Batches(10, 4)
+    wide, extra = nn.Linear(3, 1), nn.Linear(1, 1)
+    split = [{"params": [model.weight]}, {"params": [model.bias]}]
+    wrong = [
+        (torch.optim.Adam(model.parameters()), Batches(10, 5), StorageError, "repeat some samples"),
+        (torch.optim.SGD(model.parameters()), order, StorageError, "another kind of optimiser, it lacks .*momentum"),
+        (torch.optim.Adam(wide.parameters()), order, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
+        (torch.optim.Adam(split), order, StorageError, r"groups of \[2\] parameters in the file, here of \[1, 1\]"),
+        (torch.optim.Adam([*model.parameters(), *extra.parameters()]), order, StorageError, r"here of \[4\]"),
+    ]
+    for optimizer, batches, error, message in wrong:
+        with pytest.raises(error, match=message):
+            load_checkpoint(path, {"model": model, "other": optimizer, "batches": batches})
+        assert model.weight[0, 0] == 3.0
+    right = torch.optim.Adam(model.parameters())
+    load_checkpoint(path, {"model": model, "other": right, "batches": order})
+    assert float(model.weight[0, 0].detach()) == weight and right.state_dict()["state"].keys() == {0, 1}
+
+
+def test_random_numbers_of_other_devices_change_nothing(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    content = torch.load(path, weights_only=True)
+    content["random"][0]["cuda"] = [torch.zeros(16, dtype=torch.uint8)] * (torch.cuda.device_count() + 1)
+    torch.save(content, path)
+    model = tiny(3.0)
+    with pytest.raises(StorageError, match="CUDA devices"):
+        load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 3.0
+
+
+def test_compiled_modules_are_stored_as_they_were(tmp_path):
+    path, model = tmp_path / "run.pt", tiny(3.0)
+    save_checkpoint(path, {"model": torch.compile(tiny(1.0))}, step=1)
+    load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 1.0
+    save_checkpoint(path, {"model": model}, step=1)
+    other = tiny(3.0)
+    load_checkpoint(path, {"model": torch.compile(other)})
+    assert other.weight[0, 0] == 1.0
+
+
+def test_generators_are_those_of_every_rank(tmp_path, monkeypatch):
+    path, noise = tmp_path / "run.pt", torch.Generator().manual_seed(1)
+    save_checkpoint(path, {"noise": noise}, step=1)
+    expected = torch.rand(1, generator=noise)
+    load_checkpoint(path, {"noise": noise})
+    assert torch.equal(torch.rand(1, generator=noise), expected)
+    monkeypatch.setattr(checkpoint, "_size", lambda: 2)
+    with pytest.raises(StorageError, match="a generator of each of 1 ranks, expected 2"):
+        load_checkpoint(path, {"noise": noise}, random=False)

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_number
+from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.quantities import as_number, shown
 
 Part = TypeVar("Part")
 
@@ -32,20 +32,26 @@ def accumulate(
     but for the order of float sums. ::
 
         optimizer.zero_grad()
-        loss = tt.training.accumulate(lambda view: loss_fn(renderer(seed=view), measured[view]), range(8))
+        loss = tt.training.accumulate(lambda view: loss_fn(renderer({POSE: poses[view]}), measured[view]), range(8))
         optimizer.step()
 
-    ``loss_of``: gives a scalar tensor. ``weights``: one for each part; None takes 1 / number of parts, which gives the
-    gradient of a mean over parts of one size. Parts of other sizes of a mean over samples: ``[len(p) / total ...]``.
+    ``loss_of``: gives a scalar tensor. ``parts``: any iterable that ends. ``weights``: one for each part; None takes
+    1 / number of parts, which gives the gradient of a mean over parts of one size. Parts of other sizes of a mean over
+    samples: ``[len(p) / total ...]``.
     ``model``: a DistributedDataParallel, whose ranks exchange gradients once, at the last part, instead of at each one.
     ``scaler``: scales losses before they are differentiated; the sum that is returned is not scaled.
 
     Raises ShapeError for no parts, weights that do not match them and losses that are no scalars, UnitError for weights
-    that are not finite. Nothing has been differentiated then, except by parts that came before the wrong loss.
+    that are not finite, GradientError for a loss without a gradient. Nothing has been differentiated then, except by
+    parts that came before the wrong loss.
     """
+    if not isinstance(parts, Iterable):
+        raise ShapeError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.")
     listed = list(parts)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
+    if weights is not None and not isinstance(weights, Iterable):
+        raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {shown(weights)}.")
     shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
     if len(shares) != len(listed):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
@@ -57,14 +63,20 @@ def accumulate(
         # The forward pass stands inside: DDP prepares there for what its backward pass does.
         with _no_exchange(model) if waits else nullcontext():
             loss = loss_of(part)
-            if not isinstance(loss, torch.Tensor) or loss.numel() != 1:
-                came = f"shape {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
-                raise ShapeError(f"accumulate: expected the loss of a part as one number in a tensor, got {came}.")
-            scaled = loss.reshape(()) * share
+            if not isinstance(loss, torch.Tensor) or loss.numel() != 1 or loss.is_complex():
+                came = f"{loss.dtype} {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
+                raise ShapeError(f"accumulate: expected the loss of a part as one real number in a tensor, got {came}.")
+            if not loss.requires_grad:
+                raise GradientError(
+                    "accumulate: the loss of a part depends on nothing that has a gradient; parameters need "
+                    "requires_grad=True, and loss_of may not detach or run under torch.no_grad."
+                )
+            # A share of a small loss may be nothing in half precision.
+            scaled = loss.reshape(()).to(torch.promote_types(loss.dtype, torch.float32)) * share
             (scaled if scaler is None else scaler.scale(scaled)).backward()  # type: ignore[no-untyped-call]
             values.append(scaled.detach())
             del loss, scaled
-    return math.fsum(float(value) for value in values)
+    return sum(float(value) for value in values)
 
 
 def _no_exchange(model: Any) -> Any:

@@ -7,6 +7,7 @@ import pickle
 import warnings
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -16,11 +17,13 @@ import torch
 import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
+from torch.nn.parameter import is_lazy
 
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.quantities import count, shown
+from torchtransient.training.optimizer_states import check_optimizer
 from torchtransient.training.plain_state import plain
-from torchtransient.training.random_states import random_state, set_random_state
+from torchtransient.training.random_states import check_random_state, random_state, set_random_state
 
 _FORMAT, _VERSION = "torchtransient checkpoint", 1
 _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries")
@@ -49,39 +52,37 @@ def save_checkpoint(
         tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
 
     ``parts``: by name, whatever has ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
-    GradScaler, :class:`Batches`), and generators of torch. A DistributedDataParallel is stored as its module, so that
-    the checkpoint can be read with and without it. ``step``: steps that are done. ``values``: plain data (numbers,
-    texts, tensors, lists, dictionaries) that come back. Beside them: the random numbers of Python, NumPy, torch and
-    CUDA of this process, and versions of libraries.
+    GradScaler, :class:`Batches`), and generators of torch. What DistributedDataParallel or ``torch.compile`` has
+    wrapped is stored as what it was, so that the checkpoint can be read with and without. ``step``: steps that are
+    done. ``values``: plain data (numbers, texts, tensors, lists, dictionaries) that come back. Beside them: the random
+    numbers of Python, NumPy, torch and CUDA of this process, and versions of libraries.
 
     Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a run is killed,
     ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and the first one
-    writes; parts are its own, random numbers those of every rank.
+    writes; parts are its own, random numbers and generators those of every rank.
 
     Not in it: what the network's data come from beyond their position, buffers that modules do not put into their
     state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
     executing something, and where nothing can be written.
     """
-    number = count("save_checkpoint: step", step, 0, UnitError)
-    states = {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()}
-    content = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "step": number,
-        "parts": states,
-        "values": plain(dict(values or {}), "values"),
-        "random": _of_all_ranks(random_state()),
-        "libraries": _libraries(),
-    }
-    failure: str | None = None
-    if _rank() == 0:
-        try:
-            _write(Path(path), content)
-        except OSError as error:
-            failure = str(error)
-    failure = _told_by_first(failure)
+    failure: str | None = "its parts or values are no state; see its own error."
+    # All ranks learn what went wrong in one of them: none is left waiting for the others.
+    try:
+        content = _content(parts, step, values)
+        failure = None
+    finally:
+        own_generators = {name: one.get_state() for name, one in _generators(parts).items()}
+        told = _of_all_ranks({"random": random_state(), "generators": own_generators, "failure": failure})
+    failures = [f"rank {rank}: {one['failure']}" for rank, one in enumerate(told) if one["failure"] is not None]
+    if failures:
+        raise StorageError(f"save_checkpoint: {os.fspath(path)} was not written. {' '.join(failures)}")
+    content["random"] = [one["random"] for one in told]
+    for name in _generators(parts):
+        content["parts"][name]["generators"] = [one["generators"].get(name) for one in told]
+    own = _written(Path(path), content) if _rank() == 0 else None
+    failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}")
+        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
@@ -96,7 +97,9 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
 
     Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
-    its sums, format, names of parts, and names and shapes of the tensors of modules. Every rank reads it. Raises
+    its sums, format, names of parts, names and shapes of the tensors of modules, groups, settings and moments of
+    optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they have
+    one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises
     StorageError for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
     """
     given, where = _named(parts, "load_checkpoint"), os.fspath(path)
@@ -107,12 +110,14 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
             f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
         )
     for name, part in given.items():
-        _check(name, part, states[name])
+        _check(name, part, states[name], content["libraries"].get("torch") == version("torch"))
     if random and ranks != _size():
         raise StorageError(
             f"load_checkpoint: {where} has the random numbers of {ranks} ranks, expected those of {_size()}. Start as "
             "many, or use random=False."
         )
+    if random:
+        check_random_state(content["random"][_rank()])
     _compare(where, content["libraries"])
     for name, part in given.items():
         _put_back(name, part, states[name])
@@ -125,6 +130,18 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
 # ------------------------------------------------------------------------------------------------------------ parts
 
 
+def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[str, Any]:
+    """All of a checkpoint but the random numbers."""
+    return {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "step": count("save_checkpoint: step", step, 0, UnitError),
+        "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
+        "values": plain(dict(values or {}), "values"),
+        "libraries": _libraries(),
+    }
+
+
 def _named(parts: Any, who: str) -> dict[str, Any]:
     if not isinstance(parts, Mapping) or not all(isinstance(name, str) for name in parts):
         raise StorageError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
@@ -132,13 +149,25 @@ def _named(parts: Any, who: str) -> dict[str, Any]:
 
 
 def _inner(part: Any) -> Any:
-    return part.module if isinstance(part, DistributedDataParallel) else part
+    """What DistributedDataParallel or torch.compile has wrapped; they share its state, under other names."""
+    while True:
+        if isinstance(part, DistributedDataParallel):
+            part = part.module
+        elif isinstance(part, nn.Module) and isinstance(getattr(part, "_orig_mod", None), nn.Module):
+            part = part._orig_mod
+        else:
+            return part
+
+
+def _generators(parts: Any) -> dict[str, torch.Generator]:
+    found = parts.items() if isinstance(parts, Mapping) else ()
+    return {name: part for name, part in found if isinstance(part, torch.Generator)}
 
 
 def _state_of(name: str, part: Any) -> Any:
     part = _inner(part)
     if isinstance(part, torch.Generator):
-        return {"generator": part.get_state(), "device": part.device.type}
+        return {"device": part.device.type}
     if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
         raise StorageError(
             f"save_checkpoint: expected the part {name!r} to have state_dict and load_state_dict, or to be a generator "
@@ -147,12 +176,21 @@ def _state_of(name: str, part: Any) -> Any:
     return plain(part.state_dict(), name)
 
 
-def _check(name: str, part: Any, state: Any) -> None:
+def _check(name: str, part: Any, state: Any, is_same_torch: bool) -> None:
     """What can be told before anything is changed."""
     part = _inner(part)
     if isinstance(part, torch.Generator):
-        if not isinstance(state, dict) or state.get("device") != part.device.type or "generator" not in state:
+        if not isinstance(state, dict) or state.get("device") != part.device.type or "generators" not in state:
             raise StorageError(f"load_checkpoint: the part {name!r} is no state of a generator on {part.device.type}.")
+        if len(state["generators"]) != _size():
+            raise StorageError(
+                f"load_checkpoint: the part {name!r} is a generator of each of {len(state['generators'])} ranks, "
+                f"expected {_size()}. Start as many, or draw by Seeds.generator, which needs no state."
+            )
+    elif isinstance(part, torch.optim.Optimizer):
+        check_optimizer(name, part, state, is_same_torch)
+    elif hasattr(part, "check_state_dict"):
+        part.check_state_dict(state)
     elif isinstance(part, nn.Module):
         expected = part.state_dict()
         if not isinstance(state, dict) or state.keys() != expected.keys():
@@ -163,7 +201,9 @@ def _check(name: str, part: Any, state: Any) -> None:
                 f"{', '.join(lacks) or 'nothing'} and has {', '.join(map(str, has)) or 'nothing'} beyond."
             )
         for key, tensor in expected.items():
-            if isinstance(tensor, torch.Tensor) and tensor.shape != getattr(state[key], "shape", None):
+            # Lazy modules have no shapes yet.
+            known = isinstance(tensor, torch.Tensor) and not is_lazy(tensor)
+            if known and tensor.shape != getattr(state[key], "shape", None):
                 came = tuple(getattr(state[key], "shape", ()))
                 raise ShapeError(
                     f"load_checkpoint: {key!r} of {name!r}: expected shape {tuple(tensor.shape)}, the file has {came}."
@@ -174,23 +214,34 @@ def _put_back(name: str, part: Any, state: Any) -> None:
     part = _inner(part)
     try:
         if isinstance(part, torch.Generator):
-            part.set_state(state["generator"])
+            part.set_state(state["generators"][_rank()])
         else:
             part.load_state_dict(state)
     except TorchTransientError:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise StorageError(
-            f"load_checkpoint: the part {name!r} does not take its state: {error}. It and what follows it have to be "
-            "made anew."
+            f"load_checkpoint: the part {name!r} does not take its state: {error}. All parts have to be made anew: "
+            "those before it have theirs already."
         ) from error
 
 
 # ------------------------------------------------------------------------------------------------------------- file
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
+def _written(path: Path, content: dict[str, Any]) -> Exception | None:
+    """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
     part = path.with_name(path.name + ".part")
+    try:
+        _write(path, part, content)
+    except (OSError, RuntimeError) as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        return error
+    return None
+
+
+def _write(path: Path, part: Path, content: dict[str, Any]) -> None:
     with open(part, "wb") as file:
         torch.save(content, file)
         file.flush()
