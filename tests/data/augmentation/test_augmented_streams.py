@@ -11,7 +11,16 @@ from torch.utils.data import DataLoader
 
 from support.online_recipe import OnlineRecipe
 from support.stored_samples import folder
-from torchtransient.data import Augment, Augmented, AugmentedStream, Crop, Flip, OnlineDataset, TransientStream
+from torchtransient.data import (
+    Augment,
+    Augmented,
+    AugmentedStream,
+    Crop,
+    Flip,
+    OnlineDataset,
+    TransientDataset,
+    TransientStream,
+)
 from torchtransient.errors import SceneError, UnitError
 
 N = 11
@@ -81,6 +90,28 @@ def test_samples_that_are_rendered_meanwhile():
         assert stream.drawn >= 24
 
 
+class Numbered(torch.utils.data.IterableDataset):
+    def __init__(self, index):
+        self.index = index
+
+    def __iter__(self):
+        yield {"index": self.index, "depth": torch.ones(2, 2)}
+
+
+def noisy(light, generator=None):
+    return light + torch.rand(light.shape, generator=generator)
+
+
+def test_an_epoch_is_one_of_the_data_set_too(data):
+    """Else each epoch would turn the same noise."""
+    stored = TransientDataset(data, fields=["depth"], transform=noisy, seed=1)
+    augmented = Augmented(stored, Augment(Flip(p=0.0)), seed=2)
+    for epoch in (None, 0, 1):
+        assert torch.equal(augmented.sample(3, epoch)["measurement"], stored.sample(3, epoch)["measurement"])
+    assert not torch.equal(augmented.sample(3, 0)["measurement"], augmented.sample(3, 1)["measurement"])
+    assert torch.equal(augmented[3 - N]["measurement"], augmented[3]["measurement"])
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -89,6 +120,15 @@ def test_samples_that_are_rendered_meanwhile():
         (lambda data: AugmentedStream(TransientStream(data), "flip"), SceneError, "expected an Augment"),
         (lambda data: AugmentedStream(TransientStream(data), Augment(Flip()), seed=-1), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=0.5), UnitError, "seed"),
+        (lambda data: Augmented([1], Augment(Flip()), seed=-1), UnitError, "seed"),
+        (lambda data: Augmented(3, Augment(Flip())), SceneError, "samples by number"),
+        (lambda data: Augmented([1], Augment(Flip()), seed=0).sample(0, -1), UnitError, "epoch"),
+        (lambda data: Augmented([1], Augment(Flip())).sample(0, 0.5), UnitError, "epoch"),
+        (lambda data: Augmented([1, 2], Augment(Flip()))[1.7], IndexError, "from 0 to 1"),
+        (lambda data: Augmented([1, 2], Augment(Flip()))[2], IndexError, "from 0 to 1"),
+        (lambda data: Augmented([], Augment(Flip()))[0], IndexError, "number"),
+        (lambda data: next(iter(AugmentedStream(Numbered("a"), Augment(Flip()), seed=0))), SceneError, "index"),
+        (lambda data: next(iter(AugmentedStream(Numbered(-1), Augment(Flip()), seed=0))), SceneError, "index"),
         (lambda data: AugmentedStream(TransientStream(data), Augment(Flip())).nothing, AttributeError, "nothing"),
     ],
 )

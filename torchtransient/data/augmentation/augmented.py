@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import numpy as np
-import torch
 from torch.utils.data import Dataset, IterableDataset
 
 from torchtransient.data.augmentation.augment import Augment
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.data.reading.recipe_dataset import RecipeDataset
+from torchtransient.data.reading.sample_draws import checked_seed, sample_generator, sample_number
+from torchtransient.data.reading.transient_dataset import TransientDataset
+from torchtransient.errors import SceneError
 from torchtransient.quantities import count, shown
 
 
@@ -20,13 +21,16 @@ class Augmented(Dataset[Any]):
 
     ``seed``: each sample has a generator of its own, so that it comes out the same whoever reads it; None draws from
     torch's, anew each time. :meth:`sample` tells epochs apart. Pickles; for workers that were forked or spawned.
-    Raises SceneError.
+    Raises SceneError, UnitError for a seed or an epoch below zero, IndexError beyond the samples.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
         if isinstance(dataset, IterableDataset):
             raise SceneError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
-        self.dataset, self.augment, self.seed = dataset, _checked(augment, "Augmented"), _seed(seed, "Augmented")
+        if not hasattr(dataset, "__len__") or not hasattr(dataset, "__getitem__"):
+            raise SceneError(f"Augmented: expected a data set of samples by number, got {shown(dataset)}.")
+        self.dataset, self.augment = dataset, _checked(augment, "Augmented")
+        self.seed = checked_seed("Augmented", seed)
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -35,10 +39,14 @@ class Augmented(Dataset[Any]):
         return self.sample(number)
 
     def sample(self, number: int, epoch: int | None = None) -> Any:
-        """A sample; ``epoch`` tells the maps of one epoch from those of another."""
-        found = self.dataset[number]
-        place = number % max(len(self.dataset), 1)
-        return self.augment(found, generator=_generator(self.seed, place, *([] if epoch is None else [epoch])))
+        """A sample; ``epoch`` tells the maps of one epoch from those of another, and the noise of a data set of this
+        library that has a seed of its own; None is 0.
+        """
+        place = sample_number("Augmented", number, len(self.dataset))
+        generator = sample_generator("Augmented", self.seed, place, epoch)
+        has_epochs = isinstance(self.dataset, (Augmented, RecipeDataset, TransientDataset))
+        found = self.dataset.sample(place, epoch) if has_epochs else self.dataset[place]
+        return self.augment(found, generator=generator)
 
 
 class AugmentedStream(IterableDataset[Any]):
@@ -46,14 +54,15 @@ class AugmentedStream(IterableDataset[Any]):
 
     ``seed``: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
     often this iterator has given the sample before; samples without an ``index`` are a SceneError then. None draws from
-    torch's generator. What else the stream has (``set_epoch``, ``close``, ``made``) is found here, too.
+    torch's generator. What else the stream has (``set_epoch``, ``close``, ``made``) is found here, too. Raises
+    SceneError, UnitError for a seed below zero.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
         if not isinstance(dataset, IterableDataset):
             raise SceneError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
         self.dataset = dataset
-        self.augment, self.seed = _checked(augment, "AugmentedStream"), _seed(seed, "AugmentedStream")
+        self.augment, self.seed = _checked(augment, "AugmentedStream"), checked_seed("AugmentedStream", seed)
 
     def __iter__(self) -> Iterator[Any]:
         epoch, given = int(getattr(self.dataset, "epoch", 0)), Counter[int]()
@@ -62,8 +71,8 @@ class AugmentedStream(IterableDataset[Any]):
             if self.seed is not None:
                 if not isinstance(sample, Mapping) or "index" not in sample:
                     raise SceneError("AugmentedStream: expected samples with an 'index' for seed=; leave seed out.")
-                index = int(sample["index"])
-                generator = _generator(self.seed, index, epoch, given[index])
+                index = count("AugmentedStream: index", sample["index"], 0)
+                generator = sample_generator("AugmentedStream", self.seed, index, epoch, given[index])
                 given[index] += 1
             yield self.augment(sample, generator=generator)
 
@@ -77,14 +86,3 @@ def _checked(augment: Any, what: str) -> Augment:
     if not isinstance(augment, Augment):
         raise SceneError(f"{what}: expected an Augment, got {shown(augment)}.")
     return augment
-
-
-def _seed(seed: Any, what: str) -> int | None:
-    return None if seed is None else count(f"{what}: seed", seed, 0, UnitError)
-
-
-def _generator(seed: int | None, *places: int) -> torch.Generator | None:
-    if seed is None:
-        return None
-    key = np.random.SeedSequence([seed, *places])
-    return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))

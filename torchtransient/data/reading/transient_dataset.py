@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
+from torchtransient.data.reading.sample_draws import (
+    checked_seed,
+    sample_generator,
+    sample_number,
+    takes_generator,
+    transformed,
+)
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
@@ -41,7 +46,8 @@ class TransientDataset(Dataset[dict[str, Any]]):
     ``as_stored``: counts in the type that they are stored in, not as float32.
 
     Files are opened when they are first read, in every process anew: it can be pickled, and read by workers that were
-    forked or spawned. Raises StorageError for what cannot be read, or does not belong together.
+    forked or spawned. Raises StorageError for what cannot be read, or does not belong together, UnitError for a
+    seed or an epoch below zero, and IndexError beyond the samples.
     """
 
     def __init__(
@@ -58,9 +64,9 @@ class TransientDataset(Dataset[dict[str, Any]]):
         self._timed = measured_names(self.about)
         self._size = image_size(shapes, self._timed)
         self._pixels = pixels_of(pixels, self._size)
-        self.transform, self.as_stored, self.seed = transform, bool(as_stored), seed
+        self.transform, self.as_stored, self.seed = transform, bool(as_stored), checked_seed(WHAT, seed)
         self._fields = self._read_fields(fields, shapes)
-        if seed is not None and not _takes_generator(transform):
+        if seed is not None and not takes_generator(transform):
             raise StorageError(
                 f"{WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
             )
@@ -93,17 +99,16 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return torch.from_numpy(self._table.shard.copy())
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
-        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another."""
-        size = len(self._table)
-        if isinstance(number, slice) or not -size <= number < size:
-            raise IndexError(f"{WHAT}: expected a number from 0 to {size - 1}, got {shown(number)}.")
+        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""
+        number = sample_number(WHAT, number, len(self._table))
         place, row = int(self._table.shard[number]), int(self._table.row[number])
         shard = self._table.open(place)
         found: dict[str, Any] = {name: self._read(shard, name, row) for name in self._fields if name != _VALUES}
         index = int(self._table.index[number])
         if self.transform is not None:
             given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
-            found[_MEASURED] = self._transformed(given, index, epoch)
+            generator = sample_generator(WHAT, self.seed, index, epoch)
+            found[_MEASURED] = transformed(self.transform, given, generator)
         if _VALUES in self._fields:
             values = shard.values(row)
             found[_VALUES] = {k: v if isinstance(v, str) else tensor_in(v) for k, v in values.items()}
@@ -137,20 +142,3 @@ class TransientDataset(Dataset[dict[str, Any]]):
         pixels = self._pixels if shape[-2:] == self._size else None
         array = shard.read(name, row, bins, pixels, as_stored=self.as_stored)
         return torch.from_numpy(array) if array.dtype.isnative else tensor_in(array)
-
-    def _transformed(self, transient: Tensor, index: int, epoch: int | None) -> Any:
-        assert self.transform is not None
-        with torch.no_grad():
-            if self.seed is None:
-                return self.transform(transient)
-            key = np.random.SeedSequence([abs(self.seed), index, *([] if epoch is None else [epoch])])
-            generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-            return self.transform(transient, generator=generator)
-
-
-def _takes_generator(transform: Any) -> bool:
-    function = transform.forward if isinstance(transform, torch.nn.Module) else transform
-    try:
-        return "generator" in inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        return False
