@@ -87,7 +87,9 @@ def measured(sigma: float, number: int, spad: bool) -> Tensor:
     """(1, T, 1, N) noisy records of the pulse at home."""
     g = torch.Generator().manual_seed(0)
     mean = mean_counts(*(torch.full((number,), x, dtype=torch.float64) for x in (HOME, PHOTONS)), sigma)
-    return sensing.SynchronousSPAD(CYCLES)(mean / CYCLES, generator=g) if spad else torch.poisson(mean, generator=g)
+    if spad:
+        return sensing.SynchronousSPAD(CYCLES).sample(mean / CYCLES, generator=g)
+    return torch.poisson(mean, generator=g)
 
 
 def values(case: tuple[Pixel, bool], place: Tensor, light: Tensor, sigma: float, target: Tensor) -> Tensor:

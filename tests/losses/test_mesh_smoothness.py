@@ -191,3 +191,20 @@ def test_wrong_meshes(loss):
         losses.MeshLaplacianSmoothing(weights="even")
     with pytest.raises(ShapeError, match="weights 'uniform' or 'cotangent'"):
         losses.mesh_laplacian_smoothing(vertices, RING, weights=1)
+
+
+@pytest.mark.slow
+@every
+def test_compiled(loss):
+    """The function and the module, values and gradients."""
+    vertices = wavy()
+    wanted, compiled_leaf = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
+    value = loss(wanted, RING)
+    value.backward()
+    for call in (loss, MESHES[loss]()):
+        torch.compiler.reset()
+        compiled_leaf.grad = None
+        found = torch.compile(call, backend="aot_eager")(compiled_leaf, RING)
+        found.backward()
+        torch.testing.assert_close(found, value)
+        torch.testing.assert_close(compiled_leaf.grad, wanted.grad)

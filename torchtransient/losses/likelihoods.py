@@ -119,7 +119,8 @@ def poisson_nll(
     """-log of the Poisson probability of `counts`: m - n log m (+ log n! with `constant`), m = mean + floor.
 
     `floor` None: 1e-3 of the average of each item (`relative_floor`), which biases empty bins by as much; 0: the exact
-    likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. Raises
+    likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. A mean
+    that is a noisy render biases a fit, by many times the noise of the counts (docs/noisy_renders.md). Raises
     ShapeError for different shapes, UnitError for negative means.
     """
     return _poisson(counts, mean, Options(floor, dim, mask, reduction, constant), "poisson_nll")
@@ -155,7 +156,7 @@ def poisson_loss(
     """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts.
 
     Biased where the mean is a Monte Carlo render, whose noise its logarithm turns into an error of the fit: take
-    `expected_root_loss`, or more samples at the end (docs/losses.md, Noisy renders).
+    squares over a variance that is no function of the render, or many samples at the end (docs/noisy_renders.md).
     """
     return _poisson(target, input, Options(floor, dim, mask, reduction), "poisson_loss")
 

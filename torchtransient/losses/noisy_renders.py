@@ -1,7 +1,7 @@
 """Losses of Monte Carlo renders: a loss that is not linear in a render is biased by the noise of that render.
 
 `E[f(render)] = f(E render) + f'' variance / 2 + ...`: a squared error grows by the variance, which the scene's
-parameters change, too. The product of the residuals of two independent renders does not (docs/losses.md).
+parameters change, too. The product of the residuals of two independent renders does not (docs/noisy_renders.md).
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def two_render_loss(
     `first` and `second`: two renders of the same scene with different seeds. Independent noise of both has no part in
     the mean, so that value and gradient are unbiased, at any number of samples: that of the squared error of a render
     without noise (of the same target: noise of the target stays). May be negative, as unbiased estimates of small
-    numbers are. Symmetric in the renders. Raises ShapeError, UnitError.
+    numbers are. Symmetric in the renders. Two renders in one call, and which loss when: docs/noisy_renders.md. Raises
+    ShapeError, UnitError.
     """
     where = "two_render_loss"
     check_reduction(reduction, where)

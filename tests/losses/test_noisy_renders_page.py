@@ -1,0 +1,61 @@
+"""docs/noisy_renders.md: its blocks run in the order that they stand in, its tables are the measured numbers."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchtransient import losses
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "noisy_renders.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+NUMBERS = ROOT / "benchmarks" / "results" / "noisy_renders.json"
+
+
+@pytest.fixture(scope="module")
+def names():
+    torch.manual_seed(0)
+    found: dict[str, object] = {}
+    for code in re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL):
+        exec(compile(code, str(PAGE), "exec"), found)
+    return found
+
+
+def test_its_blocks_say_what_noise_adds(names):
+    """The squared error of one render is above that of two by their variance, which is positive."""
+    assert float(names["squares"]) > 0 and float(names["noise"]) > 0
+    values = names["renderer"].values[names["key"]]
+    assert bool(torch.isfinite(values).all()) and bool(torch.isfinite(values.grad).all())
+
+
+def test_its_schedule_and_its_check(names):
+    assert names["schedule"](0) == 16 and names["schedule"](8) == names["schedule"].last > 16
+    significance = names["significance"]
+    assert significance.shape == (3,) and bool(torch.isfinite(significance).all())
+
+
+def test_its_names_are_there():
+    named = re.findall(r"`(?:tt\.losses\.)?([a-z_]+(?:_loss|_nll))\b", TEXT)
+    assert len(set(named)) > 8 and all(hasattr(losses, name) for name in named)
+    for name in re.findall(r"`((?:benchmarks|docs|training_examples)/\w+\.py)`", TEXT):
+        assert (ROOT / name).is_file()
+
+
+def test_its_tables_are_those_of_the_numbers():
+    maker = ROOT / "docs" / "make_noisy_render_page.py"
+    specification = importlib.util.spec_from_file_location("make_noisy_render_page", maker)
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    data = json.loads(NUMBERS.read_text(encoding="utf-8"))
+    assert not data["settings"]["quick"]
+    assert module.written(TEXT, data) == TEXT
+    # what the page says of them
+    least = data["least"]
+    squares, likelihood = least["`squared_loss`, weighted"], least["`poisson_loss`, `poisson_nll`"]
+    assert squares["exact"]["64"]["rms"] < 0.2 and likelihood["exact"]["64"]["rms"] > 1 > squares["own"]["rms"]
