@@ -31,21 +31,29 @@ MISFITS: dict[str, tuple[Misfit, int]] = {
 
 
 def stochastic(
-    scene: Scene, lines: Sequence[Linear], name: str, spp: Callable[[int], int], steps: int, copies: int, label: str
+    scene: Scene,
+    lines: Sequence[Linear],
+    names: tuple[str, ...],
+    spp: Callable[[int], int],
+    steps: int,
+    copies: int,
+    tail: int,
 ) -> dict[str, Any]:
-    """Adam from the truth to exact targets; the mean of the last third of the steps, `copies` of every truth.
+    """Adam from the truth to exact targets; the mean of the last `tail` steps, `copies` of every truth.
 
-    Steps are in units in which the best fit to one capture has a covariance of one.
+    `names`: the misfit, or one of the first two fifths of the steps and one of the others. Steps are in units in which
+    the best fit to one capture has a covariance of one.
     """
-    misfit, renders = MISFITS[name]
+    renders = max(MISFITS[name][1] for name in names)
     truth = torch.stack([line.truth for line in lines]).repeat_interleave(copies, 0).float()
     roots = torch.stack([torch.linalg.cholesky(line.covariance(range(6))) for line in lines])
     target = torch.stack([line.mean for line in lines]).repeat_interleave(copies, 0).float()
     variance, roots = target.clone(), roots.repeat_interleave(copies, 0).float()
     place = torch.zeros(len(truth), 6, requires_grad=True)
     optimizer = torch.optim.Adam([place], betas=(0.9, 0.98))
-    total, first, began = torch.zeros_like(place), 2 * steps // 3, time.process_time()
-    for step in tqdm(range(steps), desc=label, leave=False):
+    total, first, began = torch.zeros_like(place), steps - tail, time.process_time()
+    for step in tqdm(range(steps), desc=", then ".join(names), leave=False):
+        misfit = MISFITS[names[0 if step < 0.4 * steps else -1]][0]
         optimizer.param_groups[0]["lr"] = 0.4 * (1 - 0.9 * step / steps)
         found = truth + torch.einsum("bij,bj->bi", roots, place)
         seeds = range(10**7 + 10**4 * step, 10**7 + 10**4 * step + renders * len(truth))
@@ -77,17 +85,20 @@ def fits(scene: Scene, lines: Sequence[Linear], *, quick: bool) -> dict[str, Any
     constant += [("`poisson_loss`", 1024), ("`expected_root_loss`", 1024), ("`poisson_loss`", 16)]
     constant += [("`expected_root_loss`", 16), ("`squared_loss`, weighted", 16)]
     for name, spp in constant:
-        label = f"{name}, {spp}"
-        found[label] = stochastic(scene, lines, name, lambda _, spp=spp: spp, steps, copies, label)
-        tqdm.write(line_of(label, found[label]))
+        found[f"{name}, {spp}"] = stochastic(scene, lines, (name,), lambda _, spp=spp: spp, steps, copies, steps // 3)
+        tqdm.write(line_of(f"{name}, {spp}", found[f"{name}, {spp}"]))
     for name in ("`poisson_loss`", "`expected_root_loss`"):
-        schedule = losses.SampleSchedule(16, 1024, steps, hold=0.4)
-        label = f"{name}, 16 to 1024"
-        found[label] = stochastic(scene, lines, name, schedule, steps, copies, label)
-        tqdm.write(line_of(label, found[label]))
+        for least in (16, 64):
+            label, schedule = f"{name}, {least} to 1024", losses.SampleSchedule(least, 1024, steps, hold=0.4)
+            found[label] = stochastic(scene, lines, (name,), schedule, steps, copies, max(1, steps // 12))
+            tqdm.write(line_of(label, found[label]))
+    both = ("`expected_root_loss`", "`squared_loss`, weighted")
+    label = ", 16; then ".join(both) + ", 16"
+    found[label] = stochastic(scene, lines, both, lambda _: 16, steps, copies, steps // 3)
+    tqdm.write(line_of(label, found[label]))
     scene.renderer.grad_seed = "same"
     label = '`squared_loss`, weighted, 64, `grad_seed="same"`'
-    found[label] = stochastic(scene, lines, "`squared_loss`, weighted", lambda _: 64, steps, copies, label)
+    found[label] = stochastic(scene, lines, both[1:], lambda _: 64, steps, copies, steps // 3)
     scene.renderer.grad_seed = None
     tqdm.write(line_of(label, found[label]))
     return found

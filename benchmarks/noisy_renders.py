@@ -88,7 +88,7 @@ CASES = {
     '`squared_loss`, weighted, `grad_seed="same"`': Case(weighted, linear=True, same=True),
     "`two_render_loss`, weighted": Case(two_renders, linear=True, renders=2),
     "`transient_phasor_loss`, 0.2 to 1.6 per m": Case(plain(losses.transient_phasor_loss, AXIS, BAND), linear=True),
-    "the same, `phase_only`": Case(
+    "`transient_phasor_loss`, `phase_only`": Case(
         plain(losses.transient_phasor_loss, AXIS, BAND, phase_only=True, floor=1.0), free=SHAPE_ALONE
     ),
     "`multiscale_loss` of `squared_loss`": Case(plain(losses.multiscale_loss), linear=True, part=4),
@@ -182,7 +182,6 @@ def measure(
     found: dict[str, Any] = {
         "spread": float((torch.stack([s.std(0) for s in single])[:, free] / spread).square().mean().sqrt()),
         "own": summary(torch.stack(own, 1)[..., free], spread),
-        "captures": [(s[:, free] / wide).tolist() for s, wide in zip(single, spread, strict=True)],
     }
     for kind in ["exact"] if case.linear else ["counts", "exact"]:
         whole = kind == "exact"

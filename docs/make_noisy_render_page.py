@@ -1,6 +1,6 @@
 """Write the tables and the picture of docs/noisy_renders.md from benchmarks/results/noisy_renders.json.
 
-`python benchmarks/noisy_renders.py` measures them, half an hour of one core.
+`python benchmarks/noisy_renders.py` measures them, ten minutes of one core.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ TEXEL_BLOCK = 15
 
 @dataclass(frozen=True)
 class Sizes:
-    """Pixels, samples per pixel of the pictures and of a step, bounces, steps of the recovery."""
+    """Pixels, samples per pixel of the pictures and of a step, bounces, steps of the recovery, windows of time."""
 
     width: int
     height: int
@@ -46,6 +46,7 @@ class Sizes:
     spp_step: int
     max_depth: int
     steps: int
+    windows: int
 
 
 @dataclass
@@ -88,15 +89,14 @@ def window_slice(window: tuple[float, float]) -> slice:
     return slice(first, last)
 
 
-def window_gradients(scene: tt.Scene, key: str, sizes: Sizes) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def window_gradients(renderer: tt.TransientRenderer, key: str, sizes: Sizes) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """The texture (H, W, 3), and d(light of the whole picture in a window)/d(texel), summed over channels: (H, W) each.
 
     The loss is linear in the light, so its derivative does not depend on the render: one sample per pixel is enough
     there, and the samples go into the adjoint pass.
     """
-    renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
     gradients = []
-    for number, window in enumerate(tqdm(WINDOWS, desc="staircase: gradients", unit="window")):
+    for number, window in enumerate(tqdm(WINDOWS[: sizes.windows], desc="staircase: gradients", unit="window")):
         renderer.zero_grad()
         renderer(seed=number).transient[:, window_slice(window)].sum().backward()
         gradients.append(renderer.values[key].grad.sum(dim=-1))
@@ -196,11 +196,11 @@ def draw_gradients(texture: torch.Tensor, gradients: list[torch.Tensor], path: P
     """The floor's texture and, for every window of time, how much each texel adds to the light in it."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.5, 3.3), layout="constrained")
+    figure = Figure(figsize=(2.7 * (1 + len(gradients)), 3.3), layout="constrained")
     grid = figure.subplots(1, 1 + len(gradients))
     grid[0].imshow(colours(texture.permute(2, 0, 1)[:, ::3, ::3]))
     grid[0].set_title("texture of the floor", fontsize=10)
-    for axes, gradient, window in zip(grid[1:], gradients, WINDOWS, strict=True):
+    for axes, gradient, window in zip(grid[1:], gradients, WINDOWS[: len(gradients)], strict=True):
         smooth = avg_pool2d(gradient[None, None], 6)[0, 0]
         axes.imshow(smooth, cmap="magma", vmin=0, vmax=float(torch.quantile(smooth, 0.99).clamp_min(1e-12)))
         axes.set_title(f"d light({window[0]:.1f} to {window[1]:.1f} m) / d texel", fontsize=10)
@@ -239,22 +239,27 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
         "--max-depth", type=int, default=12, help="segments of a path; the scene's own is 65 (%(default)s)"
     )
     parser.add_argument("--steps", type=int, default=40, help="steps of Adam for the texture (%(default)s)")
+    parser.add_argument("--windows", type=int, default=len(WINDOWS), help="of time, for gradients (%(default)s)")
     parser.add_argument(
         "--output", type=Path, default=Path("demo_output"), help="folder for the pictures (%(default)s)"
     )
     parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
     if parser.parse_known_args(argv)[0].smoke:
-        parser.set_defaults(resolution=18, spp=8, spp_step=4, max_depth=4, steps=2)
+        # Most of a small run is compiled code: a window more is a kernel more.
+        parser.set_defaults(resolution=18, spp=8, spp_step=4, max_depth=4, steps=1, windows=1)
     options = parser.parse_args(argv)
     height = options.resolution * 16 // 9
-    sizes = Sizes(options.resolution, height, options.spp, options.spp_step, options.max_depth, options.steps)
+    steps = (options.spp_step, options.max_depth, options.steps, options.windows)
+    sizes = Sizes(options.resolution, height, options.spp, *steps)
     with tempfile.TemporaryDirectory() as folder:
         path = unpack(options.archive, Path(folder))
         scene = tt.load(path, "llvm_ad_rgb", resx=sizes.width, resy=sizes.height, max_depth=sizes.max_depth)
         key = floor_key(scene)
-        renderer = tt.TransientRenderer(scene, time_axis=AXIS, spp=sizes.spp)
-        draw_light(renderer(seed=0, progress=True), options.output / "staircase_light.png")
-        texture, gradients = window_gradients(scene, key, sizes)
+        renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
+        with torch.no_grad():
+            light = renderer(seed=0, spp=sizes.spp, progress=True)
+        draw_light(light, options.output / "staircase_light.png")
+        texture, gradients = window_gradients(renderer, key, sizes)
         draw_gradients(texture, gradients, options.output / "staircase_gradient.png")
         result = recover(scene, key, sizes)
     draw_recovery(result, options.output / "staircase_recovery.png")

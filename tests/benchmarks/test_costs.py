@@ -77,3 +77,15 @@ def test_data_sets(tmp_path):
 def test_data_sets_by_two_workers(tmp_path):
     report, _ = run("dataset.py", tmp_path, "--only", "workers")
     assert [row["unit"] for row in report["rows"]] == ["x", "x"] and report["rows"][0]["load"] >= 0
+
+
+def test_bias_of_noisy_renders(tmp_path):
+    """At toy size already the likelihood is farther off than squares, whose bias is none."""
+    report, printed = run("noisy_renders.py", tmp_path)
+    squares, likelihood = (
+        report["least"][name]["exact"]["64"] for name in ("`squared_loss`, weighted", "`poisson_loss`, `poisson_nll`")
+    )
+    assert likelihood["rms"] > 1 > squares["rms"] + 2 * squares["error"]
+    assert set(report) >= {"least", "fits", "priors"} and report["settings"]["quick"]
+    assert len(report["fits"]) == 16 and all(found["CPU s"] > 0 for found in report["fits"].values())
+    assert "the start" in report["priors"] and "`expected_root_loss`" in printed

@@ -29,7 +29,7 @@ def names():
 
 def test_its_blocks_say_what_noise_adds(names):
     """The squared error of one render is above that of two by their variance, which is positive."""
-    assert float(names["squares"]) > 0 and float(names["noise"]) > 0
+    assert names["squares"].item() > 0 and names["noise"].item() > 0
     values = names["renderer"].values[names["key"]]
     assert bool(torch.isfinite(values).all()) and bool(torch.isfinite(values.grad).all())
 
@@ -59,3 +59,10 @@ def test_its_tables_are_those_of_the_numbers():
     least = data["least"]
     squares, likelihood = least["`squared_loss`, weighted"], least["`poisson_loss`, `poisson_nll`"]
     assert squares["exact"]["64"]["rms"] < 0.2 and likelihood["exact"]["64"]["rms"] > 1 > squares["own"]["rms"]
+    late, few = (data["fits"][f"`expected_root_loss`, 64{more}"] for more in (" to 1024", ""))
+    assert late["rms"] < 0.1 < 1 < few["rms"]
+    errors = {name: sum(found["percent"]) / 3 for name, found in data["priors"].items()}
+    squares, roots, poisson = (
+        errors[name] for name in ("weighted squares, 64 samples", "`expected_root_loss`, 64", "`poisson_loss`, 64")
+    )
+    assert squares < 0.6 * roots and roots < errors["the start"] < 0.6 * poisson

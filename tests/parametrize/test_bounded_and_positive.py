@@ -54,8 +54,14 @@ def test_beyond_the_bounds_no_margin_helps(value, margin):
 
 
 @pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (math.nan, 1.0), ("0", 1.0)])
-def test_bounds_that_are_none(low, high):
-    for make in (lambda: parametrize.Bounded(low, high), lambda: bounded(torch.zeros(2), low, high)):
+@pytest.mark.parametrize("kind", [lambda bound: bound, lambda bound: torch.tensor([0.5, bound])[1:]])
+def test_bounds_that_are_none(low, high, kind):
+    if isinstance(low, float):
+        low, high = kind(low), kind(high)
+    for make in (
+        lambda: parametrize.Bounded(low, high), lambda: bounded(torch.zeros(2), low, high),
+        lambda: bounded_inverse(torch.full((2,), 1.5), low, high),
+    ):  # fmt: skip
         with pytest.raises(UnitError, match="bounds"):
             make()
 

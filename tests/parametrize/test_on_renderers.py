@@ -13,7 +13,15 @@ from torch.nn.utils import parametrize as torch_parametrize
 
 import torchtransient as tt
 from torchtransient.errors import SceneError, ShapeError, UnitError, UnknownKeyError
-from torchtransient.parametrize import Albedo, AxisAnglePose, original, register, remove
+from torchtransient.parametrize import (
+    Albedo,
+    AxisAnglePose,
+    PrincipledRoughness,
+    Roughness,
+    original,
+    register,
+    remove,
+)
 from torchtransient.testing.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 
 KEYS = [COLOUR, WALL_POSE]
@@ -191,3 +199,23 @@ def test_what_is_wrong_is_said(renderer, plain):
         register(two, COLOUR, Albedo())
     register(two, f"1.{COLOUR}", Albedo())
     assert torch_parametrize.is_parametrized(plain, COLOUR.replace(".", "/"))
+
+
+def test_a_principled_roughness_has_a_clamp_of_its_own():
+    """Below it, renders are the same and slopes are zero; from its lower end on, they are not."""
+    key = "wall.bsdf.roughness.value"
+    room = make_room()
+    room["wall"]["bsdf"] = {"type": "principled", "roughness": 0.3, "metallic": 1.0}
+    module = tt.TransientRenderer(tt.load(room, variant=VARIANT), [key], spp=16)
+    with pytest.raises(SceneError, match="PrincipledRoughness"):
+        register(module, key, Roughness())
+
+    def slope(value):
+        x = torch.tensor(value, requires_grad=True)
+        (found,) = torch.autograd.grad(module({key: x}, seed=0).transient.square().sum(), x)
+        return float(found)
+
+    least = float(PrincipledRoughness().low)
+    assert slope(0.99 * 0.001**0.5) == 0.0 and slope(least) != 0.0
+    register(module, key, PrincipledRoughness())
+    assert float(module.values[key].detach()) == pytest.approx(0.3, rel=1e-5)

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 import torchtransient as tt
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Seeds, accumulate
 
@@ -155,6 +155,9 @@ def test_an_overflow_before_the_renderer_is_an_error_and_no_skipped_step(model):
         (lambda: accumulate(torch.sum, [1], weights=[float("nan")]), UnitError, "finite"),
         (lambda: accumulate(lambda _: torch.ones(2), [1]), ShapeError, r"got shape \(2,\)"),
         (lambda: accumulate(lambda _: 1.0, [1]), ShapeError, "got float"),
+        (lambda: accumulate(torch.sum, 3), ShapeError, "expected parts"),
+        (lambda: accumulate(torch.sum, [1], weights=1.0), ShapeError, "a weight for each of 1 parts"),
+        (lambda: accumulate(lambda _: torch.ones(()), [1]), GradientError, "has a gradient"),
         (lambda: accumulate(torch.sum, [1], model=3), UnitError, "model as a module, got int"),
     ],
 )

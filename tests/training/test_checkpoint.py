@@ -251,3 +251,40 @@ def test_a_part_that_does_not_take_its_state(tmp_path):
     other = torch.optim.SGD([{"params": [model.weight]}, {"params": [model.bias]}])
     with pytest.raises(StorageError, match=r"'optimizer' does not take its state: .*made anew"):
         load_checkpoint(path, {"optimizer": other})
+
+
+def test_a_full_disk(tmp_path):
+    """Torch's writer has an error of its own for what the system refuses in the middle of a file."""
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))
+    try:
+        with pytest.raises(StorageError, match="cannot be written"):
+            save_checkpoint(path, {"model": nn.Linear(600, 600)}, step=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert load_checkpoint(path, {"model": tiny()}).step == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["run.pt"]
+
+
+def test_numbers_of_other_kinds(tmp_path):
+    path = tmp_path / "run.pt"
+    values = {"big": np.arange(3, dtype=">f4"), "part": np.arange(8)[::-2], "words": np.uint32([7])}
+    values["no"] = np.bool_(True)
+    save_checkpoint(path, {}, step=0, values=values)
+    found = load_checkpoint(path, {}).values
+    assert found["big"].tolist() == [0.0, 1.0, 2.0] and found["part"].tolist() == [7, 5, 3, 1]
+    assert found["words"].tolist() == [7] and found["no"] is True
+    for odd in (np.longdouble(1), np.datetime64("2020-01-01"), np.arange(3, dtype=np.longdouble), np.array(["a"])):
+        with pytest.raises(StorageError, match=r"values\['odd'\] is a"):
+            save_checkpoint(path, {}, step=0, values={"odd": odd})
+
+
+def test_lazy_modules(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": nn.Linear(3, 2)}, step=1)
+    lazy = nn.LazyLinear(2)
+    load_checkpoint(path, {"model": lazy})
+    assert lazy.weight.shape == (2, 3)

@@ -85,6 +85,14 @@ SCRIPT = """
         found["same random numbers"] = torch.rand(1).item() == drawn
         found["drawn"] = drawn
         found["weights"] = {name: p.detach() for name, p in model.named_parameters()}
+        # What goes wrong in one rank is told to all: none waits for the others.
+        found["refused"] = []
+        odd = {"odd": object() if ranks.rank == ranks.size - 1 else 0}
+        for where, values in ((path, odd), (f"{folder}/no/x.pt", {})):
+            try:
+                tt.training.save_checkpoint(where, parts, step=5, values=values)
+            except tt.errors.StorageError as error:
+                found["refused"].append(str(error))
         torch.save(found, f"{folder}/{ranks.size}-{ranks.rank}.pt")
 """
 EPS = torch.finfo(torch.float32).eps
@@ -95,8 +103,8 @@ def test_two_ranks_are_one_rank_on_the_joined_batch(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(textwrap.dedent(SCRIPT))
     for count in (1, 2):
-        torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
-        command = [*torchrun, "--master-port", str(29500 + 7 * count), str(script), str(tmp_path)]
+        torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+        command = [*torchrun, str(script), str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == 0, done.stderr[-4000:]
     one, first, second = (torch.load(tmp_path / f"{name}.pt") for name in ("1-0", "2-0", "2-1"))
@@ -120,3 +128,6 @@ def test_two_ranks_are_one_rank_on_the_joined_batch(tmp_path):
     assert first["same random numbers"]
     assert second["same random numbers"]
     assert first["drawn"] != second["drawn"]
+    assert "values['odd'] is a object" in one["refused"][0] and one["refused"][1].count("cannot be written") == 1
+    assert "was not written. rank 1: " in first["refused"][0] and "values['odd'] is a object" in second["refused"][0]
+    assert first["refused"][1] == second["refused"][1] == one["refused"][1]

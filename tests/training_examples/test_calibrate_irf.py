@@ -39,7 +39,7 @@ def frames(folder):
 
 def test_finds_what_was_put_in(tmp_path, capsys):
     options = [
-        "--irf", response(tmp_path), "--lobes", "2", "--frames", frames(tmp_path), "--steps", "160",
+        "--irf", response(tmp_path), "--smoke", "--frames", frames(tmp_path), "--steps", "160",
         "--output", tmp_path / "out",
     ]  # fmt: skip
     runpy.run_path(str(SCRIPT))["main"]([str(x) for x in options])

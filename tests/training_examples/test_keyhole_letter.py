@@ -53,7 +53,7 @@ def write_track(folder, example, letter, seed=0):
 
 def test_a_made_letter_is_found(example, tmp_path, capsys):
     write_track(tmp_path, example, "E")
-    found = example["main"]([str(tmp_path), "--steps", "60", "--resolution", "24", "--output", str(tmp_path)])
+    found = example["main"]([str(tmp_path), "--smoke", "--output", str(tmp_path)])
     assert found["positions"] == 45
     assert found["picture"].shape == (24, 24)
     assert next(iter(found["scores"])) == "E"

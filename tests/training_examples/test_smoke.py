@@ -28,8 +28,19 @@ def test_what_is_no_script_is_shared_by_some(part):
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_the_small_run_is_called_smoke(script):
     text = script.read_text(encoding="utf-8")
+    # Of the script, or of a part that it shares with others.
+    text += "".join(part.read_text(encoding="utf-8") for part in FILES if f"from {part.stem} import " in text)
     assert '"--smoke"' in text
     assert '"--quick"' not in text
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_every_small_run_is_run(script):
+    """Here, or in tests of the script's own."""
+    tests = [path for path in Path(__file__).parents[1].rglob("test_*.py") if path != Path(__file__)]
+    texts = [path.read_text(encoding="utf-8") for path in tests]
+    own = any(f'{script.stem}"' in text or f"{script.stem}.py" in text for text in texts if "--smoke" in text)
+    assert own or script.stem in NO_FILES
 
 
 @pytest.mark.slow

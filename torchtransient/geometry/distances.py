@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.geometry.pinhole import camera_matrices, camera_to_world
+from torchtransient.geometry.pinhole import camera_matrices, camera_to_world, image_size
 from torchtransient.quantities import positive, real_array, shown
 
 
@@ -21,7 +21,7 @@ def ray_directions(camera_matrix: Any, size: tuple[int, int], to_world: Any = No
     kornia's camera, or in the world of a sensor's `to_world`. Raises ShapeError.
     """
     matrix = camera_matrices(camera_matrix, "ray_directions")
-    height, width = size
+    height, width = image_size(size, "ray_directions")
     v, u = torch.meshgrid(
         torch.arange(height, dtype=matrix.dtype, device=matrix.device),
         torch.arange(width, dtype=matrix.dtype, device=matrix.device),
@@ -49,7 +49,7 @@ def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = N
     """Points (..., 3, H, W) at a distance along each pixel's ray: in kornia's camera, or in the world of a sensor's
     `to_world` (the label `position`).
     """
-    size = _image(distance, "points_from_distance")
+    size = image_of(distance, "points_from_distance")
     points = ray_directions(_like(camera_matrix, distance, "points_from_distance"), size, to_world)
     points = points * distance[..., None, :, :]
     if to_world is not None:
@@ -67,6 +67,7 @@ def opl_from_distance(
     of refraction of what is between. Raises ShapeError, UnitError.
     """
     index = positive("opl_from_distance: index", index)
+    image_of(distance, "opl_from_distance")
     if light is None:
         return 2 * index * distance
     rays, baseline = _triangle(distance, camera_matrix, to_world, light, "opl_from_distance")
@@ -84,6 +85,7 @@ def distance_from_opl(
     Raises as `opl_from_distance`.
     """
     index = positive("distance_from_opl: index", index)
+    image_of(opl, "distance_from_opl")
     if light is None:
         return opl / (2 * index)
     rays, baseline = _triangle(opl, camera_matrix, to_world, light, "distance_from_opl")
@@ -98,7 +100,8 @@ def distance_from_opl(
 # ------------------------------------------------------------------------------------------------------------- checks
 
 
-def _image(image: Tensor, where: str) -> tuple[int, int]:
+def image_of(image: Any, where: str) -> tuple[int, int]:
+    """Height and width. Raises ShapeError for what is no floating image."""
     if not isinstance(image, Tensor) or image.ndim < 2 or not image.is_floating_point():
         got = f"{tuple(image.shape)} of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
         raise ShapeError(f"{where}: expected a floating image (..., H, W), got {got}.")
@@ -111,14 +114,14 @@ def _like(camera_matrix: Any, image: Tensor, where: str) -> Tensor:
 
 def _cosines(image: Tensor, camera_matrix: Any, where: str) -> Tensor:
     """Of the angles between rays and axis."""
-    size = _image(image, where)
+    size = image_of(image, where)
     rays = ray_directions(_like(camera_matrix, image, where), size)
     return rays[..., 2, :, :]
 
 
 def _triangle(image: Tensor, camera_matrix: Any, to_world: Any, light: Any, where: str) -> tuple[Tensor, Tensor]:
     """Rays (..., 3, H, W) in the world, and from the pinhole to the light (..., 3, 1, 1)."""
-    size = _image(image, where)
+    size = image_of(image, where)
     if camera_matrix is None or to_world is None:
         raise UnitError(f"{where}: a light that is not at the pinhole wants camera_matrix= and to_world=.")
     if isinstance(light, Tensor) and light.is_floating_point():

@@ -15,6 +15,8 @@ from torchtransient.quantities import count, real_array, shown
 FovAxis = Literal["x", "y", "diagonal", "smaller", "larger"]
 # From Mitsuba's camera, x to the left and y up, to kornia's, x to the right and y down; and back.
 _HALF_TURN = (-1.0, -1.0, 1.0, 1.0)
+# How far a turn times its transpose may be from one: single precision, after some products.
+_RIGID = 1e-4
 
 
 def intrinsics(
@@ -35,7 +37,7 @@ def intrinsics(
     Pixels are square. The first pixel's centre is (0, 0). Raises UnitError, ShapeError, SceneError.
     """
     where = "intrinsics"
-    height, width = _size(size, where)
+    height, width = image_size(size, where)
     if fov_axis not in get_args(FovAxis):
         raise SceneError(f"{where}: expected fov_axis among {', '.join(get_args(FovAxis))}, got {shown(fov_axis)}.")
     fov = _number_tensor(fov_deg, "fov_deg", where)
@@ -59,16 +61,20 @@ def intrinsics(
 
 
 def extrinsics(to_world: Any) -> Tensor:
-    """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError."""
-    matrix = transforms(to_world, "extrinsics")
+    """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError,
+    UnitError.
+    """
+    matrix = _rigid(to_world, "extrinsics")
     rotation = matrix[..., :3, :3].mT
     back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
     return _half_turn(matrix)[:, None] * torch.cat([back, matrix[..., 3:, :]], -2)
 
 
 def to_world_from_extrinsics(extrinsics: Any) -> Tensor:
-    """A sensor's `to_world` of what takes the world to kornia's camera, a rigid motion. Raises ShapeError."""
-    matrix = transforms(extrinsics, "to_world_from_extrinsics")
+    """A sensor's `to_world` of what takes the world to kornia's camera, a rigid motion. Raises ShapeError,
+    UnitError.
+    """
+    matrix = _rigid(extrinsics, "to_world_from_extrinsics")
     rotation = matrix[..., :3, :3].mT
     back = torch.cat([rotation, -(rotation @ matrix[..., :3, 3:])], -1)
     return torch.cat([back, matrix[..., 3:, :]], -2) * _half_turn(matrix)
@@ -87,7 +93,7 @@ def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) ->
     """
     from kornia.geometry.camera import PinholeCamera
 
-    height, width = _size(size, "pinhole_camera")
+    height, width = image_size(size, "pinhole_camera")
     matrix = camera_matrices(camera_matrix, "pinhole_camera")
     outside = extrinsics(to_world).to(matrix.device, matrix.dtype)
     inside = torch.nn.functional.pad(matrix, (0, 1, 0, 1)) + torch.diag(matrix.new_tensor([0.0, 0.0, 0.0, 1.0]))
@@ -118,6 +124,21 @@ def transforms(given: Any, where: str) -> Tensor:
     return matrix
 
 
+def _rigid(given: Any, where: str) -> Tensor:
+    """Transforms whose inverse is their transpose. Raises UnitError for those that scale, shear or mirror."""
+    matrix = transforms(given, where)
+    known = matrix.detach().double()
+    turn, last = known[..., :3, :3], known.new_tensor([0.0, 0.0, 0.0, 1.0])
+    off = (turn @ turn.mT - torch.eye(3, dtype=turn.dtype, device=turn.device)).abs()
+    right = (off.amax((-2, -1)) < _RIGID) & (torch.linalg.det(turn) > 0) & (known[..., 3, :] == last).all(-1)
+    if not bool(right.all()):
+        raise UnitError(
+            f"{where}: expected a rigid motion (turn and shift, float32 or better), got {shown(given)}. Take scales "
+            "and mirrors out of the camera's to_world first."
+        )
+    return matrix
+
+
 def _number_tensor(given: Any, name: str, where: str) -> Tensor:
     """A floating tensor; float32 of numbers and whole numbers, float64 of arrays that are."""
     if isinstance(given, Tensor) and given.is_floating_point():
@@ -133,7 +154,8 @@ def _half_turn(like: Tensor) -> Tensor:
     return torch.tensor(_HALF_TURN, dtype=like.dtype, device=like.device)
 
 
-def _size(size: Any, where: str) -> tuple[int, int]:
+def image_size(size: Any, where: str) -> tuple[int, int]:
+    """(height, width). Raises ShapeError."""
     numbers = list(size) if isinstance(size, Sequence) and not isinstance(size, str) else []
     if len(numbers) != 2:
         raise ShapeError(f"{where}: expected size as (height, width), got {shown(size)}.")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.geometry.distances import points_from_distance
+from torchtransient.geometry.distances import image_of, points_from_distance
 from torchtransient.geometry.pinhole import camera_to_world
 
 
@@ -24,7 +24,7 @@ def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = 
     """
     from kornia.filters import spatial_gradient
 
-    if min(distance.shape[-2:], default=0) < 2:
+    if min(image_of(distance, "normals_from_distance")) < 2:
         raise ShapeError(f"normals_from_distance: expected two rows and columns at least, got {tuple(distance.shape)}.")
     points = points_from_distance(distance, camera_matrix)
     size = points.shape[-2:]

@@ -57,7 +57,7 @@ def expected_root_loss(
     Twice the negative log-likelihood of counts, nearly, without its logarithm: on average it is least where `input` is
     the mean that `target` was drawn of, however few counts, and there it is the variance of `anscombe`, 1 within
     1/(8 m) for a mean of m >= 4. A noisy `input` biases it, by the curvature of the root alone
-    (docs/noisy_renders.md: a third of the Poisson likelihood's bias).
+    (docs/noisy_renders.md: less than half of the bias of the Poisson likelihood).
     Finite for zero counts, zero means, and values below zero. Raises ShapeError, UnitError.
     """
     where = "expected_root_loss"

@@ -8,6 +8,7 @@ from torchtransient.parametrize.bounded import Albedo as Albedo
 from torchtransient.parametrize.bounded import Anisotropy as Anisotropy
 from torchtransient.parametrize.bounded import Bounded as Bounded
 from torchtransient.parametrize.bounded import IndexOfRefraction as IndexOfRefraction
+from torchtransient.parametrize.bounded import PrincipledRoughness as PrincipledRoughness
 from torchtransient.parametrize.bounded import Roughness as Roughness
 from torchtransient.parametrize.bounded import bounded as bounded
 from torchtransient.parametrize.bounded import bounded_inverse as bounded_inverse

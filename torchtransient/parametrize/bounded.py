@@ -13,6 +13,8 @@ from torchtransient.quantities import as_number, real_array, shown
 Bound = float | Tensor
 # What single precision makes of the ends of a range, as a share of it.
 _SLACK = 1e-5
+# Mitsuba renders the square of a principled roughness, no smaller than 0.001.
+LEAST_PRINCIPLED = 0.0317
 
 
 def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
@@ -23,6 +25,11 @@ def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
     """
     where = "bounded"
     x = floating(x, where)
+    _check_order(_bound(low, where), _bound(high, where), where)
+    return _between(x, low, high, where)
+
+
+def _between(x: Tensor, low: Bound, high: Bound, where: str) -> Tensor:
     below, above = _ends(x, low, high, where)
     width = above - below
     # From the nearer end: full precision at both, and no rounding past the upper one.
@@ -36,7 +43,9 @@ def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, margin: 
     share of the range between 0 and 0.5; what is nearer is moved there. Values beyond the bounds by more than rounding,
     and such as are not finite, raise UnitError in any case.
     """
-    return _inverse(value, low, high, checked_margin(margin, "bounded_inverse"), "bounded_inverse")
+    where = "bounded_inverse"
+    _check_order(_bound(low, where), _bound(high, where), where)
+    return _inverse(value, low, high, checked_margin(margin, where), where)
 
 
 def _inverse(value: Tensor, low: Bound, high: Bound, margin: float | None, where: str) -> Tensor:
@@ -77,7 +86,8 @@ class Bounded(nn.Module):
         self.register_buffer("high", ends[1], persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        return bounded(x, self.low, self.high)
+        # The bounds were looked at when they were given: looking at them again would wait for a GPU.
+        return _between(floating(x, type(self).__name__), self.low, self.high, type(self).__name__)
 
     def right_inverse(self, value: Tensor) -> Tensor:
         """Raises UnitError as `bounded_inverse`."""
@@ -95,11 +105,21 @@ class Albedo(Bounded):
 
 
 class Roughness(Bounded):
-    """`alpha` of microfacets and `roughness` of principled materials, 0.0001 to 1: Mitsuba renders smaller ones as
-    0.0001, where the slope is zero.
+    """`alpha` of microfacets, 0.001 to 1: `diff_rough_dielectric` and others render smaller ones as 0.001, the rest as
+    0.0001 (`low=1e-4`), where the slope is zero. Not for `principled`: `PrincipledRoughness`.
     """
 
-    def __init__(self, low: Any = 1e-4, high: Any = 1.0, margin: float | None = None) -> None:
+    def __init__(self, low: Any = 1e-3, high: Any = 1.0, margin: float | None = None) -> None:
+        super().__init__(low, high, margin)
+
+
+class PrincipledRoughness(Bounded):
+    """`roughness` of `principled` and `principledthin`, 0.0317 to 1: Mitsuba renders with its square, and squares below
+    0.001 as 0.001, where the slope is zero. With `anisotropic` of `a`, one of the two axes gets there at the fourth
+    root of 1e-6 / (1 - 0.9 a), 0.0563 at most: give that as `low`.
+    """
+
+    def __init__(self, low: Any = LEAST_PRINCIPLED, high: Any = 1.0, margin: float | None = None) -> None:
         super().__init__(low, high, margin)
 
 
@@ -156,9 +176,7 @@ def _check_order(low: Tensor, high: Tensor, where: str) -> None:
 
 
 def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Tensor]:
-    """Both as tensors that fit. Numbers are looked at; tensors are looked at where a module takes them."""
-    if not isinstance(low, Tensor) or not isinstance(high, Tensor):
-        _check_order(_bound(low, where), _bound(high, where), where)
+    """Both as tensors that fit."""
     ends = [torch.as_tensor(end, dtype=like.dtype, device=like.device) for end in (low, high)]
     for end in ends:
         try:

@@ -22,13 +22,16 @@ class CopiesParametrized(nn.Module):
     def __reduce_ex__(self, protocol: Any) -> Any:
         if not parametrize.is_parametrized(self):
             return super().__reduce_ex__(protocol)
-        return _shell, _origin(self), self.__dict__
+        # What the class itself would put away: torch's class on top refuses to.
+        own: Any = parametrize.type_before_parametrizations(self)
+        return _shell, _origin(self), own.__getstate__(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        shell: Self = _shell(*_origin(self))
-        memo[id(self)] = shell
-        shell.__dict__ = copy.deepcopy(self.__dict__, memo)
-        return shell
+        make, arguments, state = self.__reduce_ex__(4)[:3]
+        made: Self = make(*arguments)
+        memo[id(self)] = made
+        made.__setstate__(copy.deepcopy(state, memo))  # type: ignore[no-untyped-call]
+        return made
 
 
 def _origin(module: nn.Module) -> tuple[type, tuple[str, ...]]:

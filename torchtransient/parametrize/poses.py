@@ -127,8 +127,8 @@ class AxisAnglePose(_RigidPose):
     `to_world`. None: the identity, for poses that are rigid themselves. `about`: the point that stays when it turns:
     "self" (where `base` puts the origin), "world" (the world's origin), or a point [x, y, z] of the world. `frame`:
     "world" turns and moves along the world's axes (`motion @ base`), "local" along those of the thing before its
-    `base` (`base @ motion`, in its units of length). `length_scale`: metres for 1 in the last three numbers, so that
-    one learning rate fits turns and moves.
+    `base` (`base @ motion`, in its units of length). `length_scale`: metres (with
+    "local", units of `base`) for 1 in the last three numbers, so that one learning rate fits turns and moves.
 
     Turns by more than pi are taken, and come back as smaller ones. Raises SceneError, ShapeError, UnitError.
     """

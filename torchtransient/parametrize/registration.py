@@ -7,6 +7,7 @@ from torch import nn
 from torch.nn.utils import parametrize
 
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.parametrize.bounded import Roughness
 
 
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
@@ -16,13 +17,18 @@ def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Modu
 
     The present value is where it starts, by `right_inverse`. Optimisers are made afterwards: `module.parameters()` has
     the numbers behind the value (`original`), and `renderer.values[key]` the value. Another one on the same key is
-    applied after the first. Raises UnknownKeyError, the errors of `right_inverse`, and ShapeError where it does not
-    fit.
+    applied after the first. Raises UnknownKeyError, the errors of `right_inverse`, ShapeError where it does not
+    fit, and SceneError for a `Roughness` of principled materials.
     """
     if not isinstance(parametrization, nn.Module):
         raise SceneError(
             f"register: expected a parametrization, an nn.Module, got {type(parametrization).__name__}; "
             "tt.parametrize.Albedo() for instance."
+        )
+    if isinstance(parametrization, Roughness) and "roughness" in key.replace("/", ".").split("."):
+        # The two clamps differ by a factor of 32, in between which a fit would stand still.
+        raise SceneError(
+            f"register: {key!r} is of a principled material: expected PrincipledRoughness, or Bounded, got Roughness."
         )
     owner, name = _place(module, key)
     try:

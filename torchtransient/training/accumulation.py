@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.quantities import as_number
+from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.quantities import as_number, shown
 
 Part = TypeVar("Part")
 
@@ -32,7 +32,7 @@ def accumulate(
     but for the order of float sums. ::
 
         optimizer.zero_grad()
-        loss = tt.training.accumulate(lambda view: loss_fn(renderer(seed=view), measured[view]), range(8))
+        loss = tt.training.accumulate(lambda view: loss_fn(renderer({POSE: poses[view]}), measured[view]), range(8))
         optimizer.step()
 
     ``loss_of``: gives a scalar tensor. ``weights``: one for each part; None takes 1 / number of parts, which gives the
@@ -41,11 +41,16 @@ def accumulate(
     ``scaler``: scales losses before they are differentiated; the sum that is returned is not scaled.
 
     Raises ShapeError for no parts, weights that do not match them and losses that are no scalars, UnitError for weights
-    that are not finite. Nothing has been differentiated then, except by parts that came before the wrong loss.
+    that are not finite, GradientError for a loss without a gradient. Nothing has been differentiated then, except by
+    parts that came before the wrong loss.
     """
+    if not isinstance(parts, Iterable):
+        raise ShapeError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.")
     listed = list(parts)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
+    if weights is not None and not isinstance(weights, Iterable):
+        raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {shown(weights)}.")
     shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
     if len(shares) != len(listed):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
@@ -60,6 +65,11 @@ def accumulate(
             if not isinstance(loss, torch.Tensor) or loss.numel() != 1:
                 came = f"shape {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
                 raise ShapeError(f"accumulate: expected the loss of a part as one number in a tensor, got {came}.")
+            if not loss.requires_grad:
+                raise GradientError(
+                    "accumulate: the loss of a part depends on nothing that has a gradient; parameters need "
+                    "requires_grad=True, and loss_of may not detach or run under torch.no_grad."
+                )
             scaled = loss.reshape(()) * share
             (scaled if scaler is None else scaler.scale(scaled)).backward()  # type: ignore[no-untyped-call]
             values.append(scaled.detach())

@@ -7,6 +7,7 @@ import pickle
 import warnings
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
+from torch.nn.parameter import is_lazy
 
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.quantities import count, shown
@@ -62,26 +64,21 @@ def save_checkpoint(
     state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
     executing something, and where nothing can be written.
     """
-    number = count("save_checkpoint: step", step, 0, UnitError)
-    states = {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()}
-    content = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "step": number,
-        "parts": states,
-        "values": plain(dict(values or {}), "values"),
-        "random": _of_all_ranks(random_state()),
-        "libraries": _libraries(),
-    }
-    failure: str | None = None
-    if _rank() == 0:
-        try:
-            _write(Path(path), content)
-        except OSError as error:
-            failure = str(error)
-    failure = _told_by_first(failure)
+    failure: str | None = "its parts or values are no state; see its own error."
+    # All ranks learn what went wrong in one of them: none is left waiting for the others.
+    try:
+        content = _content(parts, step, values)
+        failure = None
+    finally:
+        told = _of_all_ranks({"random": random_state(), "failure": failure})
+    failures = [f"rank {rank}: {one['failure']}" for rank, one in enumerate(told) if one["failure"] is not None]
+    if failures:
+        raise StorageError(f"save_checkpoint: {os.fspath(path)} was not written. {' '.join(failures)}")
+    content["random"] = [one["random"] for one in told]
+    own = _written(Path(path), content) if _rank() == 0 else None
+    failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}")
+        raise StorageError(f"save_checkpoint: {os.fspath(path)} cannot be written: {failure}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
@@ -125,6 +122,18 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
 # ------------------------------------------------------------------------------------------------------------ parts
 
 
+def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[str, Any]:
+    """All of a checkpoint but the random numbers."""
+    return {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "step": count("save_checkpoint: step", step, 0, UnitError),
+        "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
+        "values": plain(dict(values or {}), "values"),
+        "libraries": _libraries(),
+    }
+
+
 def _named(parts: Any, who: str) -> dict[str, Any]:
     if not isinstance(parts, Mapping) or not all(isinstance(name, str) for name in parts):
         raise StorageError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
@@ -163,7 +172,9 @@ def _check(name: str, part: Any, state: Any) -> None:
                 f"{', '.join(lacks) or 'nothing'} and has {', '.join(map(str, has)) or 'nothing'} beyond."
             )
         for key, tensor in expected.items():
-            if isinstance(tensor, torch.Tensor) and tensor.shape != getattr(state[key], "shape", None):
+            # Lazy modules have no shapes yet.
+            known = isinstance(tensor, torch.Tensor) and not is_lazy(tensor)
+            if known and tensor.shape != getattr(state[key], "shape", None):
                 came = tuple(getattr(state[key], "shape", ()))
                 raise ShapeError(
                     f"load_checkpoint: {key!r} of {name!r}: expected shape {tuple(tensor.shape)}, the file has {came}."
@@ -189,8 +200,19 @@ def _put_back(name: str, part: Any, state: Any) -> None:
 # ------------------------------------------------------------------------------------------------------------- file
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
+def _written(path: Path, content: dict[str, Any]) -> Exception | None:
+    """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
     part = path.with_name(path.name + ".part")
+    try:
+        _write(path, part, content)
+    except (OSError, RuntimeError) as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        return error
+    return None
+
+
+def _write(path: Path, part: Path, content: dict[str, Any]) -> None:
     with open(part, "wb") as file:
         torch.save(content, file)
         file.flush()

@@ -13,6 +13,11 @@ from torchtransient.errors import StorageError
 
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, torch.Size, torch.dtype, torch.device)
 
+# Kinds of numbers that torch has, in any order of their bytes.
+_ARRAYS = [np.dtype(kind) for kind in ("?", "i1", "u1")]
+_ARRAYS += [np.dtype(order + kind + size) for order in "<>" for kind in "iu" for size in "248"]
+_ARRAYS += [np.dtype(order + kind) for order in "<>" for kind in ("f2", "f4", "f8", "c8", "c16")]
+
 
 def plain(value: Any, where: str) -> Any:
     """``value`` with mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch, and tensors
@@ -22,10 +27,10 @@ def plain(value: Any, where: str) -> Any:
         return value
     if isinstance(value, torch.Tensor):
         return value.detach()
-    if isinstance(value, np.generic):
-        return plain(value.item(), where)
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
-        return torch.from_numpy(value.copy())
+    if isinstance(value, np.generic) and type(value.item()) in _PLAIN:
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype in _ARRAYS:
+        return torch.from_numpy(value.astype(value.dtype.newbyteorder("="), copy=True))
     if isinstance(value, Mapping):
         items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
         return OrderedDict(items) if isinstance(value, OrderedDict) else items
