@@ -190,7 +190,7 @@ def test_the_gradient_is_that_of_a_fixed_scale(case):
 def test_finite_for_no_light_and_even_light(case):
     x, y = case.tensors(dtype=torch.float32)
     for a in (0.0, 1.0, 1e-30):
-        for b in (0.0, 1.0):
+        for b in (0.0, 1.0, 6.0):
             inputs, targets = torch.full_like(x, a), torch.full_like(y, b)
             assert bool(torch.isfinite(case(inputs, targets))), (a, b)
             assert bool(torch.isfinite(gradient(case, inputs, targets)).all()), (a, b)

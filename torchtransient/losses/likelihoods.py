@@ -40,9 +40,9 @@ from torchtransient.losses.results import LIGHT, Light, reads
 
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
 _RELATIVE_FLOOR = 1e-3
-# Of the counts of an item: a model that is darker than that has the floor of one that is as bright. Rather than the
-# counts themselves, which are noise, and continuous: the loss falls all the way out of the dark.
-_DARK = 1e-3
+# Of the counts of an item: a model that is darker than that has the floor of one that is as bright. Small enough that
+# no model that is about right has a floor made of noise; continuous: the loss falls all the way out of the dark.
+_DARK = 0.1
 
 
 class Options(NamedTuple):
@@ -93,8 +93,8 @@ def relative_floor(
     """`share` of the mean of each item (its C, T, H, W) of the model, without gradient: a floor that knows the scale.
 
     Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one.
-    `measured`, of the shape and in the unit of the model: an item whose mean is below a thousandth of that of its
-    measurement has the floor of one at a thousandth, since a count in it has to cost something finite. Without it the
+    `measured`, of the shape and in the unit of the model: an item whose mean is below a tenth of that of its
+    measurement has the floor of one at a tenth, since a count in it has to cost something finite. Without it the
     floor of an item that is dark altogether is the least positive number of the precision.
     `dim`: where time is, which says what is an item (`losses.layouts`). `mask`: means are over what counts. Raises
     ShapeError, UnitError, DeviceError.

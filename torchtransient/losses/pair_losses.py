@@ -17,7 +17,7 @@ from torchtransient.quantities import shown
 # both are tensors of one shape.
 _MEASUREMENT_FIRST = {"counts", "measured", "target"}
 # Second ones of such, and of losses that take more than a model before the measurement.
-_NO_MEASUREMENT = {"mean", "rate", "input", "second", "faces"}
+_NO_MEASUREMENT = {"mean", "rate", "second", "faces"}
 
 
 class PairLoss(Protocol):
