@@ -7,8 +7,8 @@ Unknown are distance, two tilts, and the albedos of wall and panel.
 
     python training_examples/fit_phasors.py --seeds 0 1 2 --output demo_output
 
-Prints the error of the distances over the picture for the camera's own depth, for a plane through it, for the fit with
-a phasor film, and for the same fit with a histogram film in the same CPU time.
+Prints the errors of the distances of the camera's own depth, of a plane through it, and of the fits with a phasor film
+and, in the same CPU time, with a histogram film.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 import torchtransient as tt
 from torchtransient import sensing
+from torchtransient.parametrize import pose_from_axis_angle
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
@@ -35,7 +36,8 @@ CODE = sensing.sine_code(4)
 ELECTRONS = 6.4e5  # of a radiance of one: 20 000 in each tap
 FREQUENCIES = tt.FrequencyAxis.from_hertz([0.0, *HERTZ])
 WINDOW = tt.TimeAxis(6.0, 0.05, 200)
-CAMERA_HEIGHT, FOV_DEG = 4.0, 20.0
+CAMERA_HEIGHT, FOV_DEG, SPP = 4.0, 20.0, 64
+WALL = torch.tensor(scale(6.0)).float()  # before it is moved
 KEYS = ("wall.to_world", "wall.bsdf.reflectance.value", "side.bsdf.reflectance.value")
 # distance (m), tilts about y and x (degrees), albedos of the wall and of the panel
 TRUTH, START = (4.0, 5.0, -3.0, 0.6, 0.85), (4.4, 0.0, 0.0, 0.4, 0.5)
@@ -44,8 +46,7 @@ RATES = (0.03, 0.5, 0.5, 0.02, 0.05)
 
 @dataclass
 class Fit:
-    """`errors_mm` (rms over the picture) and `seconds` of the processor, before the first step and after each.
-    `rest`: (H, W) metres, what is left in the end."""
+    """`errors_mm` (rms) and `seconds` of the processor: of the start and of each step. `rest`: (H, W) metres, last."""
 
     values: list[float]
     errors_mm: list[float]
@@ -57,27 +58,23 @@ def scene(resolution: int) -> dict[str, Any]:
     """A wall that fills the picture under a camera with its lamp, and a panel of 1.6 m that stands beside the view."""
     described = tt.scenes.moving_wall(side_panel=True, resolution=resolution, max_depth=4)
     described["sensor"]["fov"], described["light"]["position"] = FOV_DEG, [0.0, 0.0, CAMERA_HEIGHT]
-    described["wall"]["to_world"] = scale(6.0)
+    described["wall"]["to_world"] = WALL.numpy()
     described["side"]["to_world"] = translate([1.4, 0.0, 1.0]) @ rotate([0, 1, 0], -80) @ scale(0.8)
     return described
 
 
 def wall_to_world(distance: Tensor, tilt_y: Tensor, tilt_x: Tensor) -> Tensor:
     """(4, 4): the wall `distance` below the camera, tilted about y and then about x by degrees."""
-    cy, sy, cx, sx = (f(torch.deg2rad(t)) for t in (tilt_y, tilt_x) for f in (torch.cos, torch.sin))
-    zero, one = torch.zeros_like(cy), torch.ones_like(cy)
-    about_y = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
-    about_x = torch.stack([one, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)
-    column = torch.stack([zero, zero, CAMERA_HEIGHT - distance])
-    top = torch.cat([6.0 * about_x @ about_y, column[:, None]], dim=1)
-    return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+    zero = torch.zeros_like(distance)
+    turned = torch.stack([zero, torch.deg2rad(tilt_y), *4 * [zero]])
+    moved = torch.stack([torch.deg2rad(tilt_x), *4 * [zero], CAMERA_HEIGHT - distance])
+    return pose_from_axis_angle(moved) @ pose_from_axis_angle(turned) @ WALL
 
 
 def rays(resolution: int) -> Tensor:
     """(H, W, 3): unit vectors from the camera through the middles of the pixels, x and y as the scene has them."""
-    half = math.tan(math.radians(FOV_DEG / 2))
-    place = (torch.arange(resolution) + 0.5) / resolution * 2 - 1
-    y, x = torch.meshgrid(-half * place, half * place, indexing="ij")
+    place = math.tan(math.radians(FOV_DEG / 2)) * ((torch.arange(resolution) + 0.5) / resolution * 2 - 1)
+    y, x = torch.meshgrid(-place, place, indexing="ij")
     vectors = torch.stack([x, y, -torch.ones_like(x)], dim=-1)
     return vectors / vectors.norm(dim=-1, keepdim=True)
 
@@ -97,8 +94,7 @@ def plane_through(distances: Tensor) -> Tensor:
     return c / (rays(distances.shape[-1]) @ torch.stack([-a, -b, torch.tensor(1.0)]))
 
 
-def rms_mm(error: Tensor) -> float:
-    """Root mean square of an error in metres, in millimetres."""
+def rms_mm(error: Tensor) -> float:  # of metres
     return 1e3 * float(error.square().mean().sqrt())
 
 
@@ -120,7 +116,7 @@ class Model(torch.nn.Module):
         return self.camera(out.transient)
 
 
-def fit(model: Model, measured: Tensor, seed: int, steps: int, spp: int, seconds: float | None = None) -> Fit:
+def fit(model: Model, measured: Tensor, seed: int, steps: int, seconds: float | None = None) -> Fit:
     """Adam on the phasors of the taps, for a number of steps or for some seconds of the processor."""
     values = [torch.nn.Parameter(torch.tensor(value)) for value in START]
     groups = [{"params": [value], "lr": rate} for value, rate in zip(values, RATES, strict=True)]
@@ -135,7 +131,7 @@ def fit(model: Model, measured: Tensor, seed: int, steps: int, spp: int, seconds
         for group, rate in zip(optimizer.param_groups, RATES, strict=True):
             group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * share))
         optimizer.zero_grad()
-        found = sensing.tap_phasor(model(values, len(result.errors_mm) + 10_000 * seed, spp), CODE.num_taps)
+        found = sensing.tap_phasor(model(values, len(result.errors_mm) + 10_000 * seed, SPP), CODE.num_taps)
         tt.losses.phasor_loss(found, target).backward()
         optimizer.step()
         result.values = [value.item() for value in values]
@@ -144,20 +140,18 @@ def fit(model: Model, measured: Tensor, seed: int, steps: int, spp: int, seconds
         result.seconds.append(time.process_time() - began)
         share = result.seconds[-1] / seconds if seconds else (len(result.errors_mm) - 1) / steps
         progress.update()
-    progress.close()
     return result
 
 
 def draw(path: Path, naive: Tensor, flat: Tensor, fits: dict[str, Fit]) -> None:
     """Errors of the distances as pictures on one scale, and over the time of the processor."""
-    figure = figure_type()(figsize=(12, 3.3), layout="constrained")
+    figure = figure_type()(figsize=(12, 3.5), layout="compressed")
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.3))
     limit = 1e3 * float(naive.abs().max())
     shown = {"camera's own depth": naive, "plane through it": flat, "fit": fits["phasor film"].rest}
     for panel, (name, error) in zip(panels, shown.items(), strict=False):
         image = panel.imshow(1e3 * error, cmap="RdBu_r", vmin=-limit, vmax=limit)
-        panel.set(xticks=[], yticks=[])
-        panel.set_title(f"{name}\n{rms_mm(error):.2f} mm (rms)", fontsize=9)
+        panel.set(xticks=[], yticks=[], title=f"{name}\n{rms_mm(error):.2f} mm (rms)")
     figure.colorbar(image, ax=panels[2], label="error of the distance [mm]")
     for (name, fit_), style in zip(fits.items(), ("-", "--"), strict=True):
         panels[3].semilogy(fit_.seconds, fit_.errors_mm, style, label=f"fit, {name}")
@@ -171,35 +165,31 @@ def main(argv: Sequence[str] | None = None) -> dict[str, list[float]]:
     """Command line. Prints a line for every seed; returns the errors in mm of every method, one of each seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="noise of the camera (%(default)s)")
-    parser.add_argument("--steps", type=int, default=300, help="steps of Adam (%(default)s)")
-    parser.add_argument("--spp", type=int, default=64, help="samples per pixel and step (%(default)s)")
-    parser.add_argument("--resolution", type=int, default=16, help="pixels per side (%(default)s)")
     parser.add_argument("--smoke", action="store_true", help="one seed, few steps and pixels")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="of the picture (%(default)s)")
     options = parser.parse_args(argv)
-    if options.smoke:
-        options.seeds, options.steps, options.resolution = options.seeds[:1], 60, 8
-    models = {f"{film} film": Model(options.resolution, film) for film in ("phasor", "histogram")}
+    seeds, steps, resolution = (options.seeds[:1], 60, 8) if options.smoke else (options.seeds, 300, 16)
+    tt.threads(1)
+    models = {f"{film} film": Model(resolution, film) for film in ("phasor", "histogram")}
     with torch.no_grad():
         light = models["phasor film"]([torch.tensor(value) for value in TRUTH], seed=1_000_003, spp=16_384)
-    truth = distances_to_wall(TRUTH, options.resolution)
+    truth = distances_to_wall(TRUTH, resolution)
     errors: dict[str, list[float]] = {name: [] for name in ("camera", "plane", *models)}
-    for seed in options.seeds:
+    for seed in seeds:
         measured = sensing.poisson(light, torch.Generator().manual_seed(seed))
         depth = sensing.read_itof(measured, HERTZ, CODE.num_taps, max_depth_m=7.0).depth_m[0]
         naive, flat = depth - truth, plane_through(depth) - truth
-        fits = {"phasor film": fit(models["phasor film"], measured, seed, options.steps, options.spp)}
+        fits = {"phasor film": fit(models["phasor film"], measured, seed, steps)}
         budget = fits["phasor film"].seconds[-1]
-        fits["histogram film"] = fit(models["histogram film"], measured, seed, options.steps, options.spp, budget)
+        fits["histogram film"] = fit(models["histogram film"], measured, seed, steps, budget)
         found = (rms_mm(naive), rms_mm(flat), *(one.errors_mm[-1] for one in fits.values()))
         for values, error in zip(errors.values(), found, strict=True):
             values.append(error)
         print(
-            f"fit_phasors, seed {seed}: error of the distances {found[0]:.2f} mm by the camera, {found[1]:.2f} by a "
-            f"plane through it, {found[2]:.3f} by the fit (start {fits['phasor film'].errors_mm[0]:.0f}; {budget:.1f} "
-            f"s), {found[3]:.3f} with a histogram film; albedo of the panel {fits['phasor film'].values[4]:.3f}"
+            f"fit_phasors, seed {seed}: {found[0]:.2f} mm (rms) by the camera, {found[1]:.2f} by a plane through it, "
+            f"{found[2]:.3f} by the fit with a phasor film ({budget:.1f} s), {found[3]:.3f} with a histogram film"
         )
-        if seed == options.seeds[0]:
+        if seed == seeds[0]:
             options.output.mkdir(parents=True, exist_ok=True)
             draw(options.output / "fit_phasors.png", naive, flat, fits)
     return errors

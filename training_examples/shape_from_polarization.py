@@ -36,8 +36,8 @@ KEY = "relief.vertex_positions"
 AXIS = tt.TimeAxis(0.4, 0.0375, 32)  # 125 ps a bin
 PULSE = tt.Pulse.gaussian(0.3)  # 1 ns
 WIDTH, SIDE, CELLS, WAVES = 0.03, 0.05, 40, 20
-DISTANCE, INCIDENCE_DEG = 0.5, 50.0
-PIXELS = (24, 16)
+DISTANCE, INCIDENCE, PIXELS = 0.5, math.radians(50.0), (24, 16)
+PHOTONS = 1e6  # of a pixel without filters
 SHARES = {
     "S0 alone": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
     "Stokes": sensing.linear_analysers([0.0, 45.0, 90.0, 135.0], transmission=0.25),
@@ -46,8 +46,7 @@ SHARES = {
 
 def scene() -> dict[str, Any]:
     """A plate of plastic in the plane z = 0, a camera with a lamp at the same place above it, aside by 50 degrees."""
-    angle = math.radians(INCIDENCE_DEG)
-    eye = [0.0, -DISTANCE * math.sin(angle), DISTANCE * math.cos(angle)]
+    eye = [0.0, -DISTANCE * math.sin(INCIDENCE), DISTANCE * math.cos(INCIDENCE)]
     vertices, faces = plate(SIDE, SIDE, cells=CELLS)
     film = transient_film(PIXELS, AXIS.num_bins, AXIS.start_opl, AXIS.bin_width_opl)
     fov = 2 * math.degrees(math.atan(WIDTH / PIXELS[0] * PIXELS[1] / 2 / DISTANCE))
@@ -65,7 +64,7 @@ def scene() -> dict[str, Any]:
 
 def grid() -> tuple[Tensor, Tensor]:
     """(N, N) each: x and y of the vertices, metres."""
-    y, x = torch.meshgrid(*[torch.linspace(-SIDE / 2, SIDE / 2, CELLS + 1)] * 2, indexing="ij")
+    x, y = torch.meshgrid(*[torch.linspace(-SIDE / 2, SIDE / 2, CELLS + 1)] * 2, indexing="xy")
     return x, y
 
 
@@ -94,8 +93,7 @@ def normals(heights: Tensor) -> Tensor:
 def seen() -> Tensor:
     """(N, N): which vertices the camera sees, with a margin of a millimetre."""
     x, y = grid()
-    height = WIDTH / PIXELS[0] * PIXELS[1] / math.cos(math.radians(INCIDENCE_DEG))
-    return (x.abs() < WIDTH / 2 - 1e-3) & (y.abs() < height / 2 - 1e-3)
+    return (x.abs() < WIDTH / 2 - 1e-3) & (y.abs() < WIDTH / PIXELS[0] * PIXELS[1] / math.cos(INCIDENCE) / 2 - 1e-3)
 
 
 class Model(torch.nn.Module):
@@ -134,7 +132,7 @@ def fit(model: Model, counts: Tensor, shares: Tensor, seed: int, steps: int, spp
     optimizer = torch.optim.Adam([shape], lr=0.3, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     total = counts.sum((0, 2), keepdim=True)
-    found = Fit(torch.zeros(CELLS + 1, CELLS + 1), [errors_of(torch.zeros(CELLS + 1, CELLS + 1))])
+    found = Fit(flat := torch.zeros(CELLS + 1, CELLS + 1), [errors_of(flat)])
     began = time.process_time()
     for step in tqdm(range(steps), desc=f"{len(shares)} detectors", unit="step", leave=False):
         light = model(waves() @ (scale * shape) @ waves().T, shares, step + 10_000 * seed, spp)
@@ -152,12 +150,11 @@ def fit(model: Model, counts: Tensor, shares: Tensor, seed: int, steps: int, spp
 
 def draw(path: Path, fits: dict[str, Fit]) -> None:
     """The reliefs under a slanting lamp, cut to what the camera sees, and the errors over the steps."""
-    figure = figure_type()(figsize=(12, 3.3), layout="constrained")
+    figure = figure_type()(figsize=(12, 3.5), layout="compressed")
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.2))
-    lamp = torch.tensor([-0.6, 0.5, 0.62])
     shown = {"truth": true_heights(), **{name: one.heights for name, one in fits.items()}}
     for panel, (name, heights) in zip(panels, shown.items(), strict=False):
-        picture = (normals(heights) @ lamp).clamp_min(0)
+        picture = (normals(heights) @ torch.tensor([-0.6, 0.5, 0.62])).clamp_min(0)
         picture[~seen()[1:-1, 1:-1]] = torch.nan
         rows, columns = (part.any(dim).nonzero() for dim in (1, 0) for part in [picture.isfinite()])
         cut = picture[int(rows[0]) : int(rows[-1]) + 1, int(columns[0]) : int(columns[-1]) + 1]
@@ -174,32 +171,25 @@ def main(argv: Sequence[str] | None = None) -> dict[str, list[tuple[float, float
     """Command line. Returns the last errors (mm, degrees) of both fits, one of each seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="noise of the counts (%(default)s)")
-    parser.add_argument("--steps", type=int, default=200, help="steps of Adam (%(default)s)")
-    parser.add_argument("--spp", type=int, default=32, help="samples per pixel and step (%(default)s)")
-    parser.add_argument("--photons", type=float, default=1e6, help="counts of a pixel without filters (%(default)g)")
     parser.add_argument("--smoke", action="store_true", help="one seed, few steps")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="of the picture (%(default)s)")
     options = parser.parse_args(argv)
-    if options.smoke:
-        options.seeds, options.steps, options.spp = options.seeds[:1], 60, 8
+    seeds, steps, spp = (options.seeds[:1], 60, 8) if options.smoke else (options.seeds, 200, 32)
+    tt.threads(1)
     model = Model()
     with torch.no_grad():
         light = {name: model(true_heights(), shares, 1_000_003, 4096) for name, shares in SHARES.items()}
-    exposure = options.photons / light["S0 alone"].sum(2).mean()
+    exposure = PHOTONS / light["S0 alone"].sum(2).mean()
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in SHARES}
-    for seed in options.seeds:
+    for seed in seeds:
         fits = {}
         for name, shares in SHARES.items():
             counts = sensing.poisson(exposure * light[name], torch.Generator().manual_seed(seed))
-            fits[name] = fit(model, counts, shares, seed, options.steps, options.spp)
+            fits[name] = fit(model, counts, shares, seed, steps, spp)
             errors[name].append(fits[name].errors[-1])
-        (start_mm, start_deg), seconds = fits["Stokes"].errors[0], fits["Stokes"].seconds
-        print(
-            f"shape_from_polarization, seed {seed}: heights and normals off by {start_mm:.2f} mm, {start_deg:.1f} "
-            f"degrees before, {errors['S0 alone'][-1][0]:.3f} mm, {errors['S0 alone'][-1][1]:.2f} degrees by S0 alone, "
-            f"{errors['Stokes'][-1][0]:.3f} mm, {errors['Stokes'][-1][1]:.2f} degrees by Stokes ({seconds:.1f} s)"
-        )
-        if seed == options.seeds[0]:
+            said = "{:.3f} mm, {:.2f} degrees ({:.1f} s of one core)".format(*errors[name][-1], fits[name].seconds)
+            print(f"shape_from_polarization, seed {seed}, {name}: {said}")
+        if seed == seeds[0]:
             options.output.mkdir(parents=True, exist_ok=True)
             draw(options.output / "shape_from_polarization.png", fits)
     return errors

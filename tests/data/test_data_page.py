@@ -139,6 +139,9 @@ def test_augmented(names):
     assert torch.equal(names["augmented"][0]["depth"].nan_to_num(), turned["depth"].nan_to_num())
     first, same = names["pair"][1], plain["depth"]
     assert torch.equal(first, same) or torch.equal(first, same.flip(-1))
+    # Every pixel four times.
+    assert torch.equal(names["finer"]["depth"].nan_to_num(), plain["depth"].repeat_interleave(2, -1)
+                       .repeat_interleave(2, -2).nan_to_num())  # fmt: skip
     assert names["smooth"].shape == plain["transient"].shape
     assert torch.equal(names["filtered"][0]["measurement"], names["smooth"])
 

@@ -82,14 +82,16 @@ def test_the_score_has_mean_zero_at_the_truth(loss, draw):
 
 @each
 def test_finite_for_no_light_and_no_counts(loss, draw):
-    for n_value, r_value in ((0.0, 0.0), (0.0, 0.3), (3.0, 0.0), (3.0, 1e-30)):
+    for n_value, r_value in ((0.0, 0.0), (0.0, 0.3), (3.0, 0.0), (60.0, 0.0), (3.0, 1e-30), (60.0, 1e-38)):
         n = torch.full((1, 4, 1, 1), n_value)
         r = torch.full((1, 4, 1, 1), r_value, requires_grad=True)
         value = loss(n, r, floor=1e-4)
         value.backward()
         assert bool(torch.isfinite(value)) and bool(torch.isfinite(r.grad).all())
-        default = loss(n, r) if r_value > 1e-20 or n_value == 0 else None
-        assert default is None or bool(torch.isfinite(default))
+        leaf = r.detach().clone().requires_grad_()
+        default = loss(n, leaf)
+        default.backward()
+        assert bool(torch.isfinite(default.detach())) and bool(torch.isfinite(leaf.grad).all())
 
 
 @each

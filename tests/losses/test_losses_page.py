@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import pkgutil
 import re
@@ -9,10 +10,13 @@ from pathlib import Path
 
 import torch
 
-from support.loss_cases import OTHERS
+from support.loss_cases import CASES, OTHERS
 from torchtransient import losses
+from torchtransient.errors import ShapeError
 
 PAGE = (Path(__file__).parents[2] / "docs" / "losses.md").read_text(encoding="utf-8")
+# By the row of another: "their `*_nll`", and phasors of transients.
+SHARED_FLOORS = ("poisson_nll", "first_photon_nll", "transient_phasor_loss")
 
 
 def test_its_program_runs():
@@ -31,6 +35,43 @@ def test_its_names_are_those_of_the_room():
     assert named | parts == functions
     likely = re.findall(r"`(?:tt\.losses\.)?([a-z_]+(?:_loss|_nll|_variation|_consistency|_distance))\b", PAGE)
     assert set(likely) <= functions
+
+
+def asks_for_dim(case):
+    """Of lists of points, without levels that are given: a scale is then that of an item."""
+    known = {name: value for name, value in case.options.items() if name not in ("floor", "background")}
+    x, y = (t.flatten(-2) for t in case.tensors())
+    if "operator" in known:
+        known["operator"], x = torch.clone, y  # one that takes lists
+    try:
+        dataclasses.replace(case, options=known)(x, y)
+    except ShapeError as error:
+        return "expected dim=" in str(error)
+    return False
+
+
+def test_what_asks_for_dim_is_said():
+    """The paragraph names all losses that do, and no other."""
+    (text,) = re.findall(r"\nIt is asked for by (.*?)\. All", PAGE, re.DOTALL)
+    functions = {name for name in dir(losses) if name.islower() and inspect.isfunction(getattr(losses, name))}
+    asking = {case.function.__name__ for case in CASES if asks_for_dim(case)}
+    for function, call in OTHERS.items():
+        try:
+            call(torch.rand(2, 8, 9))
+        except ShapeError as error:
+            asking |= {function.__name__} if "expected dim=" in str(error) else set()
+    assert set(re.findall(r"`(\w+)`", text)) & functions == asking
+
+
+def test_every_floor_is_in_the_table():
+    """Of what has one as an argument."""
+    (table,) = re.findall(r"\| loss \| floor \|.*?\n\n", PAGE, re.DOTALL)
+    for name in dir(losses):
+        function = getattr(losses, name)
+        if inspect.isfunction(function) and {"floor", "background", "smoothing"} & set(
+            inspect.signature(function).parameters
+        ):
+            assert re.search(rf"`{name}\b", table) or name in SHARED_FLOORS, name
 
 
 def test_names_elsewhere_are_there():

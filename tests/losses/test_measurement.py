@@ -91,6 +91,9 @@ def test_an_operator_of_the_library_learns_a_volume():
     fk = FK(scan, time_axis=TimeAxis(0.0, 0.1, 8), dtype=torch.float64)
     loss = losses.MeasurementConsistency(fk, reduction="sum")
     assert any(module is fk for module in loss.modules())
+    # it has no tensors but those
+    assert {name.partition(".")[0] for name, _ in loss.named_buffers()} == {"operator"}
+    assert set(loss.state_dict()) == {f"operator.{name}" for name in fk.state_dict()}
     truth = torch.complex(draw(1, 8, 4, 4), draw(1, 8, 4, 4, seed=1))
     measured = fk(truth)
     volume = torch.zeros_like(truth, requires_grad=True)

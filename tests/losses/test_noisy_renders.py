@@ -127,6 +127,7 @@ def test_the_schedule_doubles():
     schedule = losses.SampleSchedule(64, 512, 100)
     assert [schedule(k) for k in (0, 59, 60, 73, 74, 87, 99, 100, 1000)] == [64, 64, 128, 128, 256, 512, 512, 512, 512]
     assert [losses.SampleSchedule(16, 100, 10, hold=0.0)(k) for k in (0, 4, 7, 9)] == [32, 64, 100, 100]
+    assert losses.SampleSchedule(64, 100, 10)(10) == 100  # no power of two times 64: the end is what was asked for
     assert losses.SampleSchedule(32, 32, 5)(3) == 32 and losses.SampleSchedule(32, 64, 5, hold=1.0)(4) == 32
 
 
@@ -145,6 +146,17 @@ def test_samples_that_are_needed():
     ):
         with pytest.raises(UnitError, match="SampleSchedule"):
             call()
+
+
+@pytest.mark.parametrize(
+    "spp, bias, allowed", [(64, 1e300, 1e-300), (64, 1e200, 1.0), (64, 2.0**27, 1.0), (3, 2.0**31, 1.0)]
+)
+def test_more_samples_than_there_are(spp, bias, allowed):
+    """2^32 are the last; a quotient may be infinite."""
+    with pytest.raises(UnitError, match=r"^SampleSchedule.needed: .*2\^32 .*Allow a tenth"):
+        losses.SampleSchedule.needed(spp, bias, allowed)
+    assert losses.SampleSchedule.needed(64, 2.0**26, 1.0) == 2**32
+    assert losses.SampleSchedule.needed(64, -1e300, 1e-300) == 64
 
 
 # --------------------------------------------------------------------------------------------------------- running sums

@@ -92,12 +92,28 @@ def test_results_without_what_is_compared(case):
     assert str(caught.value).startswith(case.function.__name__ + ":")
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if attribute_of(c) == "transient" and c.pair], ids=str)
+def two_records(case):
+    """Whether both results have an axis: a volume has none."""
+    return attribute_of(case) == "transient" and case.pair and case.function is not losses.measurement_consistency
+
+
+def test_a_volume_has_no_axis():
+    """Beside a measurement, whose `dim` is taken; a record in the place of a volume is refused."""
+    x, y = torch.rand(1, BINS, 3, 3), torch.rand(1, BINS, 3, 3)
+    loss = functools.partial(losses.measurement_consistency, operator=lambda v: 2 * v, scale_invariant=True)
+    scan = SimpleNamespace(shape=(3, 3))
+    torch.testing.assert_close(loss(own(None, x, "values"), result(y, scan=scan)), loss(x, y, dim=-3))
+    listed = x.flatten(2), y.flatten(2)
+    found = loss(own(None, listed[0], "values"), result(listed[1], scan=SimpleNamespace(shape=(9,))))
+    torch.testing.assert_close(found, loss(*listed, dim=-2))
+    with pytest.raises(ShapeError, match="expected volume to be a tensor or a result with values"):
+        loss(result(x), result(y))
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if two_records(case)], ids=str)
 def test_results_on_two_axes(case):
     """A bin of another place, not one of another rounding."""
     x, y = case.tensors()
-    if case.function is losses.measurement_consistency:
-        return  # its first result is a volume
     other = TimeAxis(AXIS.start_opl + 0.5 * AXIS.bin_width_opl, AXIS.bin_width_opl, BINS)
     a = own(case, x, "transient")
     with pytest.raises(UnitError, match="results on one axis") as caught:

@@ -237,6 +237,8 @@ def test_wrong_shapes(room_scene):
         renderer({COLOUR: torch.rand(0, 3)}, seed=0)
     with pytest.raises(tt.errors.ShapeError, match="one for each of 2 batch entries, got 3"):
         renderer({COLOUR: torch.rand(2, 3)}, seed=[1, 2, 3])
+    with pytest.raises(tt.errors.UnitError, match="1 and 4294967297 are one seed"):
+        renderer({COLOUR: torch.rand(2, 3)}, seed=(1, 1 + 2**32))
     with pytest.raises(tt.errors.ShapeError, match="start value"):
         tt.TransientRenderer(room_scene, parameters={COLOUR: torch.rand(2, 3)})
 

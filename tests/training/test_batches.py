@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from torchtransient.errors import StorageError, UnitError
-from torchtransient.training import Batches, worker_init
+from torchtransient.training import Batches, Seeds, worker_init
 
 
 def first(batches, count):
@@ -59,6 +59,8 @@ def test_a_state_of_another_order():
             other.load_state_dict(state)
     with pytest.raises(StorageError, match="expected the order"):
         Batches(10, 4).load_state_dict({})
+    with pytest.raises(StorageError, match="expected a state"):
+        Batches(10, 4).load_state_dict(None)
 
 
 def test_its_loader_leaves_random_numbers_alone():
@@ -66,6 +68,7 @@ def test_its_loader_leaves_random_numbers_alone():
     before = torch.get_rng_state()
     first = next(iter(batches.loader([1.0, 2.0, 3.0])))
     assert torch.equal(torch.get_rng_state(), before)
+    batches.step = 0
     # Another one of torch's does not, which is why it is there.
     assert next(iter(DataLoader([1.0, 2.0, 3.0], batch_sampler=batches))) == first
     assert not torch.equal(torch.get_rng_state(), before)
@@ -74,6 +77,75 @@ def test_its_loader_leaves_random_numbers_alone():
     assert (apart.worker_init_fn, apart.persistent_workers) == (worker_init, True)
     with pytest.raises(UnitError, match="of 3 samples, the data set has 2"):
         batches.loader([1.0, 2.0])
+
+
+def test_a_position_that_is_left_behind():
+    """An iterator does not move the position: what would silently begin there again is told."""
+    batches = Batches(6, 2)
+    loader = batches.loader(list(range(6)))
+    for step, _ in zip(range(3), loader, strict=False):
+        with pytest.raises(StorageError, match=r"Set batches\.step to the step that comes next"):
+            batches.state_dict()
+        batches.step = step + 1
+        assert batches.state_dict()["step"] == step + 1
+    next(iter(loader))
+    with pytest.raises(StorageError, match="would begin at step 3 again"):
+        next(iter(loader))
+    batches.step = 3
+    next(iter(loader))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_workers_of_ranks_draw_other_numbers(workers):
+    def drawn(rank, step=0, seed=0):
+        batches = Batches(8, 4, rank=rank, world_size=2, seed=seed)
+        batches.step = step
+        return next(iter(batches.loader(Drawing(), workers=workers))).tolist()
+
+    if workers:
+        cases = [drawn(0), drawn(1), drawn(0, step=1), drawn(0, seed=1)]
+        assert len({tuple(case) for case in cases}) == 4 and drawn(0) == cases[0]
+    own = torch.Generator().manual_seed(5)
+    assert Batches(8, 4).loader(Drawing(), generator=own).generator is own
+
+
+class Drawing(torch.utils.data.Dataset):
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, number):
+        return torch.rand(())
+
+
+def test_places_are_apart_where_numbers_come_twice():
+    batches = Batches(12, 8)
+    samples = batches.samples(1)
+    seeds = Seeds(0)
+    assert len(set(samples)) < 8 == len(set(seeds(1, batches.places(1))))
+    parts = [Batches(12, 8, rank=rank, world_size=2).places(1) for rank in (0, 1)]
+    assert parts[0] + parts[1] == batches.places(1)
+
+
+def test_large_seeds_and_few_workers():
+    batches = Batches(3, 1, seed=2**64)
+    assert next(iter(batches.loader([1.0, 2.0, 3.0]))) == batches.samples(0)[0] + 1
+    with pytest.raises(UnitError, match="workers"):
+        batches.loader([1.0, 2.0, 3.0], workers=-1)
+
+
+@pytest.mark.parametrize("options", [{"num_workers": 2}, {"batch_size": 3}, {"shuffle": True}])
+def test_what_the_loader_does_not_take(options):
+    with pytest.raises(UnitError, match="are said by the batches"):
+        Batches(3, 1).loader([1.0, 2.0, 3.0], **options)
+
+
+def test_streams_have_an_order_of_their_own():
+    class Stream(torch.utils.data.IterableDataset):
+        def __iter__(self):
+            yield from range(3)
+
+    with pytest.raises(UnitError, match="DataLoader\\(stream"):
+        Batches(3, 1).loader(Stream())
 
 
 @pytest.mark.parametrize(

@@ -247,8 +247,13 @@ def test_states_are_data(tmp_path):
 
 def test_a_part_that_does_not_take_its_state(tmp_path):
     path, model = tmp_path / "run.pt", tiny()
-    save_checkpoint(path, {"optimizer": torch.optim.SGD(model.parameters())}, step=0)
-    other = torch.optim.SGD([{"params": [model.weight]}, {"params": [model.bias]}])
+    save_checkpoint(path, {"optimizer": _Kept({"a": 1})}, step=0)
+
+    class Other(_Kept):
+        def load_state_dict(self, state):
+            raise KeyError("b")
+
+    other = Other({"b": model})
     with pytest.raises(StorageError, match=r"'optimizer' does not take its state: .*made anew"):
         load_checkpoint(path, {"optimizer": other})
 
@@ -288,3 +293,108 @@ def test_lazy_modules(tmp_path):
     lazy = nn.LazyLinear(2)
     load_checkpoint(path, {"model": lazy})
     assert lazy.weight.shape == (2, 3)
+
+
+def stepped(kind, model, **options):
+    """An optimiser that has made a step."""
+    optimizer = kind(model.parameters(), lr=0.1, **options)
+    model(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    return optimizer
+
+
+def test_what_one_part_refuses_changes_no_other(tmp_path):
+    """Also what torch would take, and fail with at the next step."""
+    path, donor = tmp_path / "run.pt", tiny(1.0)
+    adam = stepped(torch.optim.Adam, donor)
+    weight = float(donor.weight[0, 0].detach())
+    save_checkpoint(path, {"model": donor, "other": adam, "batches": Batches(10, 4)}, step=1)
+    model, order = tiny(3.0), Batches(10, 4)
+    wide, extra = nn.Linear(3, 1), nn.Linear(1, 1)
+    split = [{"params": [model.weight]}, {"params": [model.bias]}]
+    wrong = [
+        (torch.optim.Adam(model.parameters()), Batches(10, 5), StorageError, "repeat some samples"),
+        (torch.optim.SGD(model.parameters()), order, StorageError, "another kind of optimiser, it lacks .*momentum"),
+        (torch.optim.Adam(wide.parameters()), order, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
+        (torch.optim.Adam(split), order, StorageError, r"groups of \[2\] parameters in the file, here of \[1, 1\]"),
+        (torch.optim.Adam([*model.parameters(), *extra.parameters()]), order, StorageError, r"here of \[4\]"),
+    ]
+    for optimizer, batches, error, message in wrong:
+        with pytest.raises(error, match=message):
+            load_checkpoint(path, {"model": model, "other": optimizer, "batches": batches})
+        assert model.weight[0, 0] == 3.0
+    right = torch.optim.Adam(model.parameters())
+    load_checkpoint(path, {"model": model, "other": right, "batches": order})
+    assert float(model.weight[0, 0].detach()) == weight and right.state_dict()["state"].keys() == {0, 1}
+
+
+def test_random_numbers_of_other_devices_change_nothing(tmp_path):
+    path = tmp_path / "run.pt"
+    save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    content = torch.load(path, weights_only=True)
+    content["random"][0]["cuda"] = [torch.zeros(16, dtype=torch.uint8)] * (torch.cuda.device_count() + 1)
+    torch.save(content, path)
+    model = tiny(3.0)
+    with pytest.raises(StorageError, match="CUDA devices"):
+        load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 3.0
+
+
+def test_compiled_modules_are_stored_as_they_were(tmp_path):
+    path, model = tmp_path / "run.pt", tiny(3.0)
+    save_checkpoint(path, {"model": torch.compile(tiny(1.0))}, step=1)
+    load_checkpoint(path, {"model": model})
+    assert model.weight[0, 0] == 1.0
+    save_checkpoint(path, {"model": model}, step=1)
+    other = tiny(3.0)
+    load_checkpoint(path, {"model": torch.compile(other)})
+    assert other.weight[0, 0] == 1.0
+
+
+def test_generators_are_those_of_every_rank(tmp_path, monkeypatch):
+    path, noise = tmp_path / "run.pt", torch.Generator().manual_seed(1)
+    save_checkpoint(path, {"noise": noise}, step=1)
+    expected = torch.rand(1, generator=noise)
+    load_checkpoint(path, {"noise": noise})
+    assert torch.equal(torch.rand(1, generator=noise), expected)
+    monkeypatch.setattr(checkpoint, "_size", lambda: 2)
+    with pytest.raises(StorageError, match="a generator of each of 1 ranks, expected 2"):
+        load_checkpoint(path, {"noise": noise}, random=False)
+
+
+class _Converted(nn.Linear):
+    """Its weights of version 1 were transposed."""
+
+    _version = 2
+
+    def __init__(self):
+        super().__init__(2, 2, bias=False)
+
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *others):
+        if local_metadata.get("version", 1) < 2:
+            state_dict[prefix + "weight"] = state_dict[prefix + "weight"].T
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *others)
+
+
+def test_versions_of_modules_come_along(tmp_path):
+    path, module, other = tmp_path / "run.pt", _Converted(), _Converted()
+    save_checkpoint(path, {"m": nn.Sequential(module)}, step=0)
+    load_checkpoint(path, {"m": nn.Sequential(other)})
+    assert torch.equal(other.weight, module.weight)
+
+
+def test_what_cannot_be_written_or_read(tmp_path):
+    path, itself = tmp_path / "run.pt", []
+    itself.append(itself)
+    for where, parts, values, message in (
+        (path, {}, [1, 2], "values as a dictionary"),
+        (path, {}, {"a": itself}, "hold themselves"),
+        (path, {"m": nn.LazyLinear(2)}, {}, "has no shape yet"),
+        (".", {}, {}, "no name of a file"),
+        (tmp_path, {}, {}, "cannot be written"),
+    ):
+        with pytest.raises(StorageError, match=message):
+            save_checkpoint(where, parts, step=0, values=values)
+    save_checkpoint(path, {"m": tiny(1.0).double()}, step=0)
+    with pytest.raises(ShapeError, match=r"expected torch\.float32, the file has torch\.float64"):
+        load_checkpoint(path, {"m": tiny()})

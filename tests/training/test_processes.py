@@ -65,6 +65,33 @@ def test_broken_settings(monkeypatch):
         pass
 
 
+@pytest.mark.parametrize("changed", [{"RANK": 3}, {"RANK": 1}, {"LOCAL_RANK": 5}])
+def test_ranks_beyond_their_number(monkeypatch, changed):
+    """Which would wait for others that never come, or leave nobody to write."""
+    torchrun(monkeypatch, 0, 1)
+    for name, value in changed.items():
+        monkeypatch.setenv(name, str(value))
+    with pytest.raises(UnitError, match="RANK below WORLD_SIZE"), ranks():
+        pass
+
+
+def test_groups_that_cannot_be_joined(monkeypatch):
+    torchrun(monkeypatch, 0, 2)
+    for name in ("MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UnitError, match=r"cannot be joined.*torchrun"), ranks():
+        pass
+    monkeypatch.setattr(dist, "is_initialized", lambda: True)
+    with pytest.raises(DeviceError, match="in a group already"), ranks():
+        pass
+
+
+@pytest.mark.parametrize("value", [torch.ones(2), "1", None, [1.0]])
+def test_means_of_what_is_no_number(value):
+    with ranks() as found, pytest.raises(UnitError, match="one number to take the mean of"):
+        found.mean(value)
+
+
 @pytest.mark.parametrize(("seen", "shown"), [(None, "1"), ("4,6", "6")])
 def test_a_rank_is_shown_its_own_device(monkeypatch, seen, shown):
     torchrun(monkeypatch, 1, 2)

@@ -12,10 +12,7 @@ import pytest
 FILES = sorted((Path(__file__).parents[2] / "training_examples").glob("*.py"))
 SCRIPTS = [path for path in FILES if '__name__ == "__main__"' in path.read_text(encoding="utf-8")]
 # Those that have no test of their own which runs them so.
-NO_FILES = (
-    "bottle", "denoise_before_fk", "fit_albedo", "fit_glass_index", "fit_phasors",
-    "fit_wall", "shape_from_polarization",
-)  # fmt: skip
+NO_FILES = ("bottle", "denoise_before_fk", "fit_albedo", "fit_glass_index", "fit_wall")
 
 
 @pytest.mark.parametrize("part", sorted(set(FILES) - set(SCRIPTS)), ids=lambda path: path.stem)

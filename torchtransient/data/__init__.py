@@ -8,6 +8,7 @@ from torchtransient.data.augmentation.operations import Crop as Crop
 from torchtransient.data.augmentation.operations import Flip as Flip
 from torchtransient.data.augmentation.operations import Operation as Operation
 from torchtransient.data.augmentation.operations import QuarterTurn as QuarterTurn
+from torchtransient.data.augmentation.pixel_map import PixelMap as PixelMap
 from torchtransient.data.augmentation.spatial_filter import SpatialFilter as SpatialFilter
 from torchtransient.data.augmentation.spatial_filter import spatial_filter as spatial_filter
 from torchtransient.data.generation.generate import Generated as Generated

@@ -26,7 +26,6 @@ from torchtransient.losses.likelihoods import poisson_nll as poisson_nll
 from torchtransient.losses.likelihoods import read_noise_nll as read_noise_nll
 from torchtransient.losses.likelihoods import relative_floor as relative_floor
 from torchtransient.losses.measurement import MeasurementConsistency as MeasurementConsistency
-from torchtransient.losses.measurement import PairLoss as PairLoss
 from torchtransient.losses.measurement import SquaredLoss as SquaredLoss
 from torchtransient.losses.measurement import measurement_consistency as measurement_consistency
 from torchtransient.losses.measurement import squared_loss as squared_loss
@@ -39,6 +38,7 @@ from torchtransient.losses.multiscale import multiscale_loss as multiscale_loss
 from torchtransient.losses.noisy_renders import SampleSchedule as SampleSchedule
 from torchtransient.losses.noisy_renders import TwoRenderLoss as TwoRenderLoss
 from torchtransient.losses.noisy_renders import two_render_loss as two_render_loss
+from torchtransient.losses.pair_losses import PairLoss as PairLoss
 from torchtransient.losses.phasors import PhasorLoss as PhasorLoss
 from torchtransient.losses.phasors import TransientPhasorLoss as TransientPhasorLoss
 from torchtransient.losses.phasors import phasor_loss as phasor_loss

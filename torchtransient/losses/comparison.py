@@ -202,6 +202,16 @@ def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
     return x if mask is None else torch.where(mask, x, torch.full_like(x, fill))
 
 
+def squared_modulus(x: Tensor) -> Tensor:
+    """`|x|^2`, real or complex, with a slope at zero (that of the modulus has none)."""
+    return x.real.square() + x.imag.square() if x.is_complex() else x.square()
+
+
+def real_product(x: Tensor, y: Tensor) -> Tensor:
+    """`Re(x conj(y))` of two real or two complex tensors."""
+    return x.real * y.real + x.imag * y.imag if x.is_complex() else x * y
+
+
 def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None = None) -> Tensor:
     """The values, their sum or their mean over what counts; 0 where nothing does."""
     check_reduction(reduction, where)

@@ -19,7 +19,7 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import bin_width, bins_dim, check_held
-from torchtransient.losses.measured import TRANSIENT, Transient, reads
+from torchtransient.losses.results import TRANSIENT, Transient, reads
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)

@@ -25,7 +25,7 @@ from torchtransient.losses.comparison import (
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import as_columns, bins_dim, check_held
 from torchtransient.losses.likelihoods import Options, check_constant, check_counts, check_rates, floored
-from torchtransient.losses.measured import TRANSIENT, Transient, reads
+from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.spad import first_photon_log_prob
@@ -105,7 +105,7 @@ def _first_photon(
     check_rates(rate, where)
     measured = _exact(measured, mask, dim)
     check_constant(measured, options.constant, where)
-    n, r = (as_columns(x, dim) for x in (measured, floored(rate, options, mask, where)))
+    n, r = (as_columns(x, dim) for x in (measured, floored(rate, measured / number, options, mask, where)))
     value = -first_photon_log_prob(n, r, number, dead, constant=options.constant, where=where).reshape(rate.shape)
     return _reduce(value, options.reduction, where, mask)
 
@@ -167,7 +167,8 @@ def free_running_nll(
             f"{where}: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
             "got more. Check periods and dead time."
         )
-    r = as_columns(floored(rate, Options(floor, dim, mask, reduction), mask, where), dim).to(torch.float64)
+    rate = floored(rate, n.reshape(rate.shape) / periods, Options(floor, dim, mask, reduction), mask, where)
+    r = as_columns(rate, dim).to(torch.float64)
     hit = n != 0
     value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)

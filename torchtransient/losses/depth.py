@@ -16,7 +16,7 @@ from torchtransient.losses.comparison import (
     counted,
     reduce,
 )
-from torchtransient.losses.measured import DEPTH, DepthMap, reads
+from torchtransient.losses.results import DEPTH, DepthMap, reads
 from torchtransient.quantities import finite, shown
 
 

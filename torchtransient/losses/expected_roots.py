@@ -22,7 +22,7 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
-from torchtransient.losses.measured import LIGHT, Light, reads
+from torchtransient.losses.results import LIGHT, Light, reads
 from torchtransient.losses.roots import anscombe
 
 _OFFSET = Fraction(3, 8)
@@ -72,15 +72,16 @@ def _correction(mean: Tensor) -> Tensor:
     """`E[2 sqrt(n + 3/8)] - 2 sqrt(m + 3/8)`, in s = sqrt(m + 3/8), which has a slope at m = 0."""
     s = (mean + float(_OFFSET)).sqrt()
     tail = torch.where(s < _LAST, torch.full_like(s, _LAST), s)
-    series = torch.zeros_like(s)
-    for coefficient in reversed(_TAIL):
-        series = series / tail.square() + coefficient
+    near, series = tail.square().reciprocal(), torch.full_like(s, _TAIL[-1])
+    for coefficient in reversed(_TAIL[:-1]):
+        series = torch.addcmul(s.new_full((), coefficient), series, near)
     place = ((torch.where(s < _LAST, s, torch.full_like(s, _FIRST)) - _FIRST) / _SPACING).clamp_min(0)
-    number = place.detach().floor().clamp_max(len(_PIECES) - 1).nan_to_num(0).long()
-    pieces = _PIECES.to(s)
-    part, value = place - number, torch.zeros_like(s)
-    for power in reversed(range(6)):
-        value = value * part + pieces[:, power][number]
+    number = place.detach().floor().clamp_max(_PIECES.shape[1] - 1).nan_to_num(0).long()
+    # one row a power: gathered from a line of its own, which is twice as fast as along the columns of a table
+    rows = [row.index_select(0, number.flatten()).reshape(s.shape) for row in _PIECES.to(s)]
+    part, value = place - number, rows[-1]
+    for row in reversed(rows[:-1]):
+        value = torch.addcmul(row, value, part)
     return torch.where(s < _LAST, value, series / tail)
 
 
@@ -108,7 +109,7 @@ def _tail() -> list[float]:
 
 
 def _pieces() -> tuple[Tensor, float]:
-    """Coefficients (pieces, 6) of quintics that meet value, slope and curvature of the correction at both their ends.
+    """Coefficients (6, pieces) of quintics that meet value, slope and curvature of the correction at both their ends.
 
     Slopes of means over Poisson counts are means of differences: `d/dm E g(n) = E[g(n + 1) - g(n)]`.
     """
@@ -129,7 +130,7 @@ def _pieces() -> tuple[Tensor, float]:
     c3 = 10 * rest - 4 * rest1 + rest2 / 2
     c4 = -15 * rest + 7 * rest1 - rest2
     c5 = 6 * rest - 3 * rest1 + rest2 / 2
-    return torch.stack([c0, c1, c2, c3, c4, c5], 1), spacing
+    return torch.stack([c0, c1, c2, c3, c4, c5]), spacing
 
 
 _TAIL = _tail()

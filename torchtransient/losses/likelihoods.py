@@ -1,8 +1,9 @@
 """Negative log-likelihoods that match the noise of the sensors: Poisson and read noise, and what all of them share.
 
 All take rates or means (..., C, T, H, W) and measurements of the same shape, and are finite, with finite gradients, at
-zero counts and in empty bins. Where the model says "impossible" (a count where the mean is 0) a floor keeps them so:
-`floor`, in the unit of the mean, is added to it. Counts below 0 (those of a normal surrogate) enter the same formulas,
+zero counts, in empty bins and of a model without any light. Where the model says "impossible" (a count where the mean
+is 0) a floor keeps them so: `floor`, in the unit of the mean, is added to it (0 is the exact likelihood, which is
+infinite there). Counts below 0 (those of a normal surrogate) enter the same formulas,
 which are linear in them: the gradient stays unbiased. With `constant` there is no such formula, and they are an error.
 NaN in what counts, in counts or model, is NaN in the loss. Terms that do not depend on the mean are left out unless
 `constant`. Counts may be whole numbers, truth values of frames, or half precision; the loss is computed and returned in
@@ -35,10 +36,13 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import check_held, item_dims
-from torchtransient.losses.measured import LIGHT, Light, reads
+from torchtransient.losses.results import LIGHT, Light, reads
 
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
 _RELATIVE_FLOOR = 1e-3
+# Of the counts of an item: a model that is darker than that has the floor of one that is as bright. Small enough that
+# no model that is about right has a floor made of noise; continuous: the loss falls all the way out of the dark.
+_DARK = 0.1
 
 
 class Options(NamedTuple):
@@ -72,37 +76,51 @@ def check_constant(counts: Tensor, constant: bool, where: str) -> None:
         raise UnitError(f"{where}: expected counts >= 0 with constant=True, got negative ones. Leave the constant out.")
 
 
-def floored(model: Tensor, options: Options, mask: Tensor | None, where: str) -> Tensor:
+def floored(model: Tensor, expected: Tensor, options: Options, mask: Tensor | None, where: str) -> Tensor:
+    """The model over its floor; `expected`: what was measured, in the unit of the model."""
     if options.floor is None:
-        return model + _relative_floor(model, item_dims(model, options.dim, where, " or floor="), mask)
+        return model + _relative_floor(model, item_dims(model, options.dim, where, " or floor="), mask, expected)
     return model + check_level("floor", options.floor, model, where, zero=True)
 
 
 def relative_floor(
-    model: Tensor, share: float = _RELATIVE_FLOOR, mask: Tensor | None = None, dim: int | None = None
+    model: Tensor,
+    share: float = _RELATIVE_FLOOR,
+    mask: Tensor | None = None,
+    dim: int | None = None,
+    measured: Tensor | None = None,
 ) -> Tensor:
     """`share` of the mean of each item (its C, T, H, W) of the model, without gradient: a floor that knows the scale.
 
-    Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one; an
-    item that is dark altogether has that of the whole batch, since a count in it has to cost something finite. `dim`:
-    where time is, which says what is an item (`losses.layouts`). `mask`: means are over what counts.
+    Broadcasts to `model`. Items of a batch have floors of their own, so that a bright one does not cover a dark one.
+    `measured`, of the shape and in the unit of the model: an item whose mean is below a tenth of that of its
+    measurement has the floor of one at a tenth, since a count in it has to cost something finite. Without it the
+    floor of an item that is dark altogether is the least positive number of the precision.
+    `dim`: where time is, which says what is an item (`losses.layouts`). `mask`: means are over what counts. Raises
+    ShapeError, UnitError, DeviceError.
     """
     where = "relative_floor"
     check_dense((model,), where)
     model = model.to(working_dtype((model,), where))
+    if measured is not None:
+        model, measured = check_pair(model, measured, where, names="model and measured")
     mask = check_mask(mask, model, where)
     part = check_level("share", share, model.new_empty(()), where)
-    return _relative_floor(model, item_dims(model, dim, where), mask, part)
+    return _relative_floor(model, item_dims(model, dim, where), mask, measured, part)
 
 
 def _relative_floor(
-    model: Tensor, dims: tuple[int, ...], mask: Tensor | None, share: Tensor | float = _RELATIVE_FLOOR
+    model: Tensor,
+    dims: tuple[int, ...],
+    mask: Tensor | None,
+    measured: Tensor | None,
+    share: Tensor | float = _RELATIVE_FLOOR,
 ) -> Tensor:
-    size = counted(model.detach(), mask).abs()
-    number = max(1, size.numel()) if mask is None else mask.sum().clamp_min(1)
-    whole = size.sum() / number
-    item = item_mean(model, dims, mask) if len(dims) < model.ndim else whole
-    return (share * torch.where(item > 0, item, whole)).clamp_min(torch.finfo(model.dtype).tiny)
+    item = item_mean(model, dims, mask)
+    if measured is not None:
+        least = _DARK * item_mean(measured.to(model.dtype), dims, mask)
+        item = torch.where(item < least, least, item)  # NaN of a bin that counts is no level
+    return (share * item).clamp_min(torch.finfo(model.dtype).tiny)
 
 
 @reads(counts=LIGHT, mean=LIGHT)
@@ -118,10 +136,10 @@ def poisson_nll(
 ) -> Tensor:
     """-log of the Poisson probability of `counts`: m - n log m (+ log n! with `constant`), m = mean + floor.
 
-    `floor` None: 1e-3 of the average of each item (`relative_floor`), which biases empty bins by as much; 0: the exact
-    likelihood, infinite where a count meets a mean of 0. Empty bins have value m and gradient 1 even at m = 0. A mean
-    that is a noisy render biases a fit, by many times the noise of the counts (docs/noisy_renders.md). Raises
-    ShapeError for different shapes, UnitError for negative means.
+    `floor` None: 1e-3 of the average of each item (`relative_floor`, of a dark one by its counts), which biases empty
+    bins by as much; 0: the exact likelihood, infinite where a count meets a mean of 0. Empty bins have value m and
+    gradient 1 even at m = 0. A mean that is a noisy render biases a fit, by many times the noise of the counts
+    (docs/noisy_renders.md). Raises ShapeError for different shapes, UnitError for negative means.
     """
     return _poisson(counts, mean, Options(floor, dim, mask, reduction, constant), "poisson_nll")
 
@@ -133,7 +151,7 @@ def _poisson(given: object, model: object, options: Options, where: str) -> Tens
     counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
     check_rates(mean, where)
     check_constant(counts, options.constant, where)
-    m = floored(mean, options, mask, where)
+    m = floored(mean, counts, options, mask, where)
     hit = counts != 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(hit, m, torch.ones_like(m)).log()

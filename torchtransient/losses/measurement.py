@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -21,27 +20,13 @@ from torchtransient.losses.comparison import (
     check_pair,
     check_reduction,
     counted,
+    real_product,
     reduce,
+    squared_modulus,
 )
 from torchtransient.losses.layouts import check_held, item_dims
-from torchtransient.losses.measured import LIGHT, VALUES, Light, Volume, reads
-
-# The first argument of likelihoods that are not losses (input, target): a model there would be taken for counts.
-_MEASUREMENT_FIRST = {"counts", "measured", "target"}
-
-
-class PairLoss(Protocol):
-    """A loss of this room that compares two tensors; `functools.partial` holds further options of one."""
-
-    def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
-
-
-class PairModule(Protocol):
-    """A loss of this room as a module, which holds a `reduction` of its own."""
-
-    reduction: Reduction
-
-    def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
+from torchtransient.losses.pair_losses import PairLoss, PairModule, check_compare
+from torchtransient.losses.results import LIGHT, VALUES, Light, Volume, reads
 
 
 @reads(input=LIGHT, target=LIGHT)
@@ -50,7 +35,7 @@ def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, red
     check_reduction(reduction, "squared_loss")
     input, target = check_pair(input, target, "squared_loss", complex_too=True)
     mask = check_mask(mask, input, "squared_loss")
-    return reduce(_power(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
+    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
 
 
 @reads(volume=VALUES, measured=LIGHT)
@@ -108,17 +93,15 @@ def _checked(
 ) -> Callable[[Tensor, Tensor, Tensor | None], Tensor]:
     """`compare` as a function (input, target, mask) with that reduction. Raises ShapeError."""
     check_function("the operator", operator, where)
-    check_function("compare", compare, where)
     check_flag("scale_invariant", scale_invariant, where)
+    check_compare(compare, where, reduction)
     if not isinstance(compare, nn.Module):
-        _check_arguments(compare, {"mask": None, "reduction": reduction}, getattr(compare, "__name__", ""), where)
         return functools.partial(_compared, cast(PairLoss, compare), reduction)
-    title = type(compare).__name__
-    _check_arguments(compare.forward, {"mask": None}, title, where)
     held = getattr(compare, "reduction", None)
     if held != reduction:
         raise ShapeError(
-            f"{where}: expected reduction {reduction!r} of compare, too, got {title} with {held!r}. Give both the same."
+            f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
+            "Give both the same."
         )
     return cast(PairModule, compare)
 
@@ -127,24 +110,6 @@ def _compared(
     compare: PairLoss, reduction: Reduction, input: Tensor, target: Tensor, mask: Tensor | None
 ) -> Tensor:
     return compare(input, target, mask=mask, reduction=reduction)
-
-
-def _check_arguments(function: Callable[..., object], names: dict[str, object], title: str, where: str) -> None:
-    """Raises ShapeError unless it is a function (model, measurement) with what is named, and of nothing else."""
-    title, wanted = title or type(function).__name__, ", ".join(f"{name}=" for name in names)
-    try:
-        bound = inspect.signature(function).bind(None, None, **names)
-    except (TypeError, ValueError) as error:
-        raise ShapeError(
-            f"{where}: expected compare to take (input, target, {wanted}) and no more, got "
-            f"{title}: {error}. functools.partial holds further arguments of a loss of tt.losses."
-        ) from None
-    first = next(iter(bound.arguments))
-    if first in _MEASUREMENT_FIRST:
-        raise ShapeError(
-            f"{where}: expected compare to take the model first, (input, target), got {title}, which takes {first} "
-            "first. Take poisson_loss or first_photon_loss, or turn it round in a function."
-        )
 
 
 def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:
@@ -157,19 +122,10 @@ def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tup
     # of a prediction whose peak is 1: squares neither overflow nor vanish
     peak = torch.where(dark, torch.ones_like(peak), peak)
     seen = seen / peak
-    power = _power(seen).sum(dims, keepdim=True)
-    along = _product(seen, counted(measured, mask)).sum(dims, keepdim=True)
+    power = squared_modulus(seen).sum(dims, keepdim=True)
+    along = real_product(seen, counted(measured, mask)).sum(dims, keepdim=True)
     scale = torch.where(dark, torch.ones_like(along), along / torch.where(dark, torch.ones_like(power), power))
     return seen * scale
-
-
-def _power(x: Tensor) -> Tensor:
-    return x.real.square() + x.imag.square() if x.is_complex() else x.square()
-
-
-def _product(x: Tensor, y: Tensor) -> Tensor:
-    """Re(x conj(y))."""
-    return x.real * y.real + x.imag * y.imag if x.is_complex() else x * y
 
 
 class SquaredLoss(nn.Module):

@@ -22,12 +22,10 @@ from torchtransient.losses.comparison import (
     reduce,
     working_dtype,
 )
-from torchtransient.losses.surface_distance import check_faces
+from torchtransient.losses.triangles import SHARPEST, check_faces, unit_normals
 from torchtransient.quantities import shown
 
 Weights = Literal["uniform", "cotangent"]
-# Of a right angle: the cotangent of the sharpest corner that is told from none.
-_SHARPEST = 1e-6
 
 
 def mesh_laplacian_smoothing(
@@ -84,7 +82,7 @@ def mesh_normal_consistency(
     corners = _hinges(faces)
     kept = None if keep is None else keep[..., corners].all(-1)
     a, b, c, d = (counted(vertices[..., corner, :], None if kept is None else kept[..., None]) for corner in corners.T)
-    ours, theirs = _normals(a, b, c), _normals(b, a, d)
+    ours, theirs = unit_normals(b - a, c - a), unit_normals(a - b, d - b)
     bent = 1 - (ours * theirs).sum(-1)
     flat = (ours.square().sum(-1) == 0) | (theirs.square().sum(-1) == 0)
     return reduce(torch.where(flat, torch.zeros_like(bent), bent), reduction, where, kept)
@@ -103,7 +101,7 @@ def _checked(vertices: Tensor, faces: Tensor, where: str) -> Tensor:
             f"{tuple(faces.shape)}."
         )
     vertices = vertices.to(working_dtype((vertices,), where))
-    check_faces(faces, vertices[..., 0].movedim(-1, 0), f"{where}: vertices")
+    check_faces(faces, vertices, f"{where}: vertices")
     return vertices
 
 
@@ -128,7 +126,7 @@ def _edges(vertices: Tensor, faces: Tensor, weights: Weights) -> tuple[Tensor, T
     longest = torch.maximum(a.abs().amax(-1), b.abs().amax(-1))[..., None]
     a, b = (x / torch.where(longest > 0, longest, torch.ones_like(longest)) for x in (a, b))
     area = torch.linalg.cross(a, b).norm(dim=-1)
-    cotangent = (a * b).sum(-1) / area.clamp_min(_SHARPEST)
+    cotangent = (a * b).sum(-1) / area.clamp_min(SHARPEST)
     weight = cotangent.new_zeros((*cotangent.shape[:-1], len(edges))).index_add(-1, place, cotangent)
     return first, second, weight.clamp_min(0)
 
@@ -155,17 +153,6 @@ def _hinges(faces: Tensor) -> Tensor:
     found = torch.cat(pairs) if pairs else index.new_zeros((0, 4))
     distinct = (found[:, 2] != found[:, 3]) & (found[:, 0] != found[:, 1])
     return found[distinct]
-
-
-def _normals(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Unit normals (..., 3) of triangles; zero, with gradient zero, where they have no area."""
-    u, v = b - a, c - a
-    longest = torch.maximum(u.detach().abs().amax(-1, keepdim=True), v.detach().abs().amax(-1, keepdim=True))
-    unit = torch.where(longest > 0, longest, torch.ones_like(longest))
-    normal = torch.linalg.cross(u / unit, v / unit)
-    square = normal.square().sum(-1, keepdim=True)
-    upright = square > _SHARPEST**2
-    return torch.where(upright, normal / torch.where(upright, square, torch.ones_like(square)).sqrt(), 0.0)
 
 
 class MeshLaplacianSmoothing(nn.Module):

@@ -12,7 +12,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import Protocol, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +21,6 @@ from torch.nn import functional
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
-    check_function,
     check_mask,
     check_pair,
     check_whole,
@@ -29,25 +28,20 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import bins_dim, check_held
-from torchtransient.losses.measured import TRANSIENT, Transient, reads
 from torchtransient.losses.measurement import squared_loss
+from torchtransient.losses.pair_losses import PairLoss, check_compare
+from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import shown
 
 # Options in bins of the record, or of its axis, that would mean something else at each scale.
 _OF_BINS = ("dead_bins", "bin_width_opl", "axis", "spacing")
 
 
-class RecordLoss(Protocol):
-    """A loss of this room that compares two records bin by bin; `functools.partial` holds further options of one."""
-
-    def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
-
-
 @reads(input=TRANSIENT, target=TRANSIENT)
 def multiscale_loss(
     input: Transient,
     target: Transient,
-    compare: RecordLoss = squared_loss,
+    compare: PairLoss = squared_loss,
     *,
     scales: Sequence[int] | None = None,
     dim: int | None = None,
@@ -85,21 +79,72 @@ def multiscale_loss(
     if not input.numel():
         return reduce((input + target).sum(dim), reduction, where, pixels)
     number = torch.full((), bins) if mask is None else mask.sum(dim).clamp_min(1)
-    records = [counted(input, mask), counted(target, mask)]
+    seen = input.new_ones((1, 1, bins, 1)) if mask is None else _flat(mask.to(input.dtype), dim)
+    records = [_flat(counted(x, mask), dim) for x in (input, target)]
+    windows = _Windows(records[0]), _Windows(records[1]), _Windows(seen)
     each: Callable[..., Tensor] = functools.partial(compare, dim=-3) if known else compare  # type: ignore[call-arg]
-    values = [_at_scale(s, records, mask, dim, each) for s in steps]
+    values = [_at_scale(s, windows, input.select(dim, 0), each) for s in steps]
     mean = torch.stack(values).mean(0) / number.to(input)
     return reduce(mean, reduction, where, pixels)
 
 
+class _Windows:
+    """Sums of neighbouring bins of a record (batch, C, T, places), from windows of 1, 2, 4, ... that all scales share:
+    no cancellation as of differences of running sums.
+    """
+
+    def __init__(self, record: Tensor) -> None:
+        self._doubled = {1: record}
+
+    def coarse(self, scale: int) -> Tensor:
+        """(scale x batch, C, J, places, 1): sums of `scale` bins for each of the places where coarse bins begin.
+
+        An item for each of them, so that losses that look at whole records see proper ones.
+        """
+        sums = self._sums(scale)
+        batch, channels, length, places = sums.shape
+        number = math.ceil(length / scale)
+        sums = functional.pad(sums, (0, 0, 0, number * scale - length))
+        each = sums.reshape(batch, channels, number, scale, places).movedim(3, 0)
+        return each.reshape(scale * batch, channels, number, places, 1)
+
+    def _sums(self, scale: int) -> Tensor:
+        """Of every window that holds a bin of the record: T + scale - 1 of them."""
+        total, width, size = None, 0, 1
+        while True:
+            window = self._doubled[size]
+            if scale & size:
+                total = window if total is None else _both(total, window, width)
+                width += size
+            if 2 * size > scale:
+                return cast(Tensor, total)
+            if 2 * size not in self._doubled:
+                self._doubled[2 * size] = _both(window, window, size)
+            size *= 2
+
+
+def _both(first: Tensor, second: Tensor, later: int) -> Tensor:
+    """A window and the one that ends `later` bins before it."""
+    # padding rather than slices, whose backward fills a tensor of zeros for each
+    length = max(first.shape[2], second.shape[2] + later)
+    before = functional.pad(second, (0, 0, later, length - later - second.shape[2]))
+    return functional.pad(first, (0, 0, 0, length - first.shape[2])) + before
+
+
+def _flat(x: Tensor, dim: int) -> Tensor:
+    """(batch, C, T, places) of a tensor with time as its dimension `dim`."""
+    lead, bins, trail = x.shape[: dim + x.ndim], x.shape[dim], x.shape[dim + x.ndim + 1 :]
+    batch, channels = (math.prod(lead[:-1]), lead[-1]) if lead else (1, 1)
+    return x.reshape(batch, channels, bins, math.prod(trail))
+
+
 def _at_scale(
-    scale: int, records: list[Tensor], mask: Tensor | None, dim: int, compare: Callable[..., Tensor]
+    scale: int, windows: tuple[_Windows, _Windows, _Windows], like: Tensor, compare: Callable[..., Tensor]
 ) -> Tensor:
     """`compare` summed over coarse bins and averaged over the places where they begin: without time."""
-    first, second = (_coarse(x, scale, dim) for x in records)
-    # those that hold no bin of the record do not count either
-    seen = torch.ones_like(records[0]) if mask is None else mask.to(first.dtype)
-    kept = _coarse(seen, scale, dim) > 0
+    first, second, seen = (w.coarse(scale) for w in windows)
+    # those that hold no bin of the record do not count either; all pixels hold the same ones where nothing is masked
+    kept = (seen > 0).repeat_interleave(len(first) // len(seen), 0).expand(first.shape)
     value = compare(first, second, mask=kept, reduction="none")
     if not isinstance(value, Tensor) or value.shape != first.shape:
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
@@ -107,37 +152,7 @@ def _at_scale(
             f"multiscale_loss: expected compare to give a value for each bin, {tuple(first.shape)}, got {got}. Losses "
             "of whole records, such as wasserstein_loss, need no scales."
         )
-    like = records[0].select(dim, 0)
     return value.sum(-3).reshape(scale, *like.shape).mean(0)
-
-
-def _coarse(x: Tensor, scale: int, dim: int) -> Tensor:
-    """(scale x batch, C, J, places, 1): sums of `scale` bins for each of the places where coarse bins begin.
-
-    An item for each of them, so that losses that look at whole records see proper ones.
-    """
-    lead, bins, trail = x.shape[: dim + x.ndim], x.shape[dim], x.shape[dim + x.ndim + 1 :]
-    batch, channels = (math.prod(lead[:-1]), lead[-1]) if lead else (1, 1)
-    number = math.ceil((bins + scale - 1) / scale)
-    padding = (0, 0, scale - 1, number * scale - bins)
-    sums = _sliding(functional.pad(x.reshape(batch, channels, bins, math.prod(trail)), padding), scale)
-    each = sums.reshape(batch, channels, number, scale, -1).movedim(3, 0)
-    return each.reshape(scale * batch, channels, number, -1, 1)
-
-
-def _sliding(x: Tensor, width: int) -> Tensor:
-    """Sums of `width` neighbours along the third dimension, by windows of 1, 2, 4, ...: no cancellation as of
-    differences of running sums.
-    """
-    length = x.shape[2] - width + 1
-    total, start, size, window = torch.zeros_like(x[:, :, :length]), 0, 1, x
-    while True:
-        if width & size:
-            total, start = total + window[:, :, start : start + length], start + size
-        if 2 * size > width:
-            return total
-        window = window[:, :, : window.shape[2] - size] + window[:, :, size:]
-        size *= 2
 
 
 def _check_scales(scales: Sequence[int] | None, where: str) -> list[int] | None:
@@ -150,24 +165,14 @@ def _check_scales(scales: Sequence[int] | None, where: str) -> list[int] | None:
 
 def _check_compare(compare: object, where: str) -> bool:
     """Whether it takes `dim`. Raises ShapeError for what is no loss of bins with what is in bins left out."""
-    check_function("compare", compare, where)
-    title = getattr(compare, "__name__", None) or getattr(getattr(compare, "func", compare), "__name__", shown(compare))
     if isinstance(compare, nn.Module):
         raise ShapeError(f"{where}: expected compare to be a function, got the module {type(compare).__name__}.")
-    try:
-        signature = inspect.signature(cast(Callable[..., object], compare))
-        signature.bind(None, None, mask=None, reduction="none")
-    except (TypeError, ValueError) as error:
-        raise ShapeError(
-            f"{where}: expected compare to take (input, target, mask=, reduction=) and no more, got {title}: {error}. "
-            "functools.partial holds further arguments of a loss of tt.losses."
-        ) from None
-    known = signature.parameters
+    known = check_compare(compare, where, "none")
     for name in _OF_BINS:
         if name in known and known[name].default not in (None, inspect.Parameter.empty):
             raise ShapeError(
-                f"{where}: expected compare without options in bins, got {title} with {name}={known[name].default}: "
-                "bins are others at each scale."
+                f"{where}: expected compare without options in bins, got {name}={known[name].default}: bins are others "
+                "at each scale."
             )
     return "dim" in known and known["dim"].default is None
 
@@ -177,7 +182,7 @@ class MultiscaleLoss(nn.Module):
 
     def __init__(
         self,
-        compare: RecordLoss = squared_loss,
+        compare: PairLoss = squared_loss,
         scales: Sequence[int] | None = None,
         dim: int | None = None,
         reduction: Reduction = "mean",

@@ -19,10 +19,14 @@ from torchtransient.losses.comparison import (
     check_reduction,
     check_whole,
     counted,
+    real_product,
     reduce,
 )
-from torchtransient.losses.measured import LIGHT, Light, reads
+from torchtransient.losses.results import LIGHT, Light, reads
 from torchtransient.quantities import finite, shown
+
+# Of Mitsuba's indices of samples, 32 bits.
+_MOST_SAMPLES = 2**32
 
 
 @reads(first=LIGHT, second=LIGHT, target=LIGHT)
@@ -39,12 +43,12 @@ def two_render_loss(
     """
     where = "two_render_loss"
     check_reduction(reduction, where)
-    first, other = check_pair(first, target, where, complex_too=True, names="first and target")
+    first, target = check_pair(first, target, where, complex_too=True, names="first and target")
     second, target = check_pair(second, target, where, complex_too=True, names="second and target")
+    first = first.to(target.dtype)  # a second one of more precision, or complex
     mask = check_mask(mask, target, where)
-    a, b = (counted(render, mask) - counted(truth, mask) for render, truth in ((first, other), (second, target)))
-    product = a.real * b.real + a.imag * b.imag if a.is_complex() and b.is_complex() else (a * b).real
-    return reduce(product, reduction, where, mask)
+    a, b = (counted(render, mask) - counted(target, mask) for render in (first, second))
+    return reduce(real_product(a, b), reduction, where, mask)
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,9 @@ class SampleSchedule:
     """Samples per pixel of a fit: few at first, where noise averages out over steps, more where bias is left.
 
     `schedule(step)`: `first` up to the share `hold` of `steps`, then doubled in equal parts of what is left, and `last`
-    from the end on. By doubling alone, since every other number of samples is compiled and recorded anew. Numbers only:
-    `renderer(values, spp=schedule(step), seed=step)`. Raises UnitError for numbers that are no such schedule.
+    from the end on. By doubling, since every other number of samples is compiled and recorded anew; the last doubling
+    stops at `last`, so that (64, 100, 10) ends at 100. Numbers only: `renderer(values, spp=schedule(step), seed=step)`.
+    Raises UnitError for numbers that are no such schedule.
     """
 
     first: int
@@ -89,7 +94,8 @@ class SampleSchedule:
 
         The bias of a loss of a render falls with one over the samples; that of a squared error is `squared_loss(first,
         target) - two_render_loss(first, second, target)`. Take a tenth of what the noise of the target makes of the
-        loss. By doubling `spp`, at least itself, also where the estimate of the bias is below zero. Raises UnitError.
+        loss. By doubling `spp`, at least itself, also where the estimate of the bias is below zero. Raises UnitError,
+        also where more than 2^32 samples would be needed, which no renderer takes.
         """
         where = "SampleSchedule.needed"
         number = check_whole("spp", spp, where, UnitError)
@@ -97,7 +103,15 @@ class SampleSchedule:
         if limit <= 0:
             raise UnitError(f"{where}: expected allowed above zero, got {shown(allowed)}.")
         ratio = finite(f"{where}: bias", bias) / limit
-        return number << math.ceil(math.log2(ratio)) if ratio > 1 else number
+        # not infinite, which a quotient of numbers may be
+        doublings = math.ceil(math.log2(min(ratio, 2.0**64))) if ratio > 1 else 0
+        found = number << doublings
+        if doublings and found > _MOST_SAMPLES:
+            raise UnitError(
+                f"{where}: expected a bias at {number} samples that 2^32 bring down to what is allowed, got a bias of "
+                f"{shown(bias)} and {shown(allowed)}. Allow a tenth of what the noise of the target makes of the loss."
+            )
+        return found
 
 
 class TwoRenderLoss(nn.Module):

@@ -27,10 +27,11 @@ from torchtransient.losses.comparison import (
     counted,
     item_scale,
     reduce,
+    squared_modulus,
     working_dtype,
 )
 from torchtransient.losses.layouts import bins_dim, check_held, item_dims
-from torchtransient.losses.measured import PHASOR, TRANSIENT, Phasors, Transient, reads
+from torchtransient.losses.results import PHASOR, TRANSIENT, Phasors, Transient, reads
 from torchtransient.quantities import shown
 from torchtransient.sensing.layout import without_autocast
 
@@ -148,15 +149,14 @@ def _phasor_loss(
         else:
             scale = other = check_level("floor", floor, input, where)
         input, target = _phase(input, scale), _phase(target, other)
-    difference = input - target
-    return reduce(difference.real.square() + difference.imag.square(), reduction, where, mask)
+    return reduce(squared_modulus(input - target), reduction, where, mask)
 
 
 def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
     """`P / sqrt(|P|^2 + floor^2)`, by numbers near one: squares of bright phasors exceed single precision."""
     size = torch.maximum(phasor.detach().abs(), floor)
     scaled = phasor / size
-    return scaled / (scaled.real.square() + scaled.imag.square() + (floor / size) ** 2).sqrt()
+    return scaled / (squared_modulus(scaled) + (floor / size) ** 2).sqrt()
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)

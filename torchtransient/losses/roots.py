@@ -24,7 +24,7 @@ from torchtransient.losses.comparison import (
     working_dtype,
 )
 from torchtransient.losses.layouts import check_held, item_dims
-from torchtransient.losses.measured import LIGHT, Light, reads
+from torchtransient.losses.results import LIGHT, Light, reads
 
 _OFFSET = 3 / 8
 _BACKGROUND = 1e-3

@@ -17,7 +17,7 @@ from torchtransient.losses.comparison import (
     counted,
     reduce,
 )
-from torchtransient.losses.measured import STEADY, VALUES, Picture, Volume, reads
+from torchtransient.losses.results import STEADY, VALUES, Picture, Volume, reads
 
 WINDOW = 11
 

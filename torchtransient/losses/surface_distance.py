@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import check_dense, check_device, check_whole, holds, working_dtype
+from torchtransient.losses.triangles import check_faces, unit_normals
 from torchtransient.sensing.layout import without_autocast
 
 # Numbers held at a time of one of the tensors (points, triangles, 3, 3).
@@ -18,9 +19,10 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
 
     From points of each to the nearest point of the other, over the area, and the mean of both ways. `vertices` and
     `others`: (V, 3), (W, 3); `faces`, `other_faces`: whole numbers (F, 3), (G, 3), of any order and sense. Points are
-    the middles of `cells`^2 equal parts of each triangle; to the other surface distances are exact. Triangles without
-    area weigh nothing. Time and memory grow with F times G. Half precision is computed in float32. Raises ShapeError,
-    also for a mesh without area; UnitError for other numbers, DeviceError.
+    the middles of `cells`^2 equal parts of each triangle; to the other surface distances are exact (of triangles that
+    are flatter than 1e-6, those to their edges). Triangles without area weigh nothing. Time and memory grow with F
+    times G. Half precision is computed in float32. Raises ShapeError, also for a mesh without area; UnitError for other
+    numbers, DeviceError.
     """
     where = "surface_distance"
     check_dense((vertices, faces, others, other_faces), where)
@@ -41,15 +43,6 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
 @without_autocast
 def _both_ways(first: Tensor, second: Tensor, cells: int) -> Tensor:
     return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
-
-
-def check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
-    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
-    check_device(faces, vertices, where, "vertices and faces")
-    wide = faces.long()
-    if not holds((wide >= 0) & (wide < len(vertices))):
-        raise ShapeError(f"{where}: expected faces of numbers from 0 to {len(vertices) - 1}, got others.")
 
 
 def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
@@ -89,16 +82,6 @@ def _root(square: Tensor) -> Tensor:
     return torch.where(apart, torch.where(apart, square, torch.ones_like(square)).sqrt(), 0.0)
 
 
-def _normal(edges: Tensor) -> Tensor:
-    """Unit normals (F, 3) of triangles by their edges (F, 3, 3), zero where they have no area."""
-    longest = edges.detach().abs().amax((1, 2))[:, None]
-    edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))[..., None]
-    across = torch.linalg.cross(edges[:, 0], edges[:, 1])
-    length = _length(across)[:, None]
-    upright = length != 0
-    return torch.where(upright, across / torch.where(upright, length, torch.ones_like(length)), 0.0)
-
-
 def _middles(cells: int) -> Tensor:
     """Barycentric coordinates (cells^2, 3) of the middles of equal parts of a triangle, upright ones and others."""
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(cells) for j in range(cells - i)]
@@ -109,7 +92,7 @@ def _middles(cells: int) -> Tensor:
 
 def _distance(points: Tensor, triangles: Tensor) -> Tensor:
     edges = triangles.roll(-1, 1) - triangles
-    normal = _normal(edges)
+    normal = unit_normals(edges[:, 0], edges[:, 1])
     from_corner = points[:, None, None] - triangles
     squared = edges.square().sum(-1).clamp_min(torch.finfo(edges.dtype).tiny)
     along = ((from_corner * edges).sum(-1) / squared).clamp(0, 1)

@@ -19,9 +19,10 @@ from torchtransient.losses.comparison import (
     counted,
     item_scale,
     reduce,
+    squared_modulus,
     working_dtype,
 )
-from torchtransient.losses.measured import VALUES, Volume, reads
+from torchtransient.losses.results import VALUES, Volume, reads
 from torchtransient.quantities import shown
 
 _DIMS = (-3, -2, -1)
@@ -93,7 +94,7 @@ def _squared_difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -
     if mask is not None:
         both = mask.narrow(dim, 1, size - 1) & mask.narrow(dim, 0, size - 1)
         difference = counted(difference, both)
-    square = difference.real.square() + difference.imag.square() if x.is_complex() else difference.square()
+    square = squared_modulus(difference)
     return torch.cat([square, torch.zeros_like(square.sum(dim, keepdim=True))], dim)
 
 

@@ -21,7 +21,7 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.layouts import bin_width, bins_dim, check_held, item_dims
-from torchtransient.losses.measured import TRANSIENT, Transient, reads
+from torchtransient.losses.results import TRANSIENT, Transient, reads
 
 # Pixels below this share of the mean light of a pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3

@@ -46,6 +46,7 @@ class Seeding:
                 raise ShapeError(
                     f"seed: expected one integer, or one for each of {self.entries} batch entries, got {len(given)}."
                 )
+            _check_apart(given)
             seeds = [mix_seed(s, n) for s in given for n in range(per_entry)]
         return tuple(
             Item(n // per_entry, self.sensors[n % per_entry], value, self._of_gradient(value, n))
@@ -58,6 +59,15 @@ class Seeding:
         if isinstance(self.grad_seed, int):
             return mix_seed(self.grad_seed, number)
         return mix_seed(seed, 0x5EED)
+
+
+def _check_apart(seeds: list[int]) -> None:
+    """Raise UnitError for seeds that are not the same and count as the same: their renders would have one noise."""
+    seen: dict[int, int] = {}
+    for seed in seeds:
+        other = seen.setdefault(seed % SEED_RANGE, seed)
+        if other != seed:
+            raise UnitError(f"seed: {other} and {seed} are one seed: seeds count modulo 2^32. Take others.")
 
 
 def drawn(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:

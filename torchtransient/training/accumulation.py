@@ -35,8 +35,9 @@ def accumulate(
         loss = tt.training.accumulate(lambda view: loss_fn(renderer({POSE: poses[view]}), measured[view]), range(8))
         optimizer.step()
 
-    ``loss_of``: gives a scalar tensor. ``weights``: one for each part; None takes 1 / number of parts, which gives the
-    gradient of a mean over parts of one size. Parts of other sizes of a mean over samples: ``[len(p) / total ...]``.
+    ``loss_of``: gives a scalar tensor. ``parts``: any iterable that ends. ``weights``: one for each part; None takes
+    1 / number of parts, which gives the gradient of a mean over parts of one size. Parts of other sizes of a mean over
+    samples: ``[len(p) / total ...]``.
     ``model``: a DistributedDataParallel, whose ranks exchange gradients once, at the last part, instead of at each one.
     ``scaler``: scales losses before they are differentiated; the sum that is returned is not scaled.
 
@@ -62,19 +63,20 @@ def accumulate(
         # The forward pass stands inside: DDP prepares there for what its backward pass does.
         with _no_exchange(model) if waits else nullcontext():
             loss = loss_of(part)
-            if not isinstance(loss, torch.Tensor) or loss.numel() != 1:
-                came = f"shape {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
-                raise ShapeError(f"accumulate: expected the loss of a part as one number in a tensor, got {came}.")
+            if not isinstance(loss, torch.Tensor) or loss.numel() != 1 or loss.is_complex():
+                came = f"{loss.dtype} {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
+                raise ShapeError(f"accumulate: expected the loss of a part as one real number in a tensor, got {came}.")
             if not loss.requires_grad:
                 raise GradientError(
                     "accumulate: the loss of a part depends on nothing that has a gradient; parameters need "
                     "requires_grad=True, and loss_of may not detach or run under torch.no_grad."
                 )
-            scaled = loss.reshape(()) * share
+            # A share of a small loss may be nothing in half precision.
+            scaled = loss.reshape(()).to(torch.promote_types(loss.dtype, torch.float32)) * share
             (scaled if scaler is None else scaler.scale(scaled)).backward()  # type: ignore[no-untyped-call]
             values.append(scaled.detach())
             del loss, scaled
-    return math.fsum(float(value) for value in values)
+    return sum(float(value) for value in values)
 
 
 def _no_exchange(model: Any) -> Any:

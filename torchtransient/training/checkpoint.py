@@ -21,8 +21,9 @@ from torch.nn.parameter import is_lazy
 
 from torchtransient.errors import ShapeError, StorageError, TorchTransientError, TorchTransientWarning, UnitError
 from torchtransient.quantities import count, shown
+from torchtransient.training.optimizer_states import check_optimizer
 from torchtransient.training.plain_state import plain
-from torchtransient.training.random_states import random_state, set_random_state
+from torchtransient.training.random_states import check_random_state, random_state, set_random_state
 
 _FORMAT, _VERSION = "torchtransient checkpoint", 1
 _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries")
@@ -51,14 +52,14 @@ def save_checkpoint(
         tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
 
     ``parts``: by name, whatever has ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
-    GradScaler, :class:`Batches`), and generators of torch. A DistributedDataParallel is stored as its module, so that
-    the checkpoint can be read with and without it. ``step``: steps that are done. ``values``: plain data (numbers,
-    texts, tensors, lists, dictionaries) that come back. Beside them: the random numbers of Python, NumPy, torch and
-    CUDA of this process, and versions of libraries.
+    GradScaler, :class:`Batches`), and generators of torch. What DistributedDataParallel or ``torch.compile`` has
+    wrapped is stored as what it was, so that the checkpoint can be read with and without. ``step``: steps that are
+    done. ``values``: plain data (numbers, texts, tensors, lists, dictionaries) that come back. Beside them: the random
+    numbers of Python, NumPy, torch and CUDA of this process, and versions of libraries.
 
     Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a run is killed,
     ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and the first one
-    writes; parts are its own, random numbers those of every rank.
+    writes; parts are its own, random numbers and generators those of every rank.
 
     Not in it: what the network's data come from beyond their position, buffers that modules do not put into their
     state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
@@ -70,11 +71,14 @@ def save_checkpoint(
         content = _content(parts, step, values)
         failure = None
     finally:
-        told = _of_all_ranks({"random": random_state(), "failure": failure})
+        own_generators = {name: one.get_state() for name, one in _generators(parts).items()}
+        told = _of_all_ranks({"random": random_state(), "generators": own_generators, "failure": failure})
     failures = [f"rank {rank}: {one['failure']}" for rank, one in enumerate(told) if one["failure"] is not None]
     if failures:
         raise StorageError(f"save_checkpoint: {os.fspath(path)} was not written. {' '.join(failures)}")
     content["random"] = [one["random"] for one in told]
+    for name in _generators(parts):
+        content["parts"][name]["generators"] = [one["generators"].get(name) for one in told]
     own = _written(Path(path), content) if _rank() == 0 else None
     failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
@@ -93,7 +97,9 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
 
     Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
-    its sums, format, names of parts, and names and shapes of the tensors of modules. Every rank reads it. Raises
+    its sums, format, names of parts, names and shapes of the tensors of modules, groups, settings and moments of
+    optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they have
+    one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises
     StorageError for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
     """
     given, where = _named(parts, "load_checkpoint"), os.fspath(path)
@@ -104,12 +110,14 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
             f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
         )
     for name, part in given.items():
-        _check(name, part, states[name])
+        _check(name, part, states[name], content["libraries"].get("torch") == version("torch"))
     if random and ranks != _size():
         raise StorageError(
             f"load_checkpoint: {where} has the random numbers of {ranks} ranks, expected those of {_size()}. Start as "
             "many, or use random=False."
         )
+    if random:
+        check_random_state(content["random"][_rank()])
     _compare(where, content["libraries"])
     for name, part in given.items():
         _put_back(name, part, states[name])
@@ -129,9 +137,18 @@ def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[st
         "version": _VERSION,
         "step": count("save_checkpoint: step", step, 0, UnitError),
         "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
-        "values": plain(dict(values or {}), "values"),
+        "values": _plain_values(values),
         "libraries": _libraries(),
     }
+
+
+def _plain_values(values: Any) -> Any:
+    if values is not None and not isinstance(values, Mapping):
+        raise StorageError(f"save_checkpoint: expected values as a dictionary from names, got {shown(values)}.")
+    try:
+        return plain(dict(values or {}), "values")
+    except RecursionError:
+        raise StorageError("save_checkpoint: values hold themselves, or are nested too deeply.") from None
 
 
 def _named(parts: Any, who: str) -> dict[str, Any]:
@@ -141,13 +158,25 @@ def _named(parts: Any, who: str) -> dict[str, Any]:
 
 
 def _inner(part: Any) -> Any:
-    return part.module if isinstance(part, DistributedDataParallel) else part
+    """What DistributedDataParallel or torch.compile has wrapped; they share its state, under other names."""
+    while True:
+        if isinstance(part, DistributedDataParallel):
+            part = part.module
+        elif isinstance(part, nn.Module) and isinstance(getattr(part, "_orig_mod", None), nn.Module):
+            part = part._orig_mod
+        else:
+            return part
+
+
+def _generators(parts: Any) -> dict[str, torch.Generator]:
+    found = parts.items() if isinstance(parts, Mapping) else ()
+    return {name: part for name, part in found if isinstance(part, torch.Generator)}
 
 
 def _state_of(name: str, part: Any) -> Any:
     part = _inner(part)
     if isinstance(part, torch.Generator):
-        return {"generator": part.get_state(), "device": part.device.type}
+        return {"device": part.device.type}
     if not (hasattr(part, "state_dict") and hasattr(part, "load_state_dict")):
         raise StorageError(
             f"save_checkpoint: expected the part {name!r} to have state_dict and load_state_dict, or to be a generator "
@@ -156,12 +185,21 @@ def _state_of(name: str, part: Any) -> Any:
     return plain(part.state_dict(), name)
 
 
-def _check(name: str, part: Any, state: Any) -> None:
+def _check(name: str, part: Any, state: Any, is_same_torch: bool) -> None:
     """What can be told before anything is changed."""
     part = _inner(part)
     if isinstance(part, torch.Generator):
-        if not isinstance(state, dict) or state.get("device") != part.device.type or "generator" not in state:
+        if not isinstance(state, dict) or state.get("device") != part.device.type or "generators" not in state:
             raise StorageError(f"load_checkpoint: the part {name!r} is no state of a generator on {part.device.type}.")
+        if len(state["generators"]) != _size():
+            raise StorageError(
+                f"load_checkpoint: the part {name!r} is a generator of each of {len(state['generators'])} ranks, "
+                f"expected {_size()}. Start as many, or draw by Seeds.generator, which needs no state."
+            )
+    elif isinstance(part, torch.optim.Optimizer):
+        check_optimizer(name, part, state, is_same_torch)
+    elif hasattr(part, "check_state_dict"):
+        part.check_state_dict(state)
     elif isinstance(part, nn.Module):
         expected = part.state_dict()
         if not isinstance(state, dict) or state.keys() != expected.keys():
@@ -179,21 +217,26 @@ def _check(name: str, part: Any, state: Any) -> None:
                 raise ShapeError(
                     f"load_checkpoint: {key!r} of {name!r}: expected shape {tuple(tensor.shape)}, the file has {came}."
                 )
+            if known and tensor.dtype != state[key].dtype:
+                raise ShapeError(
+                    f"load_checkpoint: {key!r} of {name!r}: expected {tensor.dtype}, the file has {state[key].dtype}; "
+                    "load into a module of that precision, and convert it afterwards."
+                )
 
 
 def _put_back(name: str, part: Any, state: Any) -> None:
     part = _inner(part)
     try:
         if isinstance(part, torch.Generator):
-            part.set_state(state["generator"])
+            part.set_state(state["generators"][_rank()])
         else:
             part.load_state_dict(state)
     except TorchTransientError:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise StorageError(
-            f"load_checkpoint: the part {name!r} does not take its state: {error}. It and what follows it have to be "
-            "made anew."
+            f"load_checkpoint: the part {name!r} does not take its state: {error}. All parts have to be made anew: "
+            "those before it have theirs already."
         ) from error
 
 
@@ -202,6 +245,8 @@ def _put_back(name: str, part: Any, state: Any) -> None:
 
 def _written(path: Path, content: dict[str, Any]) -> Exception | None:
     """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
+    if not path.name:
+        return OSError(f"{os.fspath(path)!r} is no name of a file")
     part = path.with_name(path.name + ".part")
     try:
         _write(path, part, content)
@@ -259,7 +304,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _libraries() -> dict[str, str]:
     import torchtransient
 
-    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy")}
+    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy", "kornia")}
     return {"torchtransient": torchtransient.__version__, **others}
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.parameter import is_lazy
 
 from torchtransient.errors import StorageError
 
@@ -25,6 +26,8 @@ def plain(value: Any, where: str) -> Any:
     """
     if type(value) in _PLAIN:
         return value
+    if isinstance(value, torch.Tensor) and is_lazy(value):
+        raise StorageError(f"save_checkpoint: {where} has no shape yet: run the lazy module once before.")
     if isinstance(value, torch.Tensor):
         return value.detach()
     if isinstance(value, np.generic) and type(value.item()) in _PLAIN:
@@ -33,7 +36,7 @@ def plain(value: Any, where: str) -> Any:
         return torch.from_numpy(value.astype(value.dtype.newbyteorder("="), copy=True))
     if isinstance(value, Mapping):
         items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
-        return OrderedDict(items) if isinstance(value, OrderedDict) else items
+        return _ordered(value, items, where) if isinstance(value, OrderedDict) else items
     if type(value) in (list, tuple, set, frozenset):
         entries = [plain(entry, f"{where}[{n}]") for n, entry in enumerate(value)]
         return entries if type(value) is list else set(entries) if type(value) in (set, frozenset) else tuple(entries)
@@ -41,6 +44,14 @@ def plain(value: Any, where: str) -> Any:
         f"save_checkpoint: {where} is a {type(value).__name__}, expected data: numbers, texts, tensors, lists, "
         "dictionaries. Anything else would have to be executed when it is read."
     )
+
+
+def _ordered(value: OrderedDict[Any, Any], items: dict[Any, Any], where: str) -> OrderedDict[Any, Any]:
+    """With the versions of modules, by which they convert what older ones have written."""
+    made = OrderedDict(items)
+    if hasattr(value, "_metadata"):
+        made._metadata = plain(value._metadata, f"{where}._metadata")  # type: ignore[attr-defined]
+    return made
 
 
 def _key(key: Any, where: str) -> Any:

@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 
 from torchtransient.errors import DeviceError, UnitError
-from torchtransient.quantities import count
+from torchtransient.quantities import as_number, count, shown
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
@@ -43,10 +43,13 @@ class Ranks:
         return "cuda_ad_" if self.device.type == "cuda" else "llvm_ad_"
 
     def mean(self, value: float) -> float:
-        """The mean of a number over all ranks, which all have to ask for it."""
+        """The mean of a number over all ranks, which all have to ask for it. Raises UnitError."""
+        number = as_number(value)
+        if number is None:
+            raise UnitError(f"ranks: expected one number to take the mean of, got {shown(value)}.")
         if self.size == 1:
-            return float(value)
-        total = torch.tensor(float(value), dtype=torch.float64, device=self.device)
+            return number
+        total = torch.tensor(number, dtype=torch.float64, device=self.device)
         dist.all_reduce(total)
         return float(total) / self.size
 
@@ -87,7 +90,7 @@ def ranks(
     with set_threads(threads if threads is not None else max(1, _cores() // found.local_size)):
         if several:
             kind = backend or ("nccl" if device == "cuda" else "gloo")
-            dist.init_process_group(kind, timeout=timedelta(seconds=timeout_s))
+            _join(kind, timeout_s)
         try:
             yield found
         finally:
@@ -106,6 +109,15 @@ def worker_init(worker: int) -> None:
     set_threads(1)
 
 
+def _join(kind: str, timeout_s: float) -> None:
+    if dist.is_initialized():
+        raise DeviceError("ranks: this process is in a group already, which it would leave at the end; open one.")
+    try:
+        dist.init_process_group(kind, timeout=timedelta(seconds=timeout_s))
+    except ValueError as error:
+        raise UnitError(f"ranks: the group cannot be joined: {error}. Start the script with torchrun.") from error
+
+
 def _found(device: str) -> Ranks:
     given = {name: os.environ[name] for name in _TORCHRUN if name in os.environ}
     if not given:
@@ -117,6 +129,11 @@ def _found(device: str) -> Ranks:
     rank, size, local, local_size = (
         count(f"ranks: {name}", _whole(given[name]), least[name], UnitError) for name in _TORCHRUN
     )
+    if rank >= size or local >= local_size:
+        raise UnitError(
+            f"ranks: expected RANK below WORLD_SIZE and LOCAL_RANK below LOCAL_WORLD_SIZE, got {rank} of {size} and "
+            f"{local} of {local_size}; start the script with torchrun."
+        )
     return Ranks(rank, size, local, local_size, torch.device(device))
 
 

@@ -32,8 +32,11 @@ def random_state() -> dict[str, Any]:
     return found
 
 
-def set_random_state(state: dict[str, Any]) -> None:
-    """Put all of them back. Raises StorageError where the state is of another number of CUDA devices, or none."""
+def check_random_state(state: Any) -> None:
+    """Raises StorageError where a state is of another number of CUDA devices, or none. Changes nothing."""
+    lacking = [name for name in ("python", "numpy", "torch") if not isinstance(state, dict) or name not in state]
+    if lacking:
+        raise StorageError(f"load_checkpoint: its random numbers lack those of {', '.join(lacking)}.")
     devices = len(state.get("cuda", ()))
     here = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if devices != here:
@@ -41,6 +44,12 @@ def set_random_state(state: dict[str, Any]) -> None:
             f"load_checkpoint: its random numbers are of {devices} CUDA devices, here are {here}. Use as many, or "
             "leave them alone with random=False."
         )
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Put all of them back. Raises StorageError as `check_random_state`, and for what is no such state."""
+    check_random_state(state)
+    devices = len(state.get("cuda", ()))
     try:
         python, numpy = state["python"], state["numpy"]
         words = tuple(python["words"])

@@ -24,11 +24,12 @@ class Seeds:
 
         seeds = tt.training.Seeds(0)
         out = renderer(values, seed=seeds(step, batch["index"]))
-        counts = sensor(out.transient, generator=seeds.generator(step))
+        counts = sensor(out.transient, generator=seeds.generator(step, ranks.rank))
 
-    Within a step, samples of different numbers have different seeds: those are a permutation of the 32-bit numbers
-    (Even and Mansour 1997, with the integer hash of C. Wellons), whose keys are a hash of seed and step (BLAKE2b).
-    Between steps equal seeds are as rare as of random numbers, 2^-32 a pair.
+    Within a step, different numbers have different seeds, and equal ones the same: where a number can come twice in a
+    step, give the samples' places in the batch (``Batches.places``) for their numbers. Seeds are a permutation of the
+    32-bit numbers (Even and Mansour 1997, with the integer hash of C. Wellons), whose keys are a hash of seed and step
+    (BLAKE2b). Between steps equal seeds are as rare as of random numbers, 2^-32 a pair.
 
     ``seed``: a whole number from 0 on. ``purpose``: tells apart what a run draws several of, the two renders of an
     unbiased loss for instance: ``Seeds(0, "second render")``. Raises UnitError.

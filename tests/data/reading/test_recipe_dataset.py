@@ -5,14 +5,32 @@ from __future__ import annotations
 import itertools
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
 import torchtransient as tt
-from torchtransient.errors import UnitError
+from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.testing.small_room import COLOUR, VARIANT, make_room
 from torchtransient.training import Batches, worker_init
+
+
+def noisy(light, generator=None):
+    return light + torch.randn(light.shape, generator=generator)
+
+
+class Stored:
+    """A recipe whose samples are all alike."""
+
+    def __init__(self, arrays):
+        self.arrays = arrays
+
+    def maker(self):
+        return self
+
+    def sample(self, index):
+        return tt.data.Sample(index, 0, self.arrays)
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +59,29 @@ def test_samples_of_the_recipe_by_number(data, recipe):
     assert torch.equal(data[2]["transient"], sample["transient"])
 
 
+def test_noise_belongs_to_seed_number_and_epoch():
+    alike = Stored({"transient": np.zeros((1, 4, 2, 2), np.float32)})
+
+    def read(seed, epoch=None, first=0):
+        data = tt.data.RecipeDataset(alike, 3, first=first, transform=noisy, seed=seed)
+        return [data.sample(k, epoch)["measurement"] for k in range(3)]
+
+    first = read(4)
+    others = [read(5), read(4, 1), read(4, 2), read(None), read(4, first=3)]
+    assert all(torch.equal(a, b) for a, b in zip(first, read(4), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(read(4, 2), others[2], strict=True))
+    # Without an epoch it is the first.
+    assert all(torch.equal(a, b) for a, b in zip(first, read(4, 0), strict=True))
+    # The number is that in the recipe.
+    assert torch.equal(read(4, first=1)[0], first[1])
+    drawn = [one for group in (first, *others) for one in group]
+    assert len({one.flatten()[0].item() for one in drawn}) == len(drawn)
+    data = tt.data.RecipeDataset(alike, 3, transform=noisy, seed=4)
+    state = torch.get_rng_state()
+    assert torch.equal(pickle.loads(pickle.dumps(data))[2]["measurement"], first[2])
+    assert torch.equal(torch.get_rng_state(), state)
+
+
 @pytest.mark.slow
 def test_rendered_by_spawned_workers_in_the_order_of_steps(recipe):
     def read(workers, first, last):
@@ -61,10 +102,23 @@ def test_rendered_by_spawned_workers_in_the_order_of_steps(recipe):
 
 def test_what_it_does_not_take(data, recipe):
     assert pickle.loads(pickle.dumps(tt.data.RecipeDataset(recipe, 3))).size == 3
-    for number in (6, -7, slice(0, 2)):
+    for number in (6, -7, slice(0, 2), 1.7, "1", None, True):
         with pytest.raises(IndexError, match="from 0 to 5"):
             data[number]
+    assert data[np.int64(2)]["index"] == data[torch.tensor(2)]["index"] == 12
     with pytest.raises(UnitError, match="size"):
         tt.data.RecipeDataset(recipe, 0)
     with pytest.raises(UnitError, match="first"):
         tt.data.RecipeDataset(recipe, 1, first=-1)
+    for seed in (-1, 0.5, "0"):
+        with pytest.raises(UnitError, match="seed"):
+            tt.data.RecipeDataset(recipe, 1, transform=noisy, seed=seed)
+    for transform in (None, lambda x: x, 3):
+        with pytest.raises(SceneError, match="takes generator="):
+            tt.data.RecipeDataset(recipe, 1, transform=transform, seed=0)
+    seeded = tt.data.RecipeDataset(recipe, 1, transform=noisy, seed=0)
+    for epoch in (-1, 0.5, "first"):
+        with pytest.raises(UnitError, match="epoch"):
+            seeded.sample(0, epoch)
+    with pytest.raises(ShapeError, match="transform= is for transients"):
+        tt.data.RecipeDataset(Stored({"steady": np.zeros((1, 2, 2))}), 1, transform=noisy)[0]

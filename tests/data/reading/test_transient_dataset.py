@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 import torchtransient as tt
 from support.stored_samples import AXIS, cube, folder, header, sample, write
 from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.errors import StorageError
+from torchtransient.errors import StorageError, UnitError
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_samples(data):
             assert item[name].dtype == torch.from_numpy(array).dtype and np.array_equal(item[name].numpy(), array)
         assert item["values"]["box.filename"] == f"größe_{i}.ply" and int(item["values"]["count"]) == i
     assert found[-1]["index"] == 9 and found.index.tolist() == list(range(10))
-    for number in (10, -11, slice(2)):
+    for number in (10, -11, slice(2), 1.7, "1", None):
         with pytest.raises(IndexError):
             found[number]
     assert len(list(found)) == 10  # the old way of iterating, which ends with an IndexError
@@ -136,6 +136,11 @@ def test_transforms(data):
     assert not TransientDataset(data, transform=module)[0]["measurement"].requires_grad
     with pytest.raises(StorageError, match="takes generator="):
         TransientDataset(data, transform=doubled, seed=3)
+    for seed in (-1, 0.5):
+        with pytest.raises(UnitError, match="seed"):
+            TransientDataset(data, transform=chain, seed=seed)
+    with pytest.raises(UnitError, match="epoch"):
+        one.sample(4, -1)
 
 
 def test_counts(tmp_path):

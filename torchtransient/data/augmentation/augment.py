@@ -10,10 +10,12 @@ from torch import Tensor
 
 from torchtransient.data.augmentation.operations import Operation
 from torchtransient.data.augmentation.pixel_map import PixelMap
+from torchtransient.data.augmentation.sample_images import as_image, check_unknown, size_of
+from torchtransient.data.augmentation.scene_values import check_values
 from torchtransient.data.augmentation.stokes_fields import turned_stokes
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
-from torchtransient.quantities import shown
+from torchtransient.quantities import flag, shown
 
 Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
 KINDS: dict[str, Kind] = {
@@ -25,13 +27,8 @@ KINDS: dict[str, Kind] = {
     "position": "point",
     "normals": "direction",
 }
-# Entries of `values` that a mirror of the world makes false, by the last part of the key, and those that a camera has.
-_PLACES = frozenset(
-    ("to_world", "position", "positions", "direction", "origin", "target", "center", "p0", "p1", "vertex_positions",
-     "vertex_normals", "control_points", "laser_positions", "laser_position")
-)  # fmt: skip
-_OPTICS = ("x_fov", "fov", "principal_point_offset_x", "principal_point_offset_y")
-_NAMED = ("intrinsics", "to_world")
+# What a sample has besides images, by names that `fields` cannot give another meaning.
+_NAMED = ("intrinsics", "to_world", "values")
 
 
 class Augment:
@@ -39,28 +36,36 @@ class Augment:
 
     ``operations``: of :class:`Flip`, :class:`QuarterTurn`, :class:`Crop`, :class:`Affine`, one after another. A call
     takes a dictionary as :class:`~torchtransient.data.TransientDataset` has them, or a tuple whose entries ``names``
-    are; leading dimensions of a batch get the same map. It returns a new one; what is given stays as it is.
+    are; leading dimensions of a batch get the same map. It returns a new one; what is given stays as it is, and what no
+    map changes is passed on, not copied. Arrays of numpy that are images come back as tensors.
 
     - ``transient``, ``steady``, ``phasor``, ``gated``: interpolated between pixels, bin by bin, where pixels do not
-      come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter.
+      come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter. UnitError for whole
+      numbers that would have to be interpolated.
     - ``depth``, ``z_depth``, ``uv``, ``albedo``, ``first_return``: the nearest pixel, since between two depths there is
       no surface; NaN beyond the rim. Distances stay what they are: the camera is turned about its axis, mirrored, or
       has another matrix. ``measurement``: the nearest pixel; 0 beyond the rim.
     - ``shape``, ``primitive``, ``material``: the nearest pixel; -1 beyond the rim.
+    - Beyond the rim truth values are False. UnitError for a type that cannot hold what stands there (NaN: whole
+      numbers; -1: unsigned ones), of maps that may have a rim: kornia's. Flips, turns and crops take every type.
     - ``position``, ``normals``: the nearest pixel. Of a mirrored image the world is mirrored in the camera's frame, for
       which ``to_world`` of the camera is needed.
     - ``intrinsics``, ``to_world``: those of the camera that has taken the new image (:mod:`torchtransient.geometry`).
-    - ``values``: stay. SceneError where the map makes one of them false; read the data set without (``fields=``).
+    - ``values``: stay. SceneError where the map makes one of them false, a place in a mirror or an angle of view in a
+      crop, or where a key is not known not to be; read the data set without (``fields=``).
     - Stokes components (``polarized``): S2 and S3 change their signs in a mirror, and all is turned with the sensor's
       frame, which needs ``intrinsics`` but for half turns.
 
     ``intrinsics``, ``to_world``: of the camera, where samples do not have them; samples get the new ones under these
     names. ``polarized``: light has four Stokes components before the channels. ``fields``: what to do with other names,
     ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim), "number" (nearest, -1), "point" and
-    "direction" (3, H, W) of the world, "unchanged". ``sensor``: what the camera is called in the keys of ``values``.
+    "direction" (3, H, W) of the world, "unchanged"; without, what has the size of an image is a SceneError.
+
+    ``sensor``: what the camera is called in the keys of ``values``, or several; without it every ``to_world`` might be
+    the camera's, and is false of a turned one. ``kept_values``: keys of ``values`` that are known to stay true.
 
     Not supported: exhaustive scans, orthographic cameras where they are turned with Stokes components. Raises
-    ShapeError, SceneError.
+    ShapeError, SceneError, UnitError.
     """
 
     def __init__(
@@ -72,26 +77,29 @@ class Augment:
         polarized: bool = False,
         fields: Mapping[str, Kind] | None = None,
         names: Sequence[str] | None = None,
-        sensor: str = "sensor",
+        sensor: str | Sequence[str] = (),
+        kept_values: Sequence[str] = (),
     ) -> None:
-        given = [operations] if isinstance(operations, Operation) else list(operations)
+        given = list(operations) if isinstance(operations, Sequence) else [operations]
         for one in given:
             if not isinstance(one, Operation):
                 raise SceneError(f"Augment: expected Flip, QuarterTurn, Crop or Affine, got {shown(one)}.")
         self.operations = tuple(given)
+        # Copies: what is given may change afterwards.
         self.camera = {
-            "intrinsics": None if intrinsics is None else camera_matrices(intrinsics, "Augment"),
-            "to_world": None if to_world is None else transforms(to_world, "Augment"),
+            "intrinsics": None if intrinsics is None else camera_matrices(intrinsics, "Augment").clone(),
+            "to_world": None if to_world is None else transforms(to_world, "Augment").clone(),
         }
-        self.polarized, self.sensor = bool(polarized), sensor
-        wrong = [kind for kind in (fields or {}).values() if kind not in get_args(Kind)]
-        if wrong:
-            raise SceneError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(wrong[0])}.")
-        self.kinds: dict[str, Kind] = {**KINDS, **(fields or {})}
-        self.names = None if names is None else tuple(names)
+        self.polarized = flag("Augment: polarized", polarized)
+        self.kinds: dict[str, Kind] = {**KINDS, **_checked_fields(fields)}
+        self.names = None if names is None else _texts("names", names)
+        self.cameras = (sensor,) if isinstance(sensor, str) else _texts("sensor", sensor)
+        self.kept_values = _texts("kept_values", kept_values)
 
     def __call__(self, sample: Any, *, generator: torch.Generator | None = None) -> Any:
         """A new sample, with one map drawn. ``generator``: None for torch's own."""
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise SceneError(f"Augment: expected generator as a torch.Generator, got {shown(generator)}.")
         if isinstance(sample, Mapping):
             return self._augmented(dict(sample), generator)
         if self.names is None or not isinstance(sample, Sequence) or len(sample) != len(self.names):
@@ -105,46 +113,48 @@ class Augment:
     # ------------------------------------------------------------------------------------------------------ one call
 
     def _augmented(self, sample: dict[str, Any], generator: torch.Generator | None) -> dict[str, Any]:
-        known = dict(sample)
         for name, default in self.camera.items():
-            if default is not None:
-                sample.setdefault(name, default)
+            if default is not None and sample.get(name) is None:
+                # A copy, since a sample is its receiver's to change.
+                sample[name] = default.clone()
         for name, check in (("intrinsics", camera_matrices), ("to_world", transforms)):
             if sample.get(name) is not None:
                 sample[name] = check(sample[name], "Augment")
+        names = [name for name in sample if self._kind(name) != "unchanged"]
+        sample |= {name: as_image(name, sample[name]) for name in names}
+        size = size_of({name: sample[name] for name in names}, tuple(KINDS))
+        for name, given in sample.items():
+            if name not in self.kinds and name not in _NAMED:
+                check_unknown(name, given, size)
         for operation in self.operations:
-            images = {name: one for name, one in sample.items() if self._kind(name) != "unchanged"}
-            size = _image_size(images)
-            self._check_unknown(sample, size)
             drawn = operation.draw(size, generator)
-            if drawn is not None:
-                sample = self._mapped(sample, images, drawn)
-        return {name: value for name, value in sample.items() if name in known or value is not None}
+            if drawn is None:
+                continue
+            if not isinstance(drawn, PixelMap) or drawn.size != size:
+                got = f"one of {drawn.size}" if isinstance(drawn, PixelMap) else shown(drawn)
+                raise SceneError(
+                    f"Augment: expected {type(operation).__name__}.draw to return a PixelMap of images of {size}, or "
+                    f"None, got {got}."
+                )
+            sample = self._mapped(sample, {name: sample[name] for name in names}, drawn)
+            size = drawn.new_size
+        return sample
 
     def _kind(self, name: str) -> Kind:
         return self.kinds.get(name, "unchanged")
 
-    def _check_unknown(self, sample: Mapping[str, Any], size: tuple[int, int]) -> None:
-        for name, value in sample.items():
-            told = name in self.kinds or name in _NAMED
-            if isinstance(value, Tensor) and not told and tuple(value.shape[-2:]) == size:
-                raise SceneError(
-                    f"Augment: {name!r} has the size of an image and nothing says what it is; give "
-                    f'fields={{"{name}": "label"}}, "number", "light", "point", "direction" or "unchanged".'
-                )
-
     def _mapped(self, sample: dict[str, Any], images: Mapping[str, Tensor], drawn: PixelMap) -> dict[str, Any]:
-        self._check_values(sample.get("values"), drawn)
+        check_values(sample.get("values"), drawn, self.cameras, self.kept_values)
         found = dict(sample)
         for name, image in images.items():
             kind = self._kind(name)
             if kind == "light":
-                moved = drawn.smooth(image)
+                moved = drawn.smooth(image, name)
                 found[name] = self._stokes(name, moved, drawn, sample) if self.polarized else moved
             elif kind in ("point", "direction"):
-                found[name] = _in_the_world(name, kind, drawn.nearest(image, torch.nan), drawn, sample.get("to_world"))
+                found[name] = _in_the_world(name, kind, image, drawn, sample.get("to_world"))
             else:
-                found[name] = drawn.nearest(image, self._fill(name, image))
+                found[name] = drawn.nearest(image, self._fill(name, image), name)
         if self.polarized and "measurement" in images and (drawn.turns or drawn.mirror is not None):
             raise SceneError(
                 "Augment: a measurement of polarized light does not tell what the turned or mirrored scene would give; "
@@ -157,11 +167,9 @@ class Augment:
         return found
 
     def _fill(self, name: str, image: Tensor) -> float:
-        if name == "measurement" or image.dtype == torch.bool:
+        if image.dtype == torch.bool or (name == "measurement" and self._kind(name) == "label"):
             return 0
-        if self._kind(name) == "number" or not image.is_floating_point():
-            return -1
-        return torch.nan
+        return -1 if self._kind(name) == "number" else torch.nan
 
     def _stokes(self, name: str, light: Tensor, drawn: PixelMap, sample: Mapping[str, Any]) -> Tensor:
         dim = -4 if name == "steady" else -5
@@ -169,37 +177,43 @@ class Augment:
             raise ShapeError(
                 f"Augment: expected the 4 Stokes components of {name!r} in dimension {dim}, got {tuple(light.shape)}."
             )
+        moves = drawn.turns or drawn.mirror is not None
+        if moves and not light.is_floating_point() and not light.is_complex():
+            raise UnitError(
+                f"Augment: expected the Stokes components of {name!r} as a floating dtype, got {light.dtype}: they "
+                "change their signs, and are turned; convert them with .float()."
+            )
         return turned_stokes(light, dim, drawn, sample.get("intrinsics"))
 
-    def _check_values(self, values: Any, drawn: PixelMap) -> None:
-        for key in values if isinstance(values, Mapping) else ():
-            parts = key.split(".")
-            of_camera = parts[0] == self.sensor
-            moved = parts[-1] in _PLACES and (drawn.mirror is not None or (drawn.turns and of_camera))
-            if moved or (of_camera and parts[-1] in _OPTICS and drawn.changes_intrinsics):
-                raise SceneError(
-                    f"Augment: the value {key!r} is not true of the augmented sample. Read the data set without "
-                    "values, TransientDataset(..., fields=[...]), or use operations that keep it."
-                )
+
+def _checked_fields(fields: Any) -> dict[str, Kind]:
+    if fields is None:
+        return {}
+    if not isinstance(fields, Mapping):
+        raise SceneError(f'Augment: expected fields as a dictionary, {{"mask": "number"}}, got {shown(fields)}.')
+    for name, kind in fields.items():
+        if kind not in get_args(Kind):
+            raise SceneError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(kind)}.")
+        if name in _NAMED:
+            raise SceneError(f"Augment: {name!r} is no image: expected other names than {', '.join(_NAMED)} in fields.")
+    return dict(fields)
 
 
-def _image_size(images: Mapping[str, Any]) -> tuple[int, int]:
-    sizes = {}
-    for name, image in images.items():
-        if not isinstance(image, Tensor) or image.ndim < 2:
-            got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
-            raise ShapeError(f"Augment: expected {name!r} as an image (..., H, W), got {got}.")
-        sizes[name] = (int(image.shape[-2]), int(image.shape[-1]))
-    if not sizes:
-        raise SceneError(f"Augment: expected images among {', '.join(KINDS)}, got none; name others in fields=.")
-    if len(set(sizes.values())) > 1:
-        raise ShapeError(f"Augment: expected images of one size, got {sizes}. Leave out those of other sizes.")
-    return next(iter(sizes.values()))
+def _texts(what: str, given: Any) -> tuple[str, ...]:
+    if isinstance(given, str) or not isinstance(given, Sequence) or not all(isinstance(one, str) for one in given):
+        raise SceneError(f"Augment: expected {what} as a sequence of names, got {shown(given)}.")
+    return tuple(given)
 
 
 def _in_the_world(name: str, kind: Kind, image: Tensor, drawn: PixelMap, to_world: Tensor | None) -> Tensor:
     if image.ndim < 3 or image.shape[-3] != 3:
         raise ShapeError(f"Augment: expected {name!r} as (..., 3, H, W), got {tuple(image.shape)}.")
+    if not image.is_floating_point():
+        raise UnitError(
+            f"Augment: expected {name!r} as a floating dtype, got {image.dtype}; convert it with .float(), or call it "
+            "a label in fields=."
+        )
+    image = drawn.nearest(image, torch.nan, name)
     if drawn.mirror is None:
         return image
     if to_world is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -12,18 +11,20 @@ import numpy as np
 import torch
 
 from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError, ShapeError
 from torchtransient.quantities import count, share, shown
 
 Direction = Literal["horizontal", "vertical"]
 
 
 class Operation(abc.ABC):
-    """Draws a map of the pixels of an image."""
+    """Draws a map of the pixels of an image: the base of one's own operations, which have :meth:`draw` alone."""
 
     @abc.abstractmethod
     def draw(self, size: tuple[int, int], generator: torch.Generator | None) -> PixelMap | None:
-        """A map for images of ``size`` (height, width); None to leave them. ``generator``: None for torch's own."""
+        """A :class:`~torchtransient.data.PixelMap` for images of ``size`` (height, width), with that as its ``size``;
+        None to leave them. ``generator``: to draw with, None for torch's own.
+        """
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class QuarterTurn(Operation):
     turns: Sequence[int] = (0, 1, 2, 3)
 
     def __post_init__(self) -> None:
-        given = [self.turns] if isinstance(self.turns, int) else list(self.turns)
+        given = list(self.turns) if isinstance(self.turns, Sequence) else [self.turns]
         if not given:
             raise SceneError("QuarterTurn: expected numbers of quarter turns, got none.")
         object.__setattr__(self, "turns", tuple(count("QuarterTurn: turns", one, -3) % 4 for one in given))
@@ -107,7 +108,8 @@ class Affine(Operation):
     ``RandomRotation``, ``RandomShear``, ``RandomTranslate``, flips. Images keep their size.
 
     Its settings of interpolation and rim do not count: light is interpolated linearly and labels are taken from the
-    nearest pixel, with nothing beyond the rim. Raises SceneError for what is no affine augmentation.
+    nearest pixel, with nothing beyond the rim. Raises SceneError for what is no affine augmentation, UnitError for
+    a map without an inverse when it is drawn.
     """
 
     def __init__(self, augmentation: Any) -> None:
@@ -138,14 +140,17 @@ class Affine(Operation):
                 f"Affine: {type(self.augmentation).__name__} is no affine map of pixels: images along the axis of the "
                 "camera stay there no longer. Use RandomAffine."
             )
-        if not math.isfinite(np.linalg.det(matrix)) or abs(np.linalg.det(matrix)) < 1e-6:
-            raise UnitError(f"Affine: expected maps with an inverse, got {matrix.tolist()}.")
         return PixelMap(matrix, size, size)
 
 
 def _whole(number: int, generator: torch.Generator | None) -> int:
-    return int(torch.randint(number, (), generator=generator))
+    return int(torch.randint(number, (), generator=generator, device=_device(generator)))
 
 
 def _happens(p: float, generator: torch.Generator | None) -> bool:
-    return bool(torch.rand((), generator=generator) < p)
+    return bool(torch.rand((), generator=generator, device=_device(generator)) < p)
+
+
+def _device(generator: torch.Generator | None) -> torch.device | None:
+    """A generator draws where it is."""
+    return None if generator is None else generator.device

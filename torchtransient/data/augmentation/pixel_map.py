@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.quantities import count, real_array, shown
 
 Matrix = NDArray[np.float64]
 
@@ -22,11 +27,30 @@ class PixelMap:
     A pinhole camera with square pixels that has taken the result has the intrinsics ``matrix @ K @ rotation.T``, and is
     turned: points of its frame are ``rotation @ p``. A map that mirrors has a ``mirror`` F before it: the scene seen is
     mirrored in the camera's frame, p -> F p, and the camera stays one that exists.
+
+    What :meth:`torchtransient.data.Operation.draw` returns. Raises ShapeError for other shapes and for maps that are
+    not affine, UnitError for those without an inverse.
     """
 
     matrix: Matrix
     size: tuple[int, int]
     new_size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        matrix = real_array(self.matrix)
+        if matrix is None or matrix.shape != (3, 3) or not np.allclose(matrix[2], [0, 0, 1], atol=1e-9):
+            raise ShapeError(
+                f"PixelMap: expected an affine matrix (3, 3), its last row 0, 0, 1, got {shown(self.matrix)}."
+            )
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
+            raise UnitError(f"PixelMap: expected a matrix with an inverse, got {matrix.tolist()}.")
+        object.__setattr__(self, "matrix", matrix)
+        for name in ("size", "new_size"):
+            given = getattr(self, name)
+            if not isinstance(given, Sequence) or len(given) != 2:
+                raise ShapeError(f"PixelMap: expected {name} as (height, width), got {shown(given)}.")
+            whole = tuple(count(f"PixelMap: {name}", one, 1, ShapeError) for one in given)
+            object.__setattr__(self, name, whole)
 
     # ----------------------------------------------------------------------------------------------- of the camera
 
@@ -64,6 +88,13 @@ class PixelMap:
     def changes_intrinsics(self) -> bool:
         """Whether the camera's matrix is another one, or may be."""
         return not (np.array_equal(self.matrix, np.eye(3)) and self.size == self.new_size)
+
+    @property
+    def changes_scale(self) -> bool:
+        """Whether an angle of view is another one, or may be."""
+        upper = self.matrix[:2, :2] @ self._orthogonal[:2, :2].T
+        # To what float32 tells, in which kornia draws.
+        return self.size != self.new_size or float(np.abs(upper - np.eye(2)).max()) > 1e-6
 
     def intrinsics(self, camera_matrix: Tensor) -> Tensor:
         """Those of the camera that has taken the result."""
@@ -103,24 +134,51 @@ class PixelMap:
         rows, columns = (torch.from_numpy(np.where(inside, one, 0).astype(np.int64)) for one in (row, column))
         return rows, columns, torch.from_numpy(inside)
 
-    def nearest(self, image: Tensor, fill: float) -> Tensor:
-        """(..., H, W) by the nearest pixel; ``fill`` where there is none."""
+    def nearest(self, image: Tensor, fill: float, name: str = "image") -> Tensor:
+        """(..., H, W) by the nearest pixel; ``fill`` where there is none. ``name``: of the image, for messages.
+
+        Raises UnitError for a type that cannot hold ``fill``, NaN in whole numbers or -1 in unsigned ones; exact maps
+        without a rim take every type.
+        """
         rows, columns, inside = (one.to(image.device) for one in self._sources)
         taken = image[..., rows, columns]
-        return taken if bool(inside.all()) else torch.where(inside, taken, torch.tensor(fill).to(taken))
+        has_rim = not bool(inside.all())
+        # Also where this draw happens to have no rim: others of its kind do.
+        if (has_rim or not self.is_exact) and not _holds(image.dtype, fill):
+            raise UnitError(
+                f"Augment: {name!r} of {image.dtype} cannot hold {fill}, which stands for nothing beyond the rim: "
+                + ("convert it with .float(), or call it a number in fields=." if math.isnan(fill) else
+                   "convert it with .long() or .float().")
+            )  # fmt: skip
+        return torch.where(inside, taken, torch.tensor(fill).to(taken)) if has_rim else taken
 
-    def smooth(self, image: Tensor) -> Tensor:
-        """(..., H, W) interpolated linearly between pixels, zero beyond the rim; every bin and channel by itself."""
+    def smooth(self, image: Tensor, name: str = "image") -> Tensor:
+        """(..., H, W) interpolated linearly between pixels, zero beyond the rim; every bin and channel by itself.
+
+        Raises UnitError for whole numbers that would have to be interpolated; exact maps take every type.
+        """
         if self.is_exact:
-            return self.nearest(image, 0)
+            return self.nearest(image, 0, name)
         if image.is_complex():
             return torch.complex(self.smooth(image.real), self.smooth(image.imag))
+        if not image.is_floating_point():
+            raise UnitError(
+                f"Augment: {name!r} of {image.dtype} cannot be interpolated between pixels: convert it with .float(), "
+                "or use flips, quarter turns and crops alone."
+            )
         from kornia.geometry.transform import warp_affine
 
         whole = image.reshape(1, -1, *self.size).to(torch.promote_types(image.dtype, torch.float32))
         matrix = _like(self.matrix[None, :2], whole)
         moved: Any = warp_affine(whole, matrix, self.new_size, mode="bilinear", align_corners=True)
         return torch.as_tensor(moved, dtype=image.dtype).reshape(*image.shape[:-2], *self.new_size)
+
+
+def _holds(dtype: torch.dtype, fill: float) -> bool:
+    if dtype.is_floating_point or dtype.is_complex:
+        return True
+    least, most = (0, 1) if dtype == torch.bool else (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
+    return least <= fill <= most
 
 
 def _like(matrix: Matrix, tensor: Tensor) -> Tensor:

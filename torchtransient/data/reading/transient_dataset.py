@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
+from torchtransient.data.reading.sample_draws import (
+    Epochs,
+    checked_seed,
+    sample_generator,
+    sample_number,
+    takes_generator,
+    transformed,
+)
 from torchtransient.data.reading.shard_table import WHAT, ShardTable
 from torchtransient.data.storage.encodings import measured_names
 from torchtransient.data.storage.shard_file import Shard
@@ -24,7 +30,7 @@ _MEASURED = "measurement"
 _VALUES, _INDEX, _TRANSIENT = "values", "index", "transient"
 
 
-class TransientDataset(Dataset[dict[str, Any]]):
+class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """The samples of shards, by number, in the order of the files and their rows; those that failed are left out.
 
     ``where``: a folder, a pattern of names, a shard, or a list of these. A sample is a dictionary of its arrays by
@@ -36,18 +42,21 @@ class TransientDataset(Dataset[dict[str, Any]]):
     ``axis`` is the time axis of what is returned. ``pixels``: slices (rows, columns) of everything that is an image of
     the film's size. ``transform``: a sensor, or any function of the transient, without gradients; its result stands
     under ``measurement``, in place of one that was stored. A sensor answers under its policy, the mean with "expected";
-    ``transform=sensor.sample`` draws in any case. ``seed``: each sample has a generator of its own for the
-    transform (its argument ``generator``), so that it has the same noise whoever reads it; None draws from torch's.
-    ``as_stored``: counts in the type that they are stored in, not as float32.
+    ``transform=sensor.sample`` draws in any case. ``seed``: each sample has a generator of its own for the transform
+    (its argument ``generator``), so that it has the same noise whoever reads it, in every epoch until
+    :meth:`set_epoch`; None draws from torch's. ``as_stored``: counts in the type that they are stored in, not as
+    float32.
 
     Files are opened when they are first read, in every process anew: it can be pickled, and read by workers that were
-    forked or spawned. Raises StorageError for what cannot be read, or does not belong together.
+    forked or spawned. Raises StorageError for what cannot be read, or does not belong together, UnitError for a
+    seed or an epoch below zero, and IndexError beyond the samples.
     """
 
     def __init__(
         self, where: Any, fields: Sequence[str] | None = None, window: Any = None, pixels: Any = None,
         transform: Callable[..., Any] | None = None, as_stored: bool = False, *, seed: int | None = None,
     ) -> None:  # fmt: skip
+        super().__init__()
         self._table = ShardTable(where)
         self.about: dict[str, Any] = self._table.about
         shapes = self._table.arrays
@@ -58,9 +67,9 @@ class TransientDataset(Dataset[dict[str, Any]]):
         self._timed = measured_names(self.about)
         self._size = image_size(shapes, self._timed)
         self._pixels = pixels_of(pixels, self._size)
-        self.transform, self.as_stored, self.seed = transform, bool(as_stored), seed
+        self.transform, self.as_stored, self.seed = transform, bool(as_stored), checked_seed(WHAT, seed)
         self._fields = self._read_fields(fields, shapes)
-        if seed is not None and not _takes_generator(transform):
+        if seed is not None and not takes_generator(transform):
             raise StorageError(
                 f"{WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
             )
@@ -69,7 +78,7 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return len(self._table)
 
     def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number)
+        return self.sample(number, self.epoch)
 
     @property
     def index(self) -> Tensor:
@@ -88,22 +97,28 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return tuple(dict.fromkeys((*self._fields, *made)))
 
     @property
+    def repeats(self) -> Tensor:
+        """(N,) int64: how many samples before it have the same ``index``, those of other folders."""
+        return torch.from_numpy(self._table.repeat.copy())
+
+    @property
     def shards(self) -> Tensor:
         """(N,) int64: the file of every sample, by its place among them."""
         return torch.from_numpy(self._table.shard.copy())
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
-        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another."""
-        size = len(self._table)
-        if isinstance(number, slice) or not -size <= number < size:
-            raise IndexError(f"{WHAT}: expected a number from 0 to {size - 1}, got {shown(number)}.")
+        """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""
+        number = sample_number(WHAT, number, len(self._table))
         place, row = int(self._table.shard[number]), int(self._table.row[number])
         shard = self._table.open(place)
         found: dict[str, Any] = {name: self._read(shard, name, row) for name in self._fields if name != _VALUES}
         index = int(self._table.index[number])
         if self.transform is not None:
             given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
-            found[_MEASURED] = self._transformed(given, index, epoch)
+            # Samples of several folders may have one number in their recipes.
+            repeat = int(self._table.repeat[number])
+            generator = sample_generator(WHAT, self.seed, index, epoch or 0, repeat)
+            found[_MEASURED] = transformed(self.transform, given, generator)
         if _VALUES in self._fields:
             values = shard.values(row)
             found[_VALUES] = {k: v if isinstance(v, str) else tensor_in(v) for k, v in values.items()}
@@ -137,20 +152,3 @@ class TransientDataset(Dataset[dict[str, Any]]):
         pixels = self._pixels if shape[-2:] == self._size else None
         array = shard.read(name, row, bins, pixels, as_stored=self.as_stored)
         return torch.from_numpy(array) if array.dtype.isnative else tensor_in(array)
-
-    def _transformed(self, transient: Tensor, index: int, epoch: int | None) -> Any:
-        assert self.transform is not None
-        with torch.no_grad():
-            if self.seed is None:
-                return self.transform(transient)
-            key = np.random.SeedSequence([abs(self.seed), index, *([] if epoch is None else [epoch])])
-            generator = torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-            return self.transform(transient, generator=generator)
-
-
-def _takes_generator(transform: Any) -> bool:
-    function = transform.forward if isinstance(transform, torch.nn.Module) else transform
-    try:
-        return "generator" in inspect.signature(function).parameters
-    except (TypeError, ValueError):
-        return False

@@ -1,0 +1,240 @@
+"""Images of every type: nothing is cut off, wrapped around or left where it was without a word."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from kornia.augmentation import RandomAffine
+
+from torchtransient.data import Affine, Augment, Crop, Flip, Operation, PixelMap, QuarterTurn
+from torchtransient.errors import SceneError, ShapeError, UnitError
+
+H, W = 4, 6
+FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64)
+SIGNED = (torch.int8, torch.int16, torch.int32, torch.int64)
+UNSIGNED = (torch.uint8, torch.uint16, torch.uint32, torch.uint64)
+TYPES = (torch.bool, *FLOATING, *SIGNED, *UNSIGNED)
+# Half the image to the right and down: pixels come to lie on pixels, and there is a rim.
+SHIFT = np.array([[1.0, 0, 3], [0, 1, 2], [0, 0, 1]])
+TURN = Affine(RandomAffine((10.0, 10.0), p=1.0))
+# What stands beyond the rim; None for a type that cannot hold it.
+BEYOND = {
+    "number": {torch.bool: 0, **dict.fromkeys((*FLOATING, *SIGNED), -1)},
+    "label": {torch.bool: 0, **dict.fromkeys(FLOATING, torch.nan)},
+    "light": dict.fromkeys(TYPES, 0),
+}
+
+
+@dataclass
+class Given(Operation):
+    """The same map in every call."""
+
+    matrix: Any
+    new_size: Any = (H, W)
+    seen: Any = None
+
+    def draw(self, size, generator):
+        return PixelMap(self.matrix, self.seen or size, self.new_size)
+
+
+def ramp(dtype):
+    return (torch.arange(1, H * W + 1).reshape(H, W) % 2 if dtype == torch.bool else
+            torch.arange(1, H * W + 1).reshape(H, W)).to(dtype)  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", TYPES, ids=str)
+@pytest.mark.parametrize("kind", BEYOND)
+def test_every_type_of_every_kind(kind, dtype):
+    image = ramp(dtype)
+    plain = image.to(torch.complex128 if dtype.is_complex else torch.float64)
+    fields = {"it": kind}
+    for operation, expected in (
+        (Flip(p=1.0), plain.flip(-1)), (QuarterTurn(1), torch.rot90(plain, 1, (-2, -1))),
+        (Crop((2, 3), (1, 2)), plain[1:3, 2:5]),
+    ):  # fmt: skip
+        found = Augment(operation, fields=fields)({"it": image})["it"]
+        assert found.dtype == dtype and torch.equal(found.to(plain.dtype), expected)
+    beyond = BEYOND[kind].get(dtype)
+    augment = Augment(Given(SHIFT), fields=fields)
+    if beyond is None:
+        with pytest.raises(UnitError, match=f"'it' of {dtype} cannot hold"):
+            augment({"it": image})
+    else:
+        expected = torch.full_like(plain, beyond)
+        expected[2:, 3:] = plain[:2, :3]
+        found = augment({"it": image})["it"]
+        assert found.dtype == dtype
+        assert torch.allclose(found.to(plain.dtype), expected, rtol=0, atol=0, equal_nan=True)
+    refused = beyond is None or (kind == "light" and dtype not in FLOATING)
+    if refused:
+        with pytest.raises(UnitError, match=r"cannot (hold|be interpolated).*convert it with \.(float|long)"):
+            Augment(TURN, fields=fields)({"it": image})
+    else:
+        found = Augment(TURN, fields=fields)({"it": image})["it"]
+        assert found.dtype == dtype and found.shape == image.shape
+
+
+def test_a_rim_that_this_draw_does_not_have():
+    """Whether a type can be augmented does not depend on what is drawn: a map of kornia's may have a rim."""
+    larger = Affine(RandomAffine(0.0, scale=(2.0, 2.0), p=1.0))
+    assert bool(Augment(larger)({"depth": torch.ones(H, W)})["depth"].isfinite().all())
+    with pytest.raises(UnitError, match=r"cannot hold nan.*\.float\(\), or call it a number"):
+        Augment(larger)({"depth": torch.ones(H, W, dtype=torch.int64)})
+
+
+def test_counts_have_zero_beyond_the_rim():
+    for dtype in TYPES:
+        found = Augment(Given(SHIFT))({"measurement": ramp(dtype)})["measurement"]
+        assert found.dtype == dtype and not found[:2].any() and bool(found[2:, 3].all())
+    # Told to be something else, it is that.
+    found = Augment(Given(SHIFT), fields={"measurement": "number"})({"measurement": ramp(torch.int32)})["measurement"]
+    assert found[0, 0] == -1
+
+
+def test_points_directions_and_stokes_components_are_floating():
+    camera = {"to_world": torch.eye(4)}
+    for name in ("position", "normals"):
+        for dtype in (torch.int32, torch.uint8, torch.bool):
+            with pytest.raises(UnitError, match=f"{name}' as a floating dtype"):
+                Augment(Flip(p=1.0))({name: torch.ones(3, H, W).to(dtype), **camera})
+    whole = {"steady": torch.ones(4, 1, H, W, dtype=torch.uint8), "intrinsics": torch.eye(3)}
+    for operation in (Flip(p=1.0), QuarterTurn(1)):
+        with pytest.raises(UnitError, match="Stokes components of 'steady' as a floating dtype"):
+            Augment(operation, polarized=True)(whole)
+    assert Augment(Crop((2, 2)), polarized=True)(whole)["steady"].dtype == torch.uint8
+
+
+# --------------------------------------------------------------------------------------------- what is called an image
+
+
+@pytest.mark.parametrize("p", [0.0, 1.0])
+def test_arrays_are_taken_as_tensors(p):
+    mask = np.arange(6).reshape(2, 3)
+    given = {"depth": torch.ones(2, 3), "mask": mask, "uv": np.ones((2, 2, 3), ">f4")}
+    found = Augment(Flip(p=p), fields={"mask": "number"})(given)
+    expected = mask[:, ::-1] if p else mask
+    assert isinstance(found["mask"], torch.Tensor) and np.array_equal(found["mask"].numpy(), expected)
+    assert found["uv"].dtype == torch.float32
+    found["mask"].zero_()
+    assert mask.sum() == 15
+
+
+@dataclass
+class Record:
+    picture: Any
+
+
+UNKNOWN = {
+    "array": np.zeros((H, W)),
+    "tensor": torch.zeros(2, H, W),
+    "channels last": np.zeros((H, W, 3)),
+    "lists": np.zeros((H, W)).tolist(),
+    "dictionary": {"masks": {"left": torch.zeros(H, W)}},
+    "list of tensors": [torch.zeros(H, W)],
+    "record": Record(np.zeros((H, W))),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_may_be_an_image_is_not_passed_over(name):
+    given = {"depth": torch.ones(H, W), "mask": UNKNOWN[name]}
+    with pytest.raises(SceneError, match="'mask' has the size of an image"):
+        Augment(Flip(p=1.0))(given)
+    assert Augment(Flip(p=1.0), fields={"mask": "unchanged"})(given)["mask"] is UNKNOWN[name]
+
+
+def test_pictures_of_pillow():
+    image = pytest.importorskip("PIL.Image").new("L", (W, H))
+    with pytest.raises(SceneError, match="'mask' has the size of an image"):
+        Augment(Flip(p=1.0))({"depth": torch.ones(H, W), "mask": image})
+
+
+def test_what_is_no_image_is_passed_on():
+    given = {"index": 3, "name": "room", "tags": ["a", "b"], "points": np.zeros((9, 3)), "ragged": [[1], [2, 3]],
+             "nothing": None, "axis": Record(3.0), "values": {}}  # fmt: skip
+    found = Augment(Flip(p=1.0))({"depth": torch.ones(H, W), **given})
+    assert all(found[name] is value for name, value in given.items())
+
+
+# ------------------------------------------------------------------------------------------------------------ aliasing
+
+
+@pytest.mark.parametrize("p", [0.0, 1.0])
+def test_samples_share_nothing_with_what_augment_was_given(p):
+    matrix, pose = torch.eye(3), torch.eye(4)
+    augment = Augment(Flip(p=p), intrinsics=matrix, to_world=pose)
+    known = augment({"depth": torch.ones(H, W)})
+    first = augment({"depth": torch.ones(H, W), "to_world": None})
+    assert all(torch.equal(first[name], known[name]) for name in ("intrinsics", "to_world"))
+    kept = {name: one.clone() for name, one in known.items()}
+    first["to_world"][0, 3], first["intrinsics"][0, 0] = 9.0, 9.0
+    pose[1, 3], matrix[1, 1] = 9.0, 9.0
+    for sample in (known, augment({"depth": torch.ones(H, W)})):
+        assert all(torch.equal(sample[name], one) for name, one in kept.items())
+
+
+def test_what_is_given_is_not_changed():
+    given = {"depth": ramp(torch.float32), "steady": ramp(torch.float32)[None], "intrinsics": torch.eye(3)}
+    before = {name: one.clone() for name, one in given.items()}
+    for operation in (Flip(p=1.0), Given(np.eye(3)), TURN):
+        found = Augment(operation)(given)
+        for one in found.values():
+            one.zero_()
+        assert all(torch.equal(given[name], one) for name, one in before.items())
+
+
+# ---------------------------------------------------------------------------------------------------- one's own map
+
+
+def test_an_operation_of_ones_own():
+    found = Augment(Given(np.diag([2.0, 2.0, 1.0]), (2 * H, 2 * W)))({"depth": ramp(torch.float32)})["depth"]
+    assert found.shape == (2 * H, 2 * W) and torch.equal(found[::2, ::2], ramp(torch.float32))
+
+
+class Other(Operation):
+    def draw(self, size, generator):
+        return np.eye(3)
+
+
+DEPTH = {"depth": torch.ones(H, W)}
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: Augment(Other())(DEPTH), SceneError, r"Other\.draw to return a PixelMap"),
+        (lambda: Augment(Given(SHIFT, seen=(2, 2)))(DEPTH), SceneError, r"of images of \(4, 6\)"),
+        (lambda: PixelMap(np.eye(2), (2, 2), (2, 2)), ShapeError, "affine matrix"),
+        (lambda: PixelMap("map", (2, 2), (2, 2)), ShapeError, "affine matrix"),
+        (lambda: PixelMap([[1, 0, 0], [0, 1, 0], [0.1, 0, 1]], (2, 2), (2, 2)), ShapeError, "affine matrix"),
+        (lambda: PixelMap(np.diag([0.0, 1, 1]), (2, 2), (2, 2)), UnitError, "with an inverse"),
+        (lambda: PixelMap(np.diag([np.nan, 1, 1]), (2, 2), (2, 2)), UnitError, "with an inverse"),
+        (lambda: PixelMap(np.eye(3), 2, (2, 2)), ShapeError, r"size as \(height, width\)"),
+        (lambda: PixelMap(np.eye(3), (2, 2), (2, 0)), ShapeError, "at least 1"),
+        (lambda: Augment(3), SceneError, "Flip, QuarterTurn, Crop or Affine"),
+        (lambda: Augment(None), SceneError, "Flip, QuarterTurn, Crop or Affine"),
+        (lambda: Augment([Flip(), 3]), SceneError, "Flip, QuarterTurn, Crop or Affine"),
+        (lambda: Augment(Flip(), fields=3), SceneError, "fields as a dictionary"),
+        (lambda: Augment(Flip(), fields={"to_world": "label"}), SceneError, "'to_world' is no image"),
+        (lambda: Augment(Flip(), fields={"mask": ["number"]}), SceneError, "fields among"),
+        (lambda: Augment(Flip(), names="depth"), SceneError, "names as a sequence of names"),
+        (lambda: Augment(Flip(), names=3), SceneError, "names as a sequence"),
+        (lambda: Augment(Flip(), sensor=3), SceneError, "sensor as a sequence"),
+        (lambda: Augment(Flip(), kept_values="scene"), SceneError, "kept_values as a sequence"),
+        (lambda: Augment(Flip(), polarized="no"), SceneError, "polarized"),
+        (lambda: Augment(Flip())(DEPTH, generator=3), SceneError, r"torch\.Generator"),
+        (lambda: Augment(Flip())(3), SceneError, "expected a dictionary"),
+        (lambda: Augment(Flip())({"depth": np.array([["a", "b"]])}), ShapeError, "as numbers"),
+        (lambda: Augment(Flip())({"depth": [[1.0]]}), ShapeError, "as an image"),
+        (lambda: QuarterTurn(None), SceneError, "whole number"),
+        (lambda: QuarterTurn("12"), SceneError, "whole number"),
+        (lambda: QuarterTurn({1: 2}), SceneError, "whole number"),
+    ],
+)  # fmt: skip
+def test_what_it_refuses(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,110 @@
+"""Items of a batch that are dark, or of other levels: finite in every loss, by themselves, and led out of the dark."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import pytest
+import torch
+
+from support.loss_cases import CASES
+from torchtransient import losses
+from torchtransient.errors import ShapeError
+
+CYCLES = 400
+LEVELS = (0.0, 1e-30, 1e-12, 1e6)
+# (model, counts): without a floor that is given
+OWN_FLOORS = {
+    "poisson_loss": losses.poisson_loss,
+    "poisson_nll": lambda x, y, **more: losses.poisson_nll(y, x, **more),
+    "first_photon_loss": functools.partial(losses.first_photon_loss, cycles=CYCLES),
+    "first_photon_nll": lambda x, y, **more: losses.first_photon_nll(y, x, CYCLES, **more),
+    "first_photon_loss, dead time": functools.partial(losses.first_photon_loss, cycles=CYCLES, dead_bins=2.5),
+    "free_running_nll": lambda x, y, **more: losses.free_running_nll(y, x, CYCLES, 2.5, **more),
+    "multiscale_loss": functools.partial(losses.multiscale_loss, compare=losses.poisson_loss),
+    "measurement_consistency": functools.partial(
+        losses.measurement_consistency, operator=lambda v: 1.0 * v, compare=losses.poisson_loss
+    ),
+}
+own = pytest.mark.parametrize("name, loss", OWN_FLOORS.items(), ids=OWN_FLOORS.keys())
+# Of the mean of the rates per cycle; the others take mean counts.
+PER_CYCLE = ("first_photon_loss", "first_photon_nll", "first_photon_loss, dead time", "free_running_nll")
+
+
+def items(x, first):
+    """A batch of two, the first one times a level."""
+    return x * torch.tensor([first, 1.0], dtype=x.dtype).reshape(2, *[1] * (x.ndim - 1))
+
+
+def slope_of(loss, x, y, **more):
+    leaf = x.detach().clone().requires_grad_()
+    value = loss(leaf, y, **more)
+    (slope,) = torch.autograd.grad(value.sum(), leaf)
+    return value.detach(), slope
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_levels_of_items_in_every_loss(case):
+    """Counts of 0 to 50 against models of any level, none at all included."""
+    x, y = case.tensors(dtype=torch.float32)
+    for level in LEVELS:
+        for brightness in (0.0, 1.0, 10.0):
+            inputs, targets = items(x, level), items(y, brightness)
+            whole, slope = slope_of(case, inputs, targets, reduction="none")
+            assert bool(torch.isfinite(whole).all()) and bool(torch.isfinite(slope).all()), (level, brightness)
+            alone, own_slope = slope_of(case, inputs[0], targets[0], reduction="none")
+            # by the largest: values and slopes may be differences of larger ones, which are rounded; slopes that vanish
+            # by the loss over the change of a bin that would be all of it
+            sizes = [float(t.abs().max()) for t in (alone, own_slope)]
+            sizes[1] += 0.01 * sizes[0] / max(1.0, level)
+            for found, wanted, size in zip((whole[0], slope[0]), (alone, own_slope), sizes, strict=True):
+                assert float((found - wanted).abs().max()) <= 1e-4 * size, (level, brightness)
+
+
+@own
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("count", [0, 1, 4, 6, 50])
+def test_a_model_without_light_has_a_slope(name, loss, dtype, count):
+    """Every number of counts, in every precision: towards light where there are counts, to none where there are none.
+
+    The least light is a thousandth of a tenth of the mean counts, so that slopes of a sum are at most ten thousand,
+    and twice that for coarse bins, which hold up to twice the mean of those that are cut off at the ends. Of
+    float16, whose numbers end at 65504, the gradient is looked at before it is given in that.
+    """
+    x, y = torch.zeros(2, 1, 8, 2, 2, dtype=dtype), torch.full((2, 1, 8, 2, 2), count)
+    value, slope = slope_of(loss, x.float() if dtype == torch.float16 else x, y)
+    torch.testing.assert_close(value, loss(x, y), rtol=0, atol=0)
+    assert bool(torch.isfinite(value)) and bool((slope < 0).all() if count else (slope > 0).all())
+    assert float(value) < 50 * 25 * CYCLES
+    most = 1.01e4 * (CYCLES if name in PER_CYCLE else 2 if name == "multiscale_loss" else 1) / y.numel()
+    assert float(slope.abs().max()) <= most
+
+
+@own
+def test_the_loss_falls_all_the_way_out_of_the_dark(name, loss):
+    """From no light to the right one no level is dearer than a darker one."""
+    y = torch.full((1, 1, 8, 2, 2), 6.0, dtype=torch.float64)
+    levels = [0.0, *(10.0**k for k in range(-40, 1))]
+    scale = 6.0 / CYCLES if name in PER_CYCLE else 6.0
+    found = [float(loss(torch.full_like(y, scale * level), y)) for level in levels]
+    assert all(a >= b - 1e-12 * abs(a) for a, b in itertools.pairwise(found)), found
+    assert found[0] > found[-1] + 1
+
+
+def test_the_floor_of_a_dark_model():
+    """A thousandth of its own mean; of a tenth of what was measured where that is more; of each item."""
+    model = items(torch.rand(2, 1, 8, 2, 2, generator=torch.Generator().manual_seed(0)), 0.0)
+    measured = torch.full_like(model, 3.0)
+    floor = losses.relative_floor(model, measured=measured)
+    assert floor.flatten().tolist() == pytest.approx([1e-3 * 0.1 * 3, 1e-3 * float(model[1].mean())])
+    torch.testing.assert_close(floor[:1], losses.relative_floor(model[:1], measured=measured[:1]))
+    assert float(losses.relative_floor(model)[0]) == torch.finfo(torch.float32).tiny
+    mask = torch.zeros(8, 1, 1, dtype=torch.bool)
+    mask[:4] = True
+    measured[0, :, 4:] = math.nan
+    masked = losses.relative_floor(model, mask=mask, measured=measured)
+    assert masked.flatten().tolist() == pytest.approx([3e-4, 1e-3 * float(model[1, :, :4].mean())])
+    with pytest.raises(ShapeError, match="relative_floor: expected model and measured of one shape"):
+        losses.relative_floor(model, measured=measured[:1])
