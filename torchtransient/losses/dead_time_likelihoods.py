@@ -17,6 +17,7 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
     check_mask,
+    check_number,
     check_option,
     check_reduction,
     check_whole,
@@ -34,6 +35,7 @@ _TIME = -3
 
 
 def _check_dead_time(dead_bins: float, where: str) -> float:
+    check_number("dead_bins", dead_bins, where)
     number = positive(f"{where}: dead_bins", dead_bins)
     try:
         split_dead_time(number)
