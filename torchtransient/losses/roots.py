@@ -33,8 +33,9 @@ def anscombe(counts: Tensor, read_noise: Tensor | float = 0.0) -> Tensor:
     """`2 sqrt(n + 3/8 + read_noise^2)`: photon counts on a scale where their noise has variance one. Any shape.
 
     Anscombe 1948; with read noise, in counts, the generalised transform of Starck, Murtagh and Bijaoui 1998 for gain
-    one; a number, or a tensor that broadcasts to the counts, differentiable in it. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below
-    zero, of a record less its background, continue the tangent at zero, so that values and gradients are finite.
+    one; `read_noise` is a number, or a tensor that broadcasts to the counts, differentiable in it. The variance is 1
+    within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below zero, of a record less
+    its background, continue the tangent at zero, so that values and gradients are finite.
     Whole numbers count in torch's default dtype, half precision in float32. Raises UnitError for a read noise below
     zero and for complex numbers, ShapeError for no tensor.
     """

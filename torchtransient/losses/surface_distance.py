@@ -54,7 +54,7 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     """Mean distance of points of some triangles (F, 3, 3) to others, over the area."""
     weights = _middles(cells).to(triangles)
     # no matrix product, whose derivative autocast would narrow wherever the backward pass runs
-    points = sum(weights[:, corner, None] * triangles[:, None, corner] for corner in range(3))
+    points = (weights[:, :, None] * triangles[:, None]).sum(2)
     distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
     edges = triangles[:, 1:] - triangles[:, :1]
     longest = edges.detach().abs().amax()
