@@ -62,6 +62,12 @@ def test_the_others(call):
     torch.testing.assert_close(single.to(wanted.dtype), wanted, rtol=1e-5, atol=1e-5)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         torch.testing.assert_close(call(x.float()), single, rtol=0, atol=0)
+    leaf = x.float().requires_grad_()
+    if call is not losses.relative_floor:
+        (wanted,) = torch.autograd.grad(call(leaf).abs().sum(), leaf)
+        with torch.autocast("cpu", dtype=torch.bfloat16):  # backward, too
+            (found,) = torch.autograd.grad(call(leaf).abs().sum(), leaf)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
     leaf = x.clone().requires_grad_()
     if call is losses.relative_floor:  # a scale goes in without gradient
         assert not call(leaf).requires_grad

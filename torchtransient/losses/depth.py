@@ -78,8 +78,9 @@ def scale_invariant_depth_loss(
 
 def _log(x: Tensor, least: Tensor) -> Tensor:
     """The logarithm, and its tangent at `least` below that."""
-    above = torch.maximum(x, least)
-    return above.log() + (x - above) / least
+    # chosen, not a difference to the larger one: its two slopes of 1/least would cancel but for their rounding
+    below = x < least
+    return torch.where(below, least, x).log() + torch.where(below, x - least, 0.0) / least
 
 
 def _check_balance(balance: float, where: str) -> float:

@@ -75,7 +75,8 @@ def mesh_normal_consistency(
     `faces`: (F, 3). 0 where the mesh is flat, 1 at a right angle, 2 where it folds back. Of any order and sense of the
     faces: the angle is that at the edge. Edges of more than two faces count each pair; edges of triangles without area
     are 0, without gradient; faces that have a vertex twice are none. `mask` (V,) or (..., V): edges count whose faces
-    have no vertex that does not. `reduction="none"`: (..., E), in the order of the edges' vertex numbers. Raises ShapeError, UnitError, DeviceError.
+    have no vertex that does not. `reduction="none"`: (..., E), in the order of the edges' vertex numbers. Raises
+    ShapeError, UnitError, DeviceError.
     """
     where = "mesh_normal_consistency"
     check_reduction(reduction, where)
