@@ -80,6 +80,19 @@ def test_an_option_with_a_gradient_has_it_or_is_refused(name):
             assert torch.autograd.gradcheck(value, leaf, fast_mode=True), option
 
 
+def test_forward_mode_is_refused_as_well():
+    x, y = (1 + torch.rand(4, 4, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    calls = (
+        lambda v: losses.scale_invariant_depth_loss(x, y, balance=v),
+        lambda v: losses.total_variation(x[None], spacing=(1.0, v, 1.0)),
+    )
+    for call in calls:
+        with pytest.raises(TorchTransientError, match="without gradient"):
+            torch.func.jvp(call, (torch.tensor(0.5),), (torch.tensor(1.0),))
+    _, slope = torch.func.jvp(lambda v: losses.anscombe(x, v).sum(), (torch.tensor(0.5),), (torch.tensor(1.0),))
+    torch.testing.assert_close(slope, (1 / (x + 3 / 8 + 0.25).sqrt()).sum())
+
+
 def test_levels_that_are_fitted():
     """Read noise of a root, and the floor of each scale."""
     x, y = (torch.rand(1, 6, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) for s in (0, 1))

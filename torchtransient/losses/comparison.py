@@ -13,6 +13,7 @@ from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 from torchtransient.quantities import finite, flag, shown
@@ -164,12 +165,17 @@ def holds(condition: Tensor) -> bool:
 
 def check_number(name: str, value: object, where: str) -> float:
     """One finite number. Raises UnitError, also for a tensor with a gradient, which ends where a number is taken."""
-    if isinstance(value, Tensor) and value.requires_grad:
+    if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
         raise UnitError(
-            f"{where}: expected {name}, a number without gradient, got a tensor that requires one. The loss has no "
-            "derivative by it: use .detach()."
+            f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
+            "no derivative by it: use .detach()."
         )
     return finite(f"{where}: {name}", value)
+
+
+def _tangent(x: Tensor) -> Tensor | None:
+    """Of forward mode, which `requires_grad` does not know."""
+    return cast("Tensor | None", forward_ad.unpack_dual(x).tangent)  # type: ignore[no-untyped-call]
 
 
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:

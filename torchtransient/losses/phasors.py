@@ -76,7 +76,7 @@ def _phasors(
     angle = -2 * math.pi * (turns - turns.round())
     # A product of complex numbers, twice the work: autocast narrows a product of real ones, and its derivative wherever
     # the backward pass runs, and leaves complex ones alone.
-    table = torch.polar(torch.ones_like(angle), angle).to(transient.device, dtype.to_complex())
+    table = torch.polar(torch.ones_like(angle), angle).to(transient.device, torch.promote_types(dtype, torch.complex64))
     record = transient.to(dtype).reshape(*lead, bins, math.prod(trail)).to(table.dtype)
     return (table @ record).reshape(*lead, frequencies.num_frequencies, *trail)
 
