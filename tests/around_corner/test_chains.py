@@ -36,10 +36,7 @@ SCENES = {
 }
 
 
-QUICK = {
-    ("V and plate", "confocal"), ("two-sided", "single"), ("body before a wall", "confocal"),
-    ("interpolated normals", "exhaustive"),
-}  # fmt: skip
+QUICK = {("two-sided", "single"), ("interpolated normals", "exhaustive")}
 
 
 @pytest.mark.parametrize(("name", "kind"), long_pairs(SCENES, ["confocal", "single", "exhaustive"], QUICK))
@@ -67,6 +64,7 @@ def test_each_number_of_bounces(bounces):
     assert (a.mean() > 0) == (b.mean() > 0)
 
 
+@pytest.mark.slow
 def test_a_curved_wall(tmp_path):
     """Heads lie on the wall, too; light of two and three bounces goes on coming from paths."""
     wall = curved_wall(tmp_path)
@@ -244,6 +242,7 @@ def test_progress_goes_up_to_one():
 # ------------------------------------------------------------------------------------------------ colours
 
 
+@pytest.mark.slow
 def test_colours():
     """Of red, green and blue albedos, each channel is that of paths."""
     with mi.variant_context("llvm_ad_rgb"):

@@ -179,6 +179,7 @@ def test_a_box_of_six_plates_is_a_cube(kind):
     agree(cube, 2**13, most_error=0.03)
 
 
+@pytest.mark.slow
 def test_viewpoints_with_the_same_outline():
     """The spot is a scanned point and lies in line with others; outlines along the lines are those of both."""
     scene = scan_scene(plates(), "single", film(4, **SMOOTH), spot=(-0.125, 0.125, 0.0))

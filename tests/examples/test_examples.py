@@ -40,6 +40,7 @@ def test_fit_albedo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert float(after.abs().mean()) < 0.4 * float(before.abs().mean())
 
 
+@pytest.mark.slow
 def test_fit_wall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mi.set_variant("llvm_ad_mono")
     sizes = ["--steps", "60", "--spp", "16", "--resolution", "6", "--target-spp", "1024", "--output"]

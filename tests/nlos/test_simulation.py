@@ -89,6 +89,7 @@ def test_parts_in_a_file_and_without(tmp_path, kind, film):
     assert kept.metadata["parts"] == 3 and whole.metadata["parts"] == 1
 
 
+@pytest.mark.slow
 def test_parts_and_the_whole_have_the_same_mean():
     """Point by point: points of parts are the points that they stand for."""
     runs = {

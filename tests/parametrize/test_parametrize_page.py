@@ -56,6 +56,7 @@ def test_the_fit_finds_the_truth(names):
         assert torch.allclose(upper.mT @ upper, torch.eye(3), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_free_fit_leaves_the_range(names):
     renderer = names["renderer_of"](**names["START"])
     values = renderer.values

@@ -416,6 +416,7 @@ def test_calls_that_are_launched_do_not_warn(room_scene):
             step(renderer, seed)
 
 
+@pytest.mark.slow
 def test_many_kinds_of_calls_by_turns_do_not_warn():
     scene = tt.load(make_room(), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[COLOUR])

@@ -23,6 +23,7 @@ def table(printed):
     return {name: [float(x) for x in values.split()] for name, values in rows}
 
 
+@pytest.mark.slow
 def test_simulated_captures_lose_their_noise(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv(MEASURED, raising=False)
     (nats,) = runpy.run_path(str(SCRIPT))["main"](["--smoke", "--output", str(tmp_path)])

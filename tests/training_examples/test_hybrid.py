@@ -31,6 +31,7 @@ def ratios(printed):
     return [float(x) for x in re.findall(r": ([\d.]+) of the error of ", printed)]
 
 
+@pytest.mark.slow
 def test_the_renderer_corrects_the_network(example, tmp_path, capsys):
     amortised = example("amortised")
     table = amortised.main(["--smoke", "--seeds", "0", "--output", str(tmp_path)])
@@ -44,6 +45,7 @@ def test_the_renderer_corrects_the_network(example, tmp_path, capsys):
     assert (tmp_path / "amortised.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_counter_and_scenes_are_learnt_together(example, tmp_path, capsys):
     script = example("self_calibration")
     table = script.main(["--smoke", "--seeds", "0", "--output", str(tmp_path)])

@@ -26,6 +26,13 @@ class Camera:
     size: tuple[int, int]
 
 
+# What Mitsuba's cameras say of their optics, by class.
+_OPTICS = {
+    "PerspectiveCamera": ("x_fov", "principal_point_offset_x", "principal_point_offset_y"),
+    "ThinLensCamera": ("x_fov",),
+}
+
+
 @opaque
 def camera_of(
     renderer: TransientRenderer, values: Mapping[str, Any] | None = None, sensor: int | None = None
@@ -49,13 +56,15 @@ def camera_of(
             raise SceneError(f"camera_of: expected a sensor from 0 to {len(sensors) - 1}, got {index!r}.")
         found = sensors[index]
         params = mi.traverse(found)
-        if found.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
+        if found.class_name() not in _OPTICS:
             raise SceneError(
                 f"camera_of: expected a perspective or thinlens sensor, got {found.id()!r} ({found.class_name()}); "
                 "others have no pinhole."
             )
         name, film = found.id(), found.film()
-        built = {key: _number(params, key) for key in ("x_fov", "principal_point_offset_x", "principal_point_offset_y")}
+        # A thin lens has its axis in the middle of the film.
+        built = dict.fromkeys(_OPTICS["PerspectiveCamera"], 0.0)
+        built |= {key: _number(params, key) for key in _OPTICS[found.class_name()]}
         matrix = torch.tensor(_matrix(found), dtype=torch.float32)
         whole, crop, offset = ([int(n) for n in size] for size in (film.size(), film.crop_size(), film.crop_offset()))
     x_fov, x, y = (given.get(f"{name}.{key}", torch.tensor(value)) for key, value in built.items())
@@ -66,8 +75,7 @@ def camera_of(
 def _number(params: Any, key: str) -> float:
     import numpy as np
 
-    # A thin lens has its axis in the middle of the film.
-    return float(np.array(params[key]).reshape(-1)[0]) if key in params else 0.0
+    return float(np.array(params[key]).reshape(-1)[0])
 
 
 def _matrix(sensor: Any) -> Any:

@@ -304,7 +304,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _libraries() -> dict[str, str]:
     import torchtransient
 
-    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy")}
+    others = {name: version(name) for name in ("torch", "mitsuba", "drjit", "numpy", "kornia")}
     return {"torchtransient": torchtransient.__version__, **others}
 
 

@@ -21,7 +21,7 @@ from torchtransient.data import (
     TransientDataset,
     TransientStream,
 )
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import SceneError, TorchTransientError, UnitError
 
 N = 11
 
@@ -65,6 +65,38 @@ def test_maps_belong_to_samples_and_epochs(data):
     assert sizes == {(N, *plain[0][0].shape)}
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_epoch_of_a_data_set(data, workers):
+    """Numbers alone do not tell epochs apart: the data set is told, and so are workers that stay."""
+    augmented = Augmented(TransientDataset(data, fields=["depth"]), Augment(Flip(p=0.5)), seed=1)
+    loader = DataLoader(augmented, batch_size=N, num_workers=workers, persistent_workers=workers > 0)
+    first = next(iter(loader))["depth"]
+    assert torch.equal(next(iter(loader))["depth"], first)
+    augmented.set_epoch(1)
+    second = next(iter(loader))["depth"]
+    assert not torch.equal(second, first)
+    expected = torch.stack([augmented.sample(n, 1)["depth"] for n in range(N)])
+    assert torch.equal(second, expected) and augmented.epoch == 1
+    augmented.set_epoch(0)
+    assert torch.equal(next(iter(loader))["depth"], first)
+
+
+def test_samples_of_two_folders_with_one_number(data, tmp_path):
+    """Draws of their own; those of a stream wherever it goes on."""
+    folders = [data, folder(tmp_path / "other", N)]
+
+    def noise(where):
+        samples = TransientDataset(where, fields=["transient"], transform=noisy, seed=0)
+        return [float((sample["measurement"] - sample["transient"]).double().sum()) for sample in samples]
+
+    assert len(set(noise(folders))) == 2 * N and noise(folders)[:N] == noise(folders[0])
+    stream = AugmentedStream(TransientStream(folders, fields=["depth"]), Augment(Flip(p=0.5)), seed=4)
+    whole = [sample["depth"] for sample in stream]
+    stream.set_epoch(0, 3, 4)
+    rest = [sample["depth"] for sample in stream]
+    assert len(rest) == 2 * N - 12 and all(torch.equal(a, b) for a, b in zip(rest, whole[12:], strict=True))
+
+
 class Again(torch.utils.data.IterableDataset):
     """The same sample again and again."""
 
@@ -88,6 +120,10 @@ def test_samples_that_are_rendered_meanwhile():
         assert all(sample["transient"].shape[-2:] == (1, 1) for sample in given)
         assert all((sample["transient"] == sample["index"]).all() for sample in given)
         assert stream.drawn >= 24
+    with AugmentedStream(OnlineDataset(OnlineRecipe(), capacity=4, warm=4), Augment(Crop((1, 1)))) as stream:
+        next(iter(stream))
+    with pytest.raises(TorchTransientError):
+        stream.draw()
 
 
 class Numbered(torch.utils.data.IterableDataset):

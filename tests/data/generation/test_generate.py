@@ -67,6 +67,7 @@ def test_what_is_there(calm):
     assert json.loads((calm / "recipe.json").read_text())["standard_error"] == 0.25
 
 
+@pytest.mark.slow
 def test_equal_bytes_of_many_workers(calm, tmp_path):
     """Whole numbers of any library count."""
     numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
@@ -238,6 +239,7 @@ def test_measuring_checks_with_its_own_scenes_and_says_where_samples_fail(tmp_pa
     assert [facts[:2] for facts in traces] == [[-1, 0]] and 'fake_recipe.py", line' in traces[0][2]
 
 
+@pytest.mark.slow
 def test_no_sample_has_its_light_in_the_window(tmp_path):
     with pytest.raises(SceneError, match=r"max_outside=0.01\. Give a time_axis= that holds its light"):
         generate(FakeRecipe(late=tuple(range(23))), tmp_path, **QUICK)

@@ -516,6 +516,7 @@ def test_texts_of_structures_do_not_depend_on_how_arrays_are_printed():
     assert small(vary={"small-box.type": D.Choice(["2", 2])})._vary["small-box.type"].values == ["2", 2]
 
 
+@pytest.mark.slow
 def test_what_seldom_comes_is_checked():
     with pytest.raises(UnitError, match=r"with choice 1 of 'red.reflectance.value', .*more than all"):
         small(vary={RED: D.Choice([0.5, 7.0, 0.4], weights=[1, 1e-6, 1])}).check()
@@ -529,6 +530,7 @@ def test_what_seldom_comes_is_checked():
         small(vary={"device.99.cycles": D.Choice([10])}, **device).check()
 
 
+@pytest.mark.slow
 def test_devices_and_polarization():
     """Of polarized light a detector counts S0; one that looks at polarization needs polarized light."""
     axis = tt.sensing.device("vl53l8_like").axis()

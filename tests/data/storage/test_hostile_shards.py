@@ -186,6 +186,7 @@ def full_disks(folder):
         assert path.read_bytes() == before and list(folder.iterdir()) == [path]
 
 
+@pytest.mark.slow
 def test_full_disks(tmp_path):
     """A typed error, the old shard, nothing beside it, and a process that lives."""
     code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; "

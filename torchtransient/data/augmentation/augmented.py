@@ -10,21 +10,23 @@ from torch.utils.data import Dataset, IterableDataset
 
 from torchtransient.data.augmentation.augment import Augment
 from torchtransient.data.reading.recipe_dataset import RecipeDataset
-from torchtransient.data.reading.sample_draws import checked_seed, sample_generator, sample_number
+from torchtransient.data.reading.sample_draws import Epochs, checked_seed, sample_generator, sample_number
+from torchtransient.data.reading.stream import TransientStream
 from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.errors import SceneError
 from torchtransient.quantities import count, shown
 
 
-class Augmented(Dataset[Any]):
+class Augmented(Epochs, Dataset[Any]):
     """A map-style data set, and an :class:`Augment` of each of its samples; of streams see :class:`AugmentedStream`.
 
-    ``seed``: each sample has a generator of its own, so that it comes out the same whoever reads it; None draws from
-    torch's, anew each time. :meth:`sample` tells epochs apart. Pickles; for workers that were forked or spawned.
+    ``seed``: each sample has a generator of its own, so that it comes out the same whoever reads it, in every epoch
+    until :meth:`set_epoch`; None draws from torch's, anew each time. Pickles; for workers that were forked or spawned.
     Raises SceneError, UnitError for a seed or an epoch below zero, IndexError beyond the samples.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
+        super().__init__()
         if isinstance(dataset, IterableDataset):
             raise SceneError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
         if not hasattr(dataset, "__len__") or not hasattr(dataset, "__getitem__"):
@@ -36,7 +38,7 @@ class Augmented(Dataset[Any]):
         return len(self.dataset)
 
     def __getitem__(self, number: int) -> Any:
-        return self.sample(number)
+        return self.sample(number, self.epoch)
 
     def sample(self, number: int, epoch: int | None = None) -> Any:
         """A sample; ``epoch`` tells the maps of one epoch from those of another, and the noise of a data set of this
@@ -53,9 +55,10 @@ class AugmentedStream(IterableDataset[Any]):
     """The samples of a stream (``TransientStream``, ``OnlineDataset``), and an :class:`Augment` of each of them.
 
     ``seed``: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
-    often this iterator has given the sample before; samples without an ``index`` are a SceneError then. None draws from
-    torch's generator. What else the stream has (``set_epoch``, ``close``, ``made``) is found here, too. Raises
-    SceneError, UnitError for a seed below zero.
+    often the sample came before: among the samples of a TransientStream, or from this iterator; samples without an
+    ``index`` are a SceneError then. None draws from torch's generator. What else the stream has (``set_epoch``,
+    ``close``, ``made``) is found here, too; a ``with`` block closes it. Raises SceneError, UnitError for a seed below
+    zero.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
@@ -65,16 +68,35 @@ class AugmentedStream(IterableDataset[Any]):
         self.augment, self.seed = _checked(augment, "AugmentedStream"), checked_seed("AugmentedStream", seed)
 
     def __iter__(self) -> Iterator[Any]:
-        epoch, given = int(getattr(self.dataset, "epoch", 0)), Counter[int]()
-        for sample in self.dataset:
+        epoch = int(getattr(self.dataset, "epoch", 0))
+        for sample, repeat in self._repeated():
             generator = None
             if self.seed is not None:
-                if not isinstance(sample, Mapping) or "index" not in sample:
-                    raise SceneError("AugmentedStream: expected samples with an 'index' for seed=; leave seed out.")
                 index = count("AugmentedStream: index", sample["index"], 0)
-                generator = sample_generator("AugmentedStream", self.seed, index, epoch, given[index])
-                given[index] += 1
+                generator = sample_generator("AugmentedStream", self.seed, index, epoch, repeat)
             yield self.augment(sample, generator=generator)
+
+    def _repeated(self) -> Iterator[tuple[Any, int]]:
+        """Samples, and how often each came before."""
+        if isinstance(self.dataset, TransientStream):
+            yield from self.dataset.repeated()
+            return
+        given = Counter[Any]()
+        for sample in self.dataset:
+            if self.seed is not None and (not isinstance(sample, Mapping) or "index" not in sample):
+                raise SceneError("AugmentedStream: expected samples with an 'index' for seed=; leave seed out.")
+            index = sample["index"] if self.seed is not None else None
+            yield sample, given[index]
+            given[index] += 1
+
+    def __enter__(self) -> AugmentedStream:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """Close the stream, if it can be closed."""
+        close = getattr(self.dataset, "close", None)
+        if close is not None:
+            close()
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "dataset":

@@ -10,6 +10,7 @@ import torch
 from torch.utils.data import Dataset
 
 from torchtransient.data.reading.sample_draws import (
+    Epochs,
     checked_seed,
     sample_generator,
     sample_number,
@@ -22,7 +23,7 @@ from torchtransient.quantities import count, shown
 _WHAT = "RecipeDataset"
 
 
-class RecipeDataset(Dataset[dict[str, Any]]):
+class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders, of ``size`` samples from ``first`` on.
 
     A sample is a dictionary as of :class:`~torchtransient.data.reading.transient_dataset.TransientDataset`: its arrays
@@ -36,8 +37,8 @@ class RecipeDataset(Dataset[dict[str, Any]]):
     worker_init_fn=torchtransient.training.worker_init)`` renders beside the training; processes that were forked raise
     VariantError. ``transform``: a sensor, or any function of the transient, without gradients; its result stands under
     ``measurement``. ``seed``: each sample has a generator of its own for the transform (its argument ``generator``), so
-    that it has the same noise whoever reads it, that of a stored sample of this index; :meth:`sample` tells epochs
-    apart. None draws from torch's, anew each time.
+    that it has the same noise whoever reads it, that of a stored sample of this index; :meth:`set_epoch` and
+    :meth:`sample` tell epochs apart. None draws from torch's, anew each time.
 
     It pickles, without what it has built. ``close()`` lets go of that; it is built again when a sample is read. Raises
     UnitError for sizes, seeds and epochs, SceneError for a seed that the transform cannot take, IndexError beyond the
@@ -53,6 +54,7 @@ class RecipeDataset(Dataset[dict[str, Any]]):
         transform: Callable[..., Any] | None = None,
         seed: int | None = None,
     ) -> None:
+        super().__init__()
         self.recipe, self.transform = recipe, transform
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.first = count(f"{_WHAT}: first", first, 0, UnitError)
@@ -67,7 +69,7 @@ class RecipeDataset(Dataset[dict[str, Any]]):
         return self.size
 
     def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number)
+        return self.sample(number, self.epoch)
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
         """A sample; ``epoch`` tells the noise of ``seed`` of one epoch from that of another; None is 0."""

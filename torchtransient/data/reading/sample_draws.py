@@ -14,6 +14,24 @@ from torchtransient.errors import UnitError
 from torchtransient.quantities import count, shown
 
 
+class Epochs:
+    """A data set that knows which epoch it is read in; workers of a DataLoader that stay are told."""
+
+    def __init__(self) -> None:
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+
+    @property
+    def epoch(self) -> int:
+        """The epoch whose draws are read by number."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the draws of ``seed`` of what is read from now on; call it before a loader is iterated over. Raises
+        UnitError.
+        """
+        self._epoch.fill_(count(f"{type(self).__name__}: epoch", epoch, 0, UnitError))
+
+
 def sample_number(what: str, number: Any, size: int) -> int:
     """The place of sample ``number`` of ``size``, counted from the end where it is negative. Raises IndexError, as
     loops over a data set expect it, for all others and for what is no whole number.

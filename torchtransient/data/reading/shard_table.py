@@ -24,7 +24,8 @@ _OPEN = 32
 class ShardTable:
     """The samples of several shards in the order of files and rows, by number.
 
-    ``shard`` and ``row`` int64 (N,), ``index`` int64 (N,): that of the sample in its recipe. ``about``: what all shards
+    ``shard`` and ``row`` int64 (N,), ``index`` int64 (N,): that of the sample in its recipe, ``repeat`` int64
+    (N,): how many samples before it have the same one. ``about``: what all shards
     say about the render. Pickles without open files; a process that was forked opens its own.
     """
 
@@ -58,6 +59,7 @@ class ShardTable:
             raise StorageError(f"{WHAT}: expected samples, got none in {len(self.paths)} shards: all of them failed.")
         self.shard, self.row = np.array(shards, np.int64), np.array(rows, np.int64)
         self.index: NDArray[np.int64] = np.array(index, np.int64)
+        self.repeat = _repeats(self.index)
 
     def __len__(self) -> int:
         return len(self.index)
@@ -131,3 +133,13 @@ def _check_alike(first: dict[str, Any], other: dict[str, Any], here: Path, there
                 f"{WHAT}: expected the same {name} in all shards, got {shown(a)} in '{here}' and {shown(b)} in "
                 f"'{there}'. Read them as two data sets."
             )
+
+
+def _repeats(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each entry, how many before it are equal to it."""
+    order = np.argsort(index, kind="stable")
+    ranked = index[order]
+    starts = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])
+    found = np.empty(len(index), np.int64)
+    found[order] = np.arange(len(index)) - np.repeat(starts, np.diff(np.r_[starts, len(index)]))
+    return found

@@ -83,13 +83,19 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         return stop - start
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
+        for sample, _ in self.repeated():
+            yield sample
+
+    def repeated(self) -> Iterator[tuple[dict[str, Any], int]]:
+        """Samples as they come, each with how many samples of other folders before it have its ``index``."""
         epoch, batches, size = self._place.tolist()
+        repeats = self.dataset.repeats
         part, parts = _worker()
         given, turn = self._given(batches, size, parts)
         # Loaders begin with their first worker: it takes the share of the one whose turn it is.
         part = (part + turn) % parts
         for number in self._order(epoch, part, parts)[given[part] :]:
-            yield self.dataset.sample(int(number), epoch)
+            yield self.dataset.sample(int(number), epoch), int(repeats[number])
 
     def order(self, epoch: int) -> NDArray[np.int64]:
         """(n,) int64: the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch."""

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 from torchtransient.axes import TimeAxis
 from torchtransient.data.reading.parts import axis_of, bins_of, cut_axis, image_size, pixels_of
 from torchtransient.data.reading.sample_draws import (
+    Epochs,
     checked_seed,
     sample_generator,
     sample_number,
@@ -29,7 +30,7 @@ _MEASURED = "measurement"
 _VALUES, _INDEX, _TRANSIENT = "values", "index", "transient"
 
 
-class TransientDataset(Dataset[dict[str, Any]]):
+class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """The samples of shards, by number, in the order of the files and their rows; those that failed are left out.
 
     ``where``: a folder, a pattern of names, a shard, or a list of these. A sample is a dictionary of its arrays by
@@ -41,9 +42,10 @@ class TransientDataset(Dataset[dict[str, Any]]):
     ``axis`` is the time axis of what is returned. ``pixels``: slices (rows, columns) of everything that is an image of
     the film's size. ``transform``: a sensor, or any function of the transient, without gradients; its result stands
     under ``measurement``, in place of one that was stored. A sensor answers under its policy, the mean with "expected";
-    ``transform=sensor.sample`` draws in any case. ``seed``: each sample has a generator of its own for the
-    transform (its argument ``generator``), so that it has the same noise whoever reads it; None draws from torch's.
-    ``as_stored``: counts in the type that they are stored in, not as float32.
+    ``transform=sensor.sample`` draws in any case. ``seed``: each sample has a generator of its own for the transform
+    (its argument ``generator``), so that it has the same noise whoever reads it, in every epoch until
+    :meth:`set_epoch`; None draws from torch's. ``as_stored``: counts in the type that they are stored in, not as
+    float32.
 
     Files are opened when they are first read, in every process anew: it can be pickled, and read by workers that were
     forked or spawned. Raises StorageError for what cannot be read, or does not belong together, UnitError for a
@@ -54,6 +56,7 @@ class TransientDataset(Dataset[dict[str, Any]]):
         self, where: Any, fields: Sequence[str] | None = None, window: Any = None, pixels: Any = None,
         transform: Callable[..., Any] | None = None, as_stored: bool = False, *, seed: int | None = None,
     ) -> None:  # fmt: skip
+        super().__init__()
         self._table = ShardTable(where)
         self.about: dict[str, Any] = self._table.about
         shapes = self._table.arrays
@@ -75,7 +78,7 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return len(self._table)
 
     def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number)
+        return self.sample(number, self.epoch)
 
     @property
     def index(self) -> Tensor:
@@ -94,6 +97,11 @@ class TransientDataset(Dataset[dict[str, Any]]):
         return tuple(dict.fromkeys((*self._fields, *made)))
 
     @property
+    def repeats(self) -> Tensor:
+        """(N,) int64: how many samples before it have the same ``index``, those of other folders."""
+        return torch.from_numpy(self._table.repeat.copy())
+
+    @property
     def shards(self) -> Tensor:
         """(N,) int64: the file of every sample, by its place among them."""
         return torch.from_numpy(self._table.shard.copy())
@@ -107,7 +115,9 @@ class TransientDataset(Dataset[dict[str, Any]]):
         index = int(self._table.index[number])
         if self.transform is not None:
             given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
-            generator = sample_generator(WHAT, self.seed, index, epoch)
+            # Samples of several folders may have one number in their recipes.
+            repeat = int(self._table.repeat[number])
+            generator = sample_generator(WHAT, self.seed, index, epoch or 0, repeat)
             found[_MEASURED] = transformed(self.transform, given, generator)
         if _VALUES in self._fields:
             values = shard.values(row)
