@@ -34,6 +34,29 @@ def test_it_is_a_variance_of_logarithms():
     torch.testing.assert_close(losses.scale_invariant_depth_loss(x, y, balance=0.0), d.square().mean())
 
 
+@pytest.mark.parametrize("factor", [1000.0, 3.0, 1.0])
+def test_a_common_factor_in_single_precision(factor):
+    """Millimetres against metres: what is left is the variance, 1e-6, of squared logarithms of up to 48."""
+    g = torch.Generator().manual_seed(4)
+    y = 1 + torch.rand(16, 16, generator=g)
+    x = (factor * y * (1 + 1e-3 * torch.randn(16, 16, generator=g))).requires_grad_()
+    wide = x.detach().double().requires_grad_()
+    value = losses.scale_invariant_depth_loss(x, y, balance=1.0)
+    wanted = losses.scale_invariant_depth_loss(wide, y.double(), balance=1.0)
+    # logarithms up to 8 are rounded by 2^-22, of deviations of 1e-3
+    torch.testing.assert_close(value.double(), wanted, rtol=1e-3, atol=0)
+    value.backward()
+    wanted.backward()
+    torch.testing.assert_close(x.grad.double(), wide.grad, rtol=0, atol=2e-3 * float(wide.grad.abs().max()))
+
+
+def test_a_mean_of_squares_is_never_negative():
+    g = torch.Generator().manual_seed(5)
+    for _ in range(100):
+        y, factor = 0.1 + torch.rand(16, 16, generator=g), 10 ** (4 * torch.rand((), generator=g) - 2)
+        assert 0 <= float(losses.scale_invariant_depth_loss(factor * y, y, balance=1.0)) < 1e-11
+
+
 def test_where_there_is_no_surface():
     x, y = maps()
     wanted = losses.scale_invariant_depth_loss(x[:, :, :3], y[:, :, :3])

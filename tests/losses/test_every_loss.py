@@ -62,6 +62,12 @@ def test_the_others(call):
     torch.testing.assert_close(single.to(wanted.dtype), wanted, rtol=1e-5, atol=1e-5)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         torch.testing.assert_close(call(x.float()), single, rtol=0, atol=0)
+    leaf = x.float().requires_grad_()
+    if call is not losses.relative_floor:
+        (wanted,) = torch.autograd.grad(call(leaf).abs().sum(), leaf)
+        with torch.autocast("cpu", dtype=torch.bfloat16):  # backward, too
+            (found,) = torch.autograd.grad(call(leaf).abs().sum(), leaf)
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
     leaf = x.clone().requires_grad_()
     if call is losses.relative_floor:  # a scale goes in without gradient
         assert not call(leaf).requires_grad
@@ -367,12 +373,15 @@ def test_modules_check_their_options_when_made(case):
 @pytest.mark.slow
 @every
 def test_compiled(case):
-    """Values and gradients; likelihoods break the graph where they look at their values."""
+    """Values and gradients; likelihoods break the graph where they look at their values, others where they ask what
+    compares for its arguments.
+    """
     x, y = case.tensors()
     torch.compiler.reset()
     leaf, mask = x.clone().requires_grad_(), mask_of(y)
     module = case.module(**case.options, reduction="sum")
-    compiled = torch.compile(module, backend="aot_eager")
+    whole = case.draw_target is None and case.function not in (losses.measurement_consistency, losses.multiscale_loss)
+    compiled = torch.compile(module, backend="aot_eager", fullgraph=whole)
     found = compiled(*case.arguments(leaf, y), mask=mask)
     torch.testing.assert_close(found, case(x, y, mask, "sum"))
     found.backward()

@@ -210,11 +210,15 @@ def test_anscombe_of_every_kind(dtype):
 @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16], ids=str)
 def test_autocast_does_not_reach_in(case, half):
     for dtype in (torch.float32, torch.float64):
-        x, y = case.tensors(dtype=dtype)
-        wanted = case(x, y)
+        pair = [t.requires_grad_() for t in case.tensors(dtype=dtype)]
+        leaves = pair if case.pair and not case.measurement_first else pair[:1]
+        wanted = case(*pair)
+        slopes = torch.autograd.grad(wanted, leaves)
         with torch.autocast("cpu", dtype=half):
-            found = case(x, y)
+            found = case(*pair)
+            narrowed = torch.autograd.grad(found, leaves)
         torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+        torch.testing.assert_close(narrowed, slopes, rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------------------------------------------------- of nothing

@@ -65,6 +65,21 @@ def test_a_dark_volume_is_led_out_of_the_dark():
     torch.testing.assert_close(volume.grad, -4 * measured)
 
 
+def test_where_time_is_goes_on_to_what_compares():
+    """A list of points: said once, in any of both places, it is known to both; two places are refused."""
+    x, y = (0.1 + draw(2, 5, 9, 4, seed=seed) for seed in (1, 2))
+    plain = functools.partial(losses.wasserstein_loss, bin_width_opl=0.1)
+    held, module = functools.partial(plain, dim=-2), losses.WassersteinLoss(0.1, dim=-2)
+    for invariant in (False, True):
+        loss = functools.partial(losses.measurement_consistency, operator=torch.clone, scale_invariant=invariant)
+        wanted = loss(x[..., None], y[..., None], compare=plain, dim=-3)
+        for compare, dim in ((plain, -2), (held, None), (held, -2), (held, 2), (module, None)):
+            torch.testing.assert_close(loss(x, y, compare=compare, dim=dim), wanted)
+        for compare in (held, module):
+            with pytest.raises(ShapeError, match=r"^measurement_consistency: .* time in one .*dim=-3, and dim=-2"):
+                loss(x, y, compare=compare, dim=-3)
+
+
 def test_items_may_have_more_dimensions():
     """An exhaustive capture (C, T, Ly, Lx, Sy, Sx) is one item of six, and has one scale."""
     volume = draw(1, 3, 2, 2, 2, 2)

@@ -82,6 +82,51 @@ def test_the_mean_curvature_of_a_sphere():
 
 
 @every
+@pytest.mark.parametrize("wrong", [[0, 0, 1], [0, 0, 0], [6, 0, 6], [2, 5, 5]], ids=str)
+def test_faces_that_have_a_vertex_twice_are_none(loss, wrong):
+    """Nobody is their own neighbour, and vertices 2 and 5 across the ring are not made neighbours."""
+    faces = torch.cat([RING, torch.tensor([wrong])])
+    for weights in ("uniform", "cotangent"):
+        options = {"weights": weights} if loss is losses.mesh_laplacian_smoothing else {}
+        for mask in (None, torch.arange(7) < 5):
+            found = loss(wavy(), faces, reduction="none", mask=mask, **options)
+            wanted = loss(wavy(), RING, reduction="none", mask=mask, **options)
+            torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    leaf = wavy().requires_grad_()
+    alone = loss(leaf, torch.tensor([wrong]))
+    alone.backward()
+    assert float(alone.detach()) == 0
+    assert bool((leaf.grad == 0).all())
+
+
+def test_neighbours_that_do_not_count_are_looked_at():
+    """A border holds what it borders: its vertices have gradients, and NaN there is NaN in the loss."""
+    mask = torch.arange(7) == 0
+    leaf = hexagon(0.3).requires_grad_()
+    value = losses.mesh_laplacian_smoothing(leaf, RING, mask=mask)
+    assert float(value.detach()) == pytest.approx(0.09)
+    value.backward()
+    torch.testing.assert_close(leaf.grad[1:].sum(0), -leaf.grad[0])
+    spoiled = hexagon(0.3)
+    spoiled[3] = math.nan
+    assert not bool(losses.mesh_laplacian_smoothing(spoiled, RING, mask=mask).isfinite())
+    # of a hinge all four are: it does not count
+    consistent = losses.mesh_normal_consistency(spoiled, RING, mask=torch.arange(7) != 3)
+    assert bool(consistent.isfinite())
+
+
+@every
+def test_backward_inside_autocast(loss):
+    grads = []
+    for enabled in (False, True):
+        leaf = wavy().float().requires_grad_()
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
+            loss(leaf, RING).backward()
+        grads.append(leaf.grad)
+    torch.testing.assert_close(*grads, rtol=0, atol=0)
+
+
+@every
 def test_derivatives_and_batches(loss):
     batch = torch.stack([wavy(0), 2 * wavy(1)])
     assert torch.autograd.gradcheck(lambda v: loss(v, RING, reduction="none"), wavy().requires_grad_())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, TorchTransientError
 from torchtransient.sensing import SynchronousSPAD
 
 
@@ -118,6 +118,52 @@ def test_squares_of_many_scales_pull_from_their_largest():
         (many,) = torch.autograd.grad(losses.multiscale_loss(moved, still), at)
         assert math.copysign(1, offset) * float(many) > 1e-4
         assert abs(offset) == 5 or abs(float(fine)) < 1e-12
+
+
+def test_where_time_is_may_be_said_by_what_is_compared():
+    """Held by the partial, by the loss, by both: the same; two places are refused."""
+    g = torch.Generator().manual_seed(2)
+    x = 0.1 + torch.rand(2, 5, 9, 4, generator=g, dtype=torch.float64)
+    y = torch.poisson(3 * x, generator=g)
+    for loss in (functools.partial(losses.first_photon_loss, cycles=100), losses.poisson_loss, losses.log_ratio_loss):
+        held = functools.partial(loss, dim=-2)
+        wanted = losses.multiscale_loss(x[..., None], y[..., None], loss, reduction="none")[..., 0]
+        for compare, dim in ((loss, -2), (held, -2), (held, 2), (held, None)):
+            found = losses.multiscale_loss(x, y, compare, dim=dim, reduction="none")
+            torch.testing.assert_close(found, wanted)
+            torch.testing.assert_close(losses.MultiscaleLoss(compare, dim=dim)(x, y), wanted.mean())
+        with pytest.raises(ShapeError, match=r"^multiscale_loss: expected time in one .*dim=-3, and dim=-2 held"):
+            losses.multiscale_loss(x, y, held, dim=-3)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_light_of_bins_adds_up(masked):
+    """A background that is held is that which the record could have in its bins: the same exact likelihood."""
+    g = torch.Generator().manual_seed(3)
+    x = torch.rand(2, 3, 9, 4, 5, generator=g, dtype=torch.float64)
+    y = torch.poisson(3 * x, generator=g)
+    mask = torch.rand(x.shape, generator=g) < 0.7 if masked else None
+    for level in (0.3, torch.tensor(0.3), 0.1 + torch.rand(9, 1, 1, generator=g, dtype=torch.float64),
+                  0.1 + torch.rand(2, 1, 1, 4, 5, generator=g, dtype=torch.float64)):  # fmt: skip
+        for loss, name in ((losses.poisson_loss, "floor"), (losses.log_ratio_loss, "background")):
+            tiny = 0.0 if name == "floor" else 1e-300
+            added = y if name == "floor" else y + level
+            wanted = losses.multiscale_loss(x + level, added, functools.partial(loss, **{name: tiny}), mask=mask)
+            found = losses.multiscale_loss(x, y, functools.partial(loss, **{name: level}), mask=mask)
+            torch.testing.assert_close(found, wanted)
+
+
+def test_levels_that_are_held_are_checked():
+    x = torch.rand(1, 8, 2, 2)
+    for loss, name, values in (
+        (losses.poisson_loss, "floor", (-1.0, "a", math.nan, torch.ones(3))),
+        (losses.log_ratio_loss, "background", (0.0, -1.0, True, torch.zeros(2))),
+    ):
+        for value in values:
+            with pytest.raises(TorchTransientError, match=rf"^multiscale_loss: (expected )?{name}"):
+                losses.multiscale_loss(x, x, functools.partial(loss, **{name: value}))
+        with pytest.raises(TorchTransientError, match=r"^MultiscaleLoss: "):
+            losses.MultiscaleLoss(functools.partial(loss, **{name: values[1]}))
 
 
 def of_a_record(input, target, *, mask, reduction):

@@ -13,6 +13,7 @@ from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchtransient.errors import DeviceError, ShapeError, TorchTransientError, UnitError
 from torchtransient.quantities import finite, flag, shown
@@ -99,7 +100,7 @@ def check_level(
         level = value.detach() if value.dtype == torch.float64 else value.detach().to(dtype)
         fits = holds((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
     else:
-        number = finite(f"{where}: {name}", value)
+        number = check_number(name, value, where)
         fits = least <= number <= most or (zero and number == 0)
     if not fits:
         got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
@@ -162,9 +163,24 @@ def holds(condition: Tensor) -> bool:
         return True
 
 
+def check_number(name: str, value: object, where: str) -> float:
+    """One finite number. Raises UnitError, also for a tensor with a gradient, which ends where a number is taken."""
+    if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
+        raise UnitError(
+            f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
+            "no derivative by it: use .detach()."
+        )
+    return finite(f"{where}: {name}", value)
+
+
+def _tangent(x: Tensor) -> Tensor | None:
+    """Of forward mode, which `requires_grad` does not know."""
+    return cast("Tensor | None", forward_ad.unpack_dual(x).tangent)  # type: ignore[no-untyped-call]
+
+
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
     """A number of things, 1 or more; 3.0 is three. Raises UnitError for no number, `error` for others."""
-    number = math.nan if isinstance(value, bool) else finite(f"{where}: {name}", value)
+    number = math.nan if isinstance(value, bool) else check_number(name, value, where)
     if not number >= 1 or number != int(number):
         raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
     return int(number)

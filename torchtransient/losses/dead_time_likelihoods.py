@@ -17,6 +17,7 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
     check_mask,
+    check_number,
     check_option,
     check_reduction,
     check_whole,
@@ -34,6 +35,7 @@ _TIME = -3
 
 
 def _check_dead_time(dead_bins: float, where: str) -> float:
+    check_number("dead_bins", dead_bins, where)
     number = positive(f"{where}: dead_bins", dead_bins)
     try:
         split_dead_time(number)
@@ -176,12 +178,7 @@ def free_running_nll(
 
 class _FirstPhoton(nn.Module):
     def __init__(
-        self,
-        cycles: int,
-        dead_bins: float | None = None,
-        floor: float | None = None,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
+        self, cycles: int, dead_bins: float | None, floor: float | None, dim: int | None, reduction: Reduction
     ) -> None:
         super().__init__()
         where = type(self).__name__
@@ -194,6 +191,17 @@ class _FirstPhoton(nn.Module):
 
 class FirstPhotonNLL(_FirstPhoton):
     """`first_photon_nll(counts, rate, cycles)` with its options held."""
+
+    def __init__(
+        self,
+        cycles: int,
+        dead_bins: float | None = None,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
+    ) -> None:
+        # here rather than in the base, whose name Python would give for an argument that is missing
+        super().__init__(cycles, dead_bins, floor, dim, reduction)
 
     def forward(self, counts: Transient, rate: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
@@ -210,6 +218,16 @@ class FirstPhotonNLL(_FirstPhoton):
 
 class FirstPhotonLoss(_FirstPhoton):
     """`first_photon_loss(input, target, cycles)` with its options held."""
+
+    def __init__(
+        self,
+        cycles: int,
+        dead_bins: float | None = None,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
+    ) -> None:
+        super().__init__(cycles, dead_bins, floor, dim, reduction)
 
     def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_loss(

@@ -10,6 +10,7 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_level,
     check_mask,
+    check_number,
     check_option,
     check_pair,
     check_reduction,
@@ -17,7 +18,7 @@ from torchtransient.losses.comparison import (
     reduce,
 )
 from torchtransient.losses.results import DEPTH, DepthMap, reads
-from torchtransient.quantities import finite, shown
+from torchtransient.quantities import shown
 
 
 @reads(input=DEPTH, target=DEPTH)
@@ -59,7 +60,7 @@ def scale_invariant_depth_loss(
     """
     where = "scale_invariant_depth_loss"
     check_reduction(reduction, where)
-    _check_balance(balance, where)
+    share = _check_balance(balance, where)
     input, target = check_pair(input, target, where)
     if input.ndim < 2:
         raise ShapeError(f"{where}: expected depth maps (..., Y, X), got {tuple(input.shape)}.")
@@ -69,20 +70,24 @@ def scale_invariant_depth_loss(
     mask = surface if given is None else given & surface
     d = _log(counted(input, mask, 1.0), least) - _log(counted(target, mask, 1.0), least)
     number = mask.sum((-2, -1)).clamp_min(1)
-    mean, square = d.sum((-2, -1)) / number, d.square().sum((-2, -1)) / number
-    return reduce(square - float(balance) * mean.square(), reduction, where, mask.any(-1).any(-1))
+    mean = d.sum((-2, -1)) / number
+    # a variance and what is left of the squared mean: the difference of both squares loses what they have in common
+    variance = counted(d - mean[..., None, None], mask).square().sum((-2, -1)) / number
+    return reduce(variance + (1 - share) * mean.square(), reduction, where, mask.any(-1).any(-1))
 
 
 def _log(x: Tensor, least: Tensor) -> Tensor:
     """The logarithm, and its tangent at `least` below that."""
-    above = torch.maximum(x, least)
-    return above.log() + (x - above) / least
+    # chosen, not a difference to the larger one: its two slopes of 1/least would cancel but for their rounding
+    below = x < least
+    return torch.where(below, least, x).log() + torch.where(below, x - least, 0.0) / least
 
 
-def _check_balance(balance: float, where: str) -> None:
-    number = finite(f"{where}: balance", balance)
+def _check_balance(balance: float, where: str) -> float:
+    number = check_number("balance", balance, where)
     if isinstance(balance, bool) or not 0 <= number <= 1:
         raise UnitError(f"{where}: expected balance between 0 and 1, got {shown(balance)}.")
+    return number
 
 
 class DepthLoss(nn.Module):

@@ -211,23 +211,27 @@ def read_noise_nll(
     return _reduce(value, reduction, where, mask)
 
 
-class _Poisson(nn.Module):
+class PoissonNLL(nn.Module):
+    """`poisson_nll(counts, mean)` with its options held."""
+
     def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
-        check_held(reduction, dim, type(self).__name__)
-        check_option("floor", floor, type(self).__name__, zero=True)
+        check_held(reduction, dim, "PoissonNLL")
+        check_option("floor", floor, "PoissonNLL", zero=True)
         self.floor, self.dim, self.reduction = floor, dim, reduction
-
-
-class PoissonNLL(_Poisson):
-    """`poisson_nll(counts, mean)` with its options held."""
 
     def forward(self, counts: Light, mean: Light, mask: Tensor | None = None) -> Tensor:
         return poisson_nll(counts, mean, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
 
 
-class PoissonLoss(_Poisson):
+class PoissonLoss(nn.Module):
     """`poisson_loss(input, target)` with its options held."""
+
+    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
+        super().__init__()
+        check_held(reduction, dim, "PoissonLoss")
+        check_option("floor", floor, "PoissonLoss", zero=True)
+        self.floor, self.dim, self.reduction = floor, dim, reduction
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return poisson_loss(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import cast
 
@@ -25,7 +26,7 @@ from torchtransient.losses.comparison import (
     squared_modulus,
 )
 from torchtransient.losses.layouts import check_held, item_dims
-from torchtransient.losses.pair_losses import PairLoss, PairModule, check_compare
+from torchtransient.losses.pair_losses import PairLoss, PairModule, check_compare, shared_dim
 from torchtransient.losses.results import LIGHT, VALUES, Light, Volume, reads
 
 
@@ -58,14 +59,15 @@ def measurement_consistency(
     the same `reduction`. Losses of torch.nn take no mask: write a function. With `scale_invariant` A volume is first
     multiplied by the real number that brings each item nearest to the measurement in least squares: powers of lasers
     and albedos are seldom calibrated. `dim`, where time is in the measurement, then says what is an item
-    (`losses.layouts`). That number may be negative, so keep volumes non-negative where their sign matters; it is 1 for
-    a volume that is dark altogether, whose gradient then leads out of the dark.
+    (`losses.layouts`); a function `compare` that wants it is told, and what `compare` holds is taken. That number may
+    be negative, so keep volumes non-negative where their sign matters; it is 1 for a volume that is dark altogether,
+    whose gradient then leads out of the dark.
     Not symmetric; zero where A volume is the measurement. Raises ShapeError where A volume is no tensor of the
     measurement's shape, and for another `compare`.
     """
     where = "measurement_consistency"
     check_held(reduction, dim, where)
-    compared = _checked(operator, compare, scale_invariant, reduction, where)
+    compared, known = _checked(operator, compare, scale_invariant, reduction, where)
     volume, measured = check_dense((volume, measured), where)
     prediction = operator(volume)
     if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
@@ -76,10 +78,12 @@ def measurement_consistency(
         )
     check_device(prediction, measured, where, "what the operator makes and the measurement")
     check_mask(mask, measured, where)
+    dim = shared_dim(compare, known, dim, measured, where)
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)
         prediction = _scaled(*pair, check_mask(mask, measured, where), item_dims(measured, dim, where))
-    value = compared(prediction, measured, mask)
+    said = {"dim": dim} if dim is not None and "dim" in known else {}
+    value = compared(prediction, measured, mask, **said)
     # of a tensor of one dimension, a record, even what is not reduced may be one number
     dims = value.ndim if isinstance(value, Tensor) else -1
     if dims < 0 or (dims > 0 if reduction != "none" else dims == 0 and measured.ndim > 1):
@@ -90,26 +94,31 @@ def measurement_consistency(
 
 def _checked(
     operator: object, compare: PairLoss | PairModule, scale_invariant: bool, reduction: Reduction, where: str
-) -> Callable[[Tensor, Tensor, Tensor | None], Tensor]:
-    """`compare` as a function (input, target, mask) with that reduction. Raises ShapeError."""
+) -> tuple[Callable[..., Tensor], dict[str, inspect.Parameter]]:
+    """`compare` as a function (input, target, mask) with that reduction, and its parameters. Raises ShapeError."""
     check_function("the operator", operator, where)
     check_flag("scale_invariant", scale_invariant, where)
-    check_compare(compare, where, reduction)
+    known = check_compare(compare, where, reduction)
     if not isinstance(compare, nn.Module):
-        return functools.partial(_compared, cast(PairLoss, compare), reduction)
+        return functools.partial(_compared, compare, reduction), known
     held = getattr(compare, "reduction", None)
     if held != reduction:
         raise ShapeError(
             f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
             "Give both the same."
         )
-    return cast(PairModule, compare)
+    return cast(PairModule, compare), known
 
 
 def _compared(
-    compare: PairLoss, reduction: Reduction, input: Tensor, target: Tensor, mask: Tensor | None
+    compare: Callable[..., Tensor],
+    reduction: Reduction,
+    input: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    **said: int,
 ) -> Tensor:
-    return compare(input, target, mask=mask, reduction=reduction)
+    return compare(input, target, mask=mask, reduction=reduction, **said)
 
 
 def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:

@@ -43,18 +43,20 @@ def mesh_laplacian_smoothing(
     evenly curved meshes as they are meshed and moves vertices along the normal, by the mean curvature (Desbrun et al.
     1999).
     Cotangents go in without gradient; an edge whose cotangents sum up to less than zero, of blunt angles, has no
-    weight. Vertices of no face are zero. A border is pulled inwards: leave it out by `mask`.
+    weight. Faces that have a vertex twice are none; vertices of no face are zero. A border is pulled inwards: leave it
+    out by `mask`.
 
-    `mask` (V,) or (..., V): vertices that count. `reduction="none"`: (..., V). Raises ShapeError, UnitError for other
-    numbers, DeviceError.
+    `mask` (V,) or (..., V): vertices that count. Their neighbours are looked at as they are, and have gradients, also
+    those that do not count, such as a border: a mean of some of them would be off to one side. `reduction="none"`:
+    (..., V). Raises ShapeError, UnitError for other numbers, DeviceError.
     """
     where = "mesh_laplacian_smoothing"
     check_reduction(reduction, where)
     _check_weights(weights, where)
-    vertices = _checked(vertices, faces, where)
+    vertices, index = _checked(vertices, faces, where)
     keep = check_mask(mask, vertices[..., 0], where)
-    seen = vertices if keep is None else counted(vertices, _reached(keep, faces)[..., None])
-    first, second, weight = _edges(seen.detach(), faces, weights)
+    seen = vertices if keep is None else counted(vertices, _reached(keep, index)[..., None])
+    first, second, weight = _edges(seen.detach(), index, weights)
     total = torch.zeros_like(seen)
     # towards each end from the other one
     step = weight[..., None] * (seen[..., second, :] - seen[..., first, :])
@@ -72,14 +74,15 @@ def mesh_normal_consistency(
 
     `faces`: (F, 3). 0 where the mesh is flat, 1 at a right angle, 2 where it folds back. Of any order and sense of the
     faces: the angle is that at the edge. Edges of more than two faces count each pair; edges of triangles without area
-    are 0, without gradient. `mask` (V,) or (..., V): edges count whose faces have no vertex that does not.
-    `reduction="none"`: (..., E), in the order of the edges' vertex numbers. Raises ShapeError, UnitError, DeviceError.
+    are 0, without gradient; faces that have a vertex twice are none. `mask` (V,) or (..., V): edges count whose faces
+    have no vertex that does not. `reduction="none"`: (..., E), in the order of the edges' vertex numbers. Raises
+    ShapeError, UnitError, DeviceError.
     """
     where = "mesh_normal_consistency"
     check_reduction(reduction, where)
-    vertices = _checked(vertices, faces, where)
+    vertices, index = _checked(vertices, faces, where)
     keep = check_mask(mask, vertices[..., 0], where)
-    corners = _hinges(faces)
+    corners = _hinges(index)
     kept = None if keep is None else keep[..., corners].all(-1)
     a, b, c, d = (counted(vertices[..., corner, :], None if kept is None else kept[..., None]) for corner in corners.T)
     ours, theirs = unit_normals(b - a, c - a), unit_normals(a - b, d - b)
@@ -93,7 +96,8 @@ def _check_weights(weights: Weights, where: str) -> None:
         raise ShapeError(f"{where}: expected weights 'uniform' or 'cotangent', got {shown(weights)}.")
 
 
-def _checked(vertices: Tensor, faces: Tensor, where: str) -> Tensor:
+def _checked(vertices: Tensor, faces: Tensor, where: str) -> tuple[Tensor, Tensor]:
+    """Vertices in the dtype of the work, and the faces that are triangles."""
     check_dense((vertices, faces), where)
     if vertices.ndim < 2 or vertices.shape[-1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ShapeError(
@@ -102,20 +106,25 @@ def _checked(vertices: Tensor, faces: Tensor, where: str) -> Tensor:
         )
     vertices = vertices.to(working_dtype((vertices,), where))
     check_faces(faces, vertices, f"{where}: vertices")
-    return vertices
+    return vertices, _proper(faces)
 
 
-def _reached(mask: Tensor, faces: Tensor) -> Tensor:
-    """Vertices that count, and their neighbours, which are looked at."""
+def _proper(faces: Tensor) -> Tensor:
+    """Faces of three vertices: one that has a vertex twice is no triangle, and would make it its own neighbour."""
     index = faces.long()
+    a, b, c = index.unbind(1)
+    return index[(a != b) & (b != c) & (c != a)]
+
+
+def _reached(mask: Tensor, index: Tensor) -> Tensor:
+    """Vertices that count, and their neighbours, which are looked at."""
     near = mask[..., index].any(-1, keepdim=True).expand(*mask.shape[:-1], *index.shape).flatten(-2)
     found = torch.zeros(mask.shape, device=mask.device).index_add(-1, index.flatten(), near.float())
     return mask | (found > 0)
 
 
-def _edges(vertices: Tensor, faces: Tensor, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
+def _edges(vertices: Tensor, index: Tensor, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
     """Both ends of each edge (E,) and its weight (..., E)."""
-    index = faces.long()
     sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
     edges, place = _distinct(sides.sort(1).values)
     first, second = edges.unbind(1)
@@ -137,22 +146,20 @@ def _distinct(sides: Tensor) -> tuple[Tensor, Tensor]:
     return edges, place
 
 
-def _hinges(faces: Tensor) -> Tensor:
+def _hinges(index: Tensor) -> Tensor:
     """(E, 4) of each pair of faces at one edge: the edge's vertices, and the third one of either face."""
-    index = faces.long()
     sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]]).sort(1).values
     across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
     edges, place = _distinct(sides)
     order = place.argsort(stable=True)
-    number, most = place[order], int(torch.bincount(place).max())
+    number, most = place[order], int(torch.bincount(place, minlength=1).max())
     pairs = []
     for apart in range(1, most):
         same = number[apart:] == number[:-apart]
         one, other = order[:-apart][same], order[apart:][same]
         pairs.append(torch.cat([edges[place[one]], across[one, None], across[other, None]], 1))
     found = torch.cat(pairs) if pairs else index.new_zeros((0, 4))
-    distinct = (found[:, 2] != found[:, 3]) & (found[:, 0] != found[:, 1])
-    return found[distinct]
+    return found[found[:, 2] != found[:, 3]]
 
 
 class MeshLaplacianSmoothing(nn.Module):

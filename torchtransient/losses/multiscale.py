@@ -21,7 +21,9 @@ from torch.nn import functional
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
+    check_level,
     check_mask,
+    check_option,
     check_pair,
     check_whole,
     counted,
@@ -29,12 +31,16 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.layouts import bins_dim, check_held
 from torchtransient.losses.measurement import squared_loss
-from torchtransient.losses.pair_losses import PairLoss, check_compare
+from torchtransient.losses.pair_losses import PairLoss, check_compare, shared_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import shown
 
 # Options in bins of the record, or of its axis, that would mean something else at each scale.
 _OF_BINS = ("dead_bins", "bin_width_opl", "axis", "spacing")
+# Options that are light of a bin, which adds up over those of a coarser one; may they be zero?
+_LIGHT_OF_BINS = {"floor": True, "background": False}
+# Where the bins are in what `compare` is given.
+_BINS = -3
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)
@@ -51,7 +57,9 @@ def multiscale_loss(
     """Mean over `scales` of `compare` of two transients (..., C, T, Y, X) in bins that many times as wide.
 
     `compare`: a loss (input, target, mask=, reduction=) of this room that has a value for each bin, such as
-    `root_loss` or `functools.partial(first_photon_loss, cycles=n)`. Coarse bins are sums; those at both ends of the
+    `root_loss` or `functools.partial(first_photon_loss, cycles=n)`. It is called with tensors (..., C, bins, places,
+    1), its `dim` being set. A `floor` or a `background` that the partial holds is that of a bin of the record, a number
+    or a tensor that broadcasts to it, and is added up as bins are. Coarse bins are sums; those at both ends of the
     record, which reach beyond it, hold what is there. A scale's value is the sum over its bins, averaged over the
     places where coarse bins may begin, over the number of bins of the record: per bin of the record, as at scale one.
     Squares of sums grow with the scale and let the coarse ones lead; likelihoods and roots of counts weigh all alike.
@@ -62,7 +70,8 @@ def multiscale_loss(
     time, (..., C, Y, X). Time and memory are those of `compare` times the number of scales.
 
     Not supported: `compare` with options in bins or lengths (`dead_bins`, `bin_width_opl`, `axis`), of
-    detectors that are armed again within a cycle, or as a module. Raises ShapeError, UnitError, and what `compare`
+    detectors that are armed again within a cycle, or as a module. Options of a `root` that it holds, such as a read
+    noise, are the same at each scale. Raises ShapeError, UnitError, and what `compare`
     does.
     """
     where = "multiscale_loss"
@@ -70,7 +79,7 @@ def multiscale_loss(
     steps = _check_scales(scales, where)
     known = _check_compare(compare, where)
     input, target = check_pair(input, target, where)
-    dim = bins_dim(input, dim, where)
+    dim = bins_dim(input, shared_dim(compare, known, dim, input, where), where)
     mask = check_mask(mask, input, where)
     bins = input.shape[dim]
     if steps is None:
@@ -82,8 +91,9 @@ def multiscale_loss(
     seen = input.new_ones((1, 1, bins, 1)) if mask is None else _flat(mask.to(input.dtype), dim)
     records = [_flat(counted(x, mask), dim) for x in (input, target)]
     windows = _Windows(records[0]), _Windows(records[1]), _Windows(seen)
-    each: Callable[..., Tensor] = functools.partial(compare, dim=-3) if known else compare  # type: ignore[call-arg]
-    values = [_at_scale(s, windows, input.select(dim, 0), each) for s in steps]
+    light = {name: _Windows(level) for name, level in _levels(compare, input, mask, seen, dim, where).items()}
+    each: Callable[..., Tensor] = functools.partial(compare, dim=_BINS) if "dim" in known else compare  # type: ignore[call-arg]
+    values = [_at_scale(s, windows, light, input.select(dim, 0), each) for s in steps]
     mean = torch.stack(values).mean(0) / number.to(input)
     return reduce(mean, reduction, where, pixels)
 
@@ -138,14 +148,43 @@ def _flat(x: Tensor, dim: int) -> Tensor:
     return x.reshape(batch, channels, bins, math.prod(trail))
 
 
+def _held(compare: object) -> dict[str, object]:
+    """The options of `_LIGHT_OF_BINS` that a partial holds."""
+    held = compare.keywords if isinstance(compare, functools.partial) else {}
+    return {name: held[name] for name in _LIGHT_OF_BINS if held.get(name) is not None}
+
+
+def _levels(
+    compare: object, input: Tensor, mask: Tensor | None, seen: Tensor, dim: int, where: str
+) -> dict[str, Tensor]:
+    """What `_held` has, as records (batch, C, T, places), or (1, 1, T, 1) where all are alike; 0 in bins that do not
+    count.
+    """
+    records = {}
+    for name, value in _held(compare).items():
+        level = check_level(name, cast(Tensor, value), input, where, zero=_LIGHT_OF_BINS[name])
+        records[name] = level * seen if level.ndim == 0 else _flat(counted(level.expand(input.shape), mask), dim)
+    return records
+
+
 def _at_scale(
-    scale: int, windows: tuple[_Windows, _Windows, _Windows], like: Tensor, compare: Callable[..., Tensor]
+    scale: int,
+    windows: tuple[_Windows, _Windows, _Windows],
+    light: dict[str, _Windows],
+    like: Tensor,
+    compare: Callable[..., Tensor],
 ) -> Tensor:
     """`compare` summed over coarse bins and averaged over the places where they begin: without time."""
     first, second, seen = (w.coarse(scale) for w in windows)
-    # those that hold no bin of the record do not count either; all pixels hold the same ones where nothing is masked
-    kept = (seen > 0).repeat_interleave(len(first) // len(seen), 0).expand(first.shape)
-    value = compare(first, second, mask=kept, reduction="none")
+
+    def spread(x: Tensor) -> Tensor:
+        """All pixels hold the same bins where nothing is masked."""
+        return x.repeat_interleave(len(first) // len(x), 0).expand(first.shape)
+
+    # those that hold no bin of the record do not count either
+    kept = spread(seen > 0)
+    levels = {name: torch.where(kept, spread(w.coarse(scale)), 1.0) for name, w in light.items()}
+    value = compare(first, second, mask=kept, reduction="none", **levels)
     if not isinstance(value, Tensor) or value.shape != first.shape:
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise ShapeError(
@@ -163,8 +202,10 @@ def _check_scales(scales: Sequence[int] | None, where: str) -> list[int] | None:
     return [check_whole("scales", s, where) for s in scales]
 
 
-def _check_compare(compare: object, where: str) -> bool:
-    """Whether it takes `dim`. Raises ShapeError for what is no loss of bins with what is in bins left out."""
+def _check_compare(compare: object, where: str) -> dict[str, inspect.Parameter]:
+    """Its parameters. Raises ShapeError for what is no loss of bins with what is in bins left out, UnitError for levels
+    that are none.
+    """
     if isinstance(compare, nn.Module):
         raise ShapeError(f"{where}: expected compare to be a function, got the module {type(compare).__name__}.")
     known = check_compare(compare, where, "none")
@@ -174,7 +215,9 @@ def _check_compare(compare: object, where: str) -> bool:
                 f"{where}: expected compare without options in bins, got {name}={known[name].default}: bins are others "
                 "at each scale."
             )
-    return "dim" in known and known["dim"].default is None
+    for name, value in _held(compare).items():
+        check_option(name, cast(Tensor, value), where, zero=_LIGHT_OF_BINS[name])
+    return known
 
 
 class MultiscaleLoss(nn.Module):

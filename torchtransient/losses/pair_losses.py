@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import Reduction, check_function
+from torchtransient.losses.layouts import time_dim
 from torchtransient.quantities import shown
 
 # First arguments of what is no loss (input, target): a model there would be taken for a measurement, in silence, since
@@ -65,6 +66,23 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
             "it round in a function."
         )
     return dict(signature.parameters)
+
+
+def shared_dim(
+    compare: object, known: dict[str, inspect.Parameter], dim: int | None, like: Tensor, where: str
+) -> int | None:
+    """Where time is: `dim`, or what `compare` holds, whose parameters are `known`. Raises ShapeError for two places."""
+    named = known["dim"].default if "dim" in known else None
+    held = getattr(compare, "dim", None) if isinstance(compare, nn.Module) else named
+    if held is None or held is inspect.Parameter.empty:
+        return dim
+    place = time_dim(like, held, where)
+    if dim is not None and time_dim(like, dim, where) != place:
+        raise ShapeError(
+            f"{where}: expected time in one dimension, got dim={dim}, and dim={held} held by compare. Leave "
+            "the latter out."
+        )
+    return place
 
 
 def _title(function: object) -> str:

@@ -88,6 +88,7 @@ def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned
 
     def wrapped(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
         signature = inspect.signature(function)
+        names = ", ".join(signature.parameters)
         places = {name: list(signature.parameters).index(name) for name in measures}
 
         @functools.wraps(function)
@@ -96,7 +97,10 @@ def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned
             # tensors, as a rule, of which nothing is asked here: compiled and mapped functions see none of this
             if all(isinstance(x, Tensor) for x in given):
                 return function(*args, **keywords)
-            bound = signature.bind(*args, **keywords)
+            try:
+                bound = signature.bind(*args, **keywords)
+            except TypeError as error:  # which does not say of what
+                raise TypeError(f"{function.__name__}: {error}. Its arguments are {names}.") from None
             _read(bound.arguments, measures, set(signature.parameters), function.__name__)
             return function(*bound.args, **bound.kwargs)
 

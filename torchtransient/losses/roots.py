@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -30,23 +29,24 @@ _OFFSET = 3 / 8
 _BACKGROUND = 1e-3
 
 
-def anscombe(counts: Tensor, read_noise: float = 0.0) -> Tensor:
+def anscombe(counts: Tensor, read_noise: Tensor | float = 0.0) -> Tensor:
     """`2 sqrt(n + 3/8 + read_noise^2)`: photon counts on a scale where their noise has variance one. Any shape.
 
     Anscombe 1948; with read noise, in counts, the generalised transform of Starck, Murtagh and Bijaoui 1998 for gain
-    one. The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below
-    zero, of a record less its background, continue the tangent at zero, so that values and gradients are finite.
+    one; `read_noise` is a number, or a tensor that broadcasts to the counts, differentiable in it. The variance is 1
+    within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light. Counts below zero, of a record less
+    its background, continue the tangent at zero, so that values and gradients are finite.
     Whole numbers count in torch's default dtype, half precision in float32. Raises UnitError for a read noise below
     zero and for complex numbers, ShapeError for no tensor.
     """
     check_dense((counts,), "anscombe")
     whole = not (counts.is_floating_point() or counts.is_complex())
     counts = counts.to(torch.get_default_dtype() if whole else working_dtype((counts,), "anscombe"))
-    check_level("read_noise", read_noise, counts.new_empty(()), "anscombe", zero=True, square=True)
-    offset = _OFFSET + float(read_noise) ** 2
+    sigma = check_level("read_noise", read_noise, counts, "anscombe", zero=True, square=True)
+    offset = _OFFSET + sigma.square()
     negative = counts < 0
     root = (torch.where(negative, torch.zeros_like(counts), counts) + offset).sqrt()
-    return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / math.sqrt(offset)
+    return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / offset.sqrt()
 
 
 @reads(input=LIGHT, target=LIGHT)

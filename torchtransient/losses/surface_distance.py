@@ -8,7 +8,6 @@ from torch import Tensor
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import check_dense, check_device, check_whole, holds, working_dtype
 from torchtransient.losses.triangles import check_faces, unit_normals
-from torchtransient.sensing.layout import without_autocast
 
 # Numbers held at a time of one of the tensors (points, triangles, 3, 3).
 _MOST = 1 << 24
@@ -37,11 +36,6 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
     cells = check_whole("cells", cells, where)
     dtype = working_dtype((vertices, others), where)
     first, second = vertices.to(dtype)[faces.long()], others.to(dtype)[other_faces.long()]
-    return _both_ways(first, second, cells)
-
-
-@without_autocast
-def _both_ways(first: Tensor, second: Tensor, cells: int) -> Tensor:
     return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
 
 
@@ -59,7 +53,8 @@ def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
 def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     """Mean distance of points of some triangles (F, 3, 3) to others, over the area."""
     weights = _middles(cells).to(triangles)
-    points = torch.einsum("kc,fcd->fkd", weights, triangles)
+    # no matrix product, whose derivative autocast would narrow wherever the backward pass runs
+    points = (weights[:, :, None] * triangles[:, None]).sum(2)
     distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
     edges = triangles[:, 1:] - triangles[:, :1]
     longest = edges.detach().abs().amax()

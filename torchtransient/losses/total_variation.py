@@ -14,6 +14,7 @@ from torchtransient.losses.comparison import (
     check_flag,
     check_level,
     check_mask,
+    check_number,
     check_option,
     check_reduction,
     counted,
@@ -84,7 +85,7 @@ def _check_spacing(spacing: Sequence[float] | None, like: Tensor, where: str) ->
         )
     for step in spacing:
         check_level("spacing", step, like.new_empty(()), where, square=True)
-    z, y, x = (float(step) for step in spacing)
+    z, y, x = (check_number("spacing", step, where) for step in spacing)
     return z, y, x
 
 

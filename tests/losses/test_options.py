@@ -1,0 +1,148 @@
+"""Options of every loss: a gradient goes through or is refused. The error of a wrong call names what was called."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from support.loss_cases import CASES
+from torchtransient import losses
+from torchtransient.errors import TorchTransientError
+
+# Options that are numbers, by one that fits.
+NUMBERS = {
+    **dict.fromkeys(("floor", "background", "smoothing", "read_noise", "creation_cost_opl", "share"), 0.7),
+    **dict.fromkeys(("bin_width_opl", "balance"), 0.05),
+    **dict.fromkeys(("cycles", "periods"), 400.0),
+    **dict.fromkeys(("window", "value_range", "cells"), 3.0),
+    "dead_bins": 2.5,
+}
+SEVERAL = {"spacing": (0.1, 0.2, 0.3), "scales": (1.0, 2.0)}
+
+
+def plain(function):
+    """Of losses that are no case: the arguments that are not options."""
+    x = 0.1 + torch.rand(1, 8, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3]])
+    corners = x[0, :4, 0, :3]
+    return {losses.surface_distance: (corners, faces, 2 * corners, faces)}.get(function, (x,))
+
+
+def calls():
+    """(function, its options, a call with more of them)."""
+    for case in CASES:
+        x, y = case.tensors()
+        more = functools.partial(case.function, *case.arguments(x, y))
+        yield case.name, case.function, case.options, more
+    for function in (losses.anscombe, losses.relative_floor, losses.surface_distance):
+        yield function.__name__, function, {}, functools.partial(function, *plain(function))
+
+
+CALLS = {name: call for name, *call in calls()}
+
+
+# Options that have no part beside the others of a case: phases have a floor, and so do records of mass one.
+IDLE = {("phasor", "floor"), ("transient phasor", "floor"), ("Wasserstein, unbalanced", "floor")}
+
+
+def refused(call):
+    """What a typed error says."""
+    try:
+        call()
+    except TorchTransientError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_an_option_with_a_gradient_has_it_or_is_refused(name):
+    """Never a number in silence, whose derivative is nothing."""
+    function, options, call = CALLS[name]
+    for option in (NUMBERS.keys() | SEVERAL.keys()) & inspect.signature(function).parameters.keys():
+        if (name, option) in IDLE:
+            continue
+        number = NUMBERS.get(option, SEVERAL.get(option))
+        leaf = torch.tensor(number, dtype=torch.float64, requires_grad=True)
+
+        def value(x, option=option):
+            return call(**{**options, option: x if x.ndim == 0 else tuple(x)}).sum()
+
+        said = refused(functools.partial(value, leaf))
+        if said is not None:
+            assert "without gradient" in said
+            assert said.startswith(function.__name__ + ":")
+            value(leaf.detach())
+        else:
+            assert torch.autograd.gradcheck(value, leaf, fast_mode=True), option
+
+
+def test_forward_mode_is_refused_as_well():
+    x, y = (1 + torch.rand(4, 4, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    calls = (
+        lambda v: losses.scale_invariant_depth_loss(x, y, balance=v),
+        lambda v: losses.total_variation(x[None], spacing=(1.0, v, 1.0)),
+    )
+    for call in calls:
+        with pytest.raises(TorchTransientError, match="without gradient"):
+            torch.func.jvp(call, (torch.tensor(0.5),), (torch.tensor(1.0),))
+    _, slope = torch.func.jvp(lambda v: losses.anscombe(x, v).sum(), (torch.tensor(0.5),), (torch.tensor(1.0),))
+    torch.testing.assert_close(slope, (1 / (x + 3 / 8 + 0.25).sqrt()).sum())
+
+
+def test_levels_that_are_fitted():
+    """Read noise of a root, and the floor of each scale."""
+    x, y = (torch.rand(1, 6, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    leaf = torch.full((2, 2), 0.7, dtype=torch.float64, requires_grad=True)
+    levels = (
+        lambda v: losses.root_loss(x, y, root=functools.partial(losses.anscombe, read_noise=v)),
+        lambda v: losses.multiscale_loss(x, y, functools.partial(losses.poisson_loss, floor=v)),
+        lambda v: losses.multiscale_loss(x, y, functools.partial(losses.log_ratio_loss, background=v)),
+    )
+    for level in levels:
+        assert torch.autograd.gradcheck(level, leaf, fast_mode=True)
+
+
+FUNCTIONS = {name: f for name, f in vars(losses).items() if inspect.isfunction(f)}
+MODULES = {
+    name: kind
+    for name, kind in vars(losses).items()
+    if inspect.isclass(kind) and issubclass(kind, torch.nn.Module) and not name.startswith("_")
+}
+
+
+def results(number):
+    return [SimpleNamespace(transient=torch.ones(1, 8, 2, 2), axis=None) for _ in range(number)]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_wrong_call_of_a_function_names_it(name):
+    """Arguments missing, too many, and of other names, of tensors and of results."""
+    function = FUNCTIONS[name]
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    tensors = [torch.ones(1, 8, 2, 2)] * len(needed)
+    for given in (tensors, results(len(needed))):
+        wrong = [((), {}), (given[:-1], {}), (given, {"redution": "sum"}), (given * 20, {})]
+        for arguments, keywords in wrong:
+            with pytest.raises(TypeError, match=rf"^{name}\b"):
+                function(*arguments, **keywords)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_wrong_call_of_a_module_names_it(name):
+    kind = MODULES[name]
+    with pytest.raises(TypeError, match=rf"^{name}\b"):
+        kind(redution="sum")
+    with pytest.raises(TypeError, match=rf"^{name}\b"):
+        kind(*range(20))
+    needed = [p for p in list(inspect.signature(kind).parameters.values()) if p.default is p.empty]
+    if needed:
+        with pytest.raises(TypeError, match=rf"^{name}\b.*{needed[0].name}"):
+            kind()
+    (module,) = [case.module(**case.options) for case in CASES if case.module is kind][:1] or [kind()]
+    for arguments, keywords in (((), {}), (results(9), {}), (results(1), {"redution": "sum"})):
+        with pytest.raises(TypeError, match=rf"^{name}\b"):
+            module(*arguments, **keywords)
