@@ -36,7 +36,10 @@ SCENES = {
 }
 
 
-QUICK = {("two-sided", "single"), ("interpolated normals", "exhaustive")}
+QUICK = {
+    ("V and plate", "confocal"), ("two-sided", "single"), ("body before a wall", "confocal"),
+    ("interpolated normals", "exhaustive"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "kind"), long_pairs(SCENES, ["confocal", "single", "exhaustive"], QUICK))

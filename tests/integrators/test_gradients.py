@@ -23,7 +23,7 @@ ROUNDING = 2e-3
 FIRST = 1
 # So does it run cases of more than a second that need many samples.
 LONG = {
-    "hair_coloured_absorption", "plastic_index", "pattern_shifts", "medium_albedo",
+    "pattern_grows", "plastic_alpha", "hair_coloured_absorption", "plastic_index", "pattern_shifts", "medium_albedo",
     "rough_mirror_moves", "thin_glass_tilts", "rough_glass_index", "glass_in_a_group", "phasor_fog_density",
     "phasor_glass_index", "meter_moves", "camera_before_an_instance", "instance_of_a_grid_turns",
     "camera_before_a_curve", "pattern_and_light_move", "gap_lamp_with_a_cone_tilts", "gap_lamp_with_a_cone",

@@ -14,9 +14,8 @@ SCRIPT = Path(__file__).parents[2] / "training_examples" / "depth_from_counts.py
 METHODS = ("highest bin", "matched filter", "untrained", "network")
 
 
-@pytest.mark.parametrize(
-    "way", [pytest.param([], id="on disk"), pytest.param(["--online"], id="online", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [pytest.param([], id="on disk"), pytest.param(["--online"], id="online")])
 def test_the_network_beats_the_filter(tmp_path, capsys, way):
     run = runpy.run_path(str(SCRIPT))["main"]
     errors = run(["--smoke", "--output", str(tmp_path), *way])

@@ -55,6 +55,7 @@ def test_the_judge_finds_delay_gain_and_background(example):
     assert float(best.sum()) == pytest.approx(float(counts.sum()), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_simulated_chip_is_predicted(example, tmp_path, capsys, monkeypatch):
     monkeypatch.delenv(MEASURED, raising=False)
     (rows,) = example.main(["--smoke", "--output", str(tmp_path)])

@@ -12,6 +12,7 @@ SCRIPT = Path(__file__).parents[2] / "training_examples" / "spad_depth.py"
 METHODS = ("matched filter", "Coates + matched filter", "network")
 
 
+@pytest.mark.slow
 def test_runs_and_beats_the_filters_in_much_light(tmp_path, capsys):
     (errors,) = runpy.run_path(str(SCRIPT))["main"](["--smoke", "--workers", "1", "--output", str(tmp_path)])
     printed = capsys.readouterr().out
