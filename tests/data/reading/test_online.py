@@ -395,6 +395,8 @@ from support.online_recipe import OnlineRecipe
 from torchtransient.data.reading.online import OnlineDataset
 
 if __name__ == "__main__":
+    # A shell starts what it puts behind with interrupts ignored, which children inherit.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     data = OnlineDataset(OnlineRecipe(pids={pids!r}, hang=(40,)), capacity=16, uses=1.0, warm=1)
     data.draw()
     print("drawn", flush=True)
