@@ -92,7 +92,10 @@ def test_of_two_renders(loss, renderer, shared):
     found = loss(out, target, **options)
     wanted = loss(out.transient, target.transient, **options, **known)
     torch.testing.assert_close(found, wanted, rtol=0, atol=0)
-    torch.testing.assert_close(slope_of(found, renderer), slope_of(wanted, renderer), rtol=1e-5, atol=0)
+    slope_of(found, renderer)
+    # Compared where the renderer takes it up: behind it the order of the additions changes from run to run.
+    of_found, of_wanted = (torch.autograd.grad(v, out.transient, retain_graph=True) for v in (found, wanted))
+    torch.testing.assert_close(of_found, of_wanted, rtol=0, atol=0)
     for pair in ((out, target.transient), (out.transient, target)):
         torch.testing.assert_close(loss(*pair, **options), wanted, rtol=0, atol=0)
 
