@@ -86,7 +86,7 @@ def test_phase_of_nan_is_nan(code):
     taps = 0.1 + light(1, 3, 2, 3)
     taps[0, 1, 0, 0] = math.nan
     reading = sensing.read_itof(taps, (40e6,), 3, code=code)
-    for value in (reading.phase, reading.amplitude, reading.confidence, reading.depth_m):
+    for value in (reading.phase, reading.amplitude, reading.depth_std_m, reading.depth_m):
         assert bool(value[..., 0, 0].isnan().all())
         assert int(value.isnan().sum()) == 1
 

@@ -43,6 +43,7 @@ from torchtransient.sensing.impulse_response import (
 )
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
@@ -68,9 +69,10 @@ KINDS: Mapping[str, Callable[..., Any]] = {
         made.__name__: made
         for made in (
             Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
-            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCorrelation,
-            LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic, ShotNoise,
-            StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse,
+            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCalibration,
+            ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic,
+            ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, TapDifference,
+            TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
         )
     },
