@@ -25,6 +25,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, without_autocast
 from torchtransient.sensing.sensor import Sensor
@@ -72,6 +73,7 @@ def tap_weights(
     return torch.cat(rows)
 
 
+@in_single
 @without_autocast
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
@@ -186,6 +188,7 @@ class ItofCorrelation(Sensor):
         self.within_bin: WithinBin = within_bin
         weights = tap_weights(code, self.frequencies_hz, axis, self.contrast, within_bin)
         self.register_buffer("weights", weights)
+        self.num_bins = axis.num_bins
 
     def expected(self, x: Tensor) -> Tensor:
         # Scaled on the small side: taps are fewer than bins.
