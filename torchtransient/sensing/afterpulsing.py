@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
@@ -40,6 +41,7 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     return folded.roll(start % period_bins)
 
 
+@in_single
 def add_afterpulses(
     counts: Tensor,
     probability: Tensor | float,
@@ -106,6 +108,7 @@ class Afterpulsing(AddedCounts):
         tau = check_seconds(tau_s, "tau_s", where, open_low=True)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         self.period_bins: int | None = None
         if period_s is not None:
             self.period_bins = round(check_seconds(period_s, "period_s", where, open_low=True) / self.bin_width_s)
@@ -131,6 +134,7 @@ class Afterpulsing(AddedCounts):
     def _period_bins(self, x: Tensor) -> int:
         return self.period_bins or x.shape[TIME]
 
+    @in_single
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
         kernel = afterpulse_kernel(self.tau_s, self.dead_time_s, self.bin_width_s, self._period_bins(x))

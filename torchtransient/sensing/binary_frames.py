@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchtransient.floating import in_single
 from torchtransient.sensing.draws import WHOLE_FLOAT32, check_rates
 from torchtransient.sensing.layout import TIME, check_count, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 
 
+@in_single
 def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     """Photons per frame from the number of frames that saw any: -log(1 - counts/frames), any shape.
 

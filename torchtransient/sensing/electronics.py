@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import check_count, check_number, check_transient
 from torchtransient.sensing.policies import (
     VARIANCE_FLOOR,
@@ -142,6 +143,7 @@ class PixelElectronics(RandomSensor):
         low = -self.black_level_dn * self.gain_e_per_dn
         return low, low + (2**self.bits - 1) * self.gain_e_per_dn
 
+    @in_single
     def collected(self, x: Tensor) -> Tensor:
         """Mean electrons before saturation: with the gain map and the dark electrons. UnitError for negative light."""
         check_transient(x, type(self).__name__)

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
 from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state, whole_and_part
@@ -30,6 +31,7 @@ from torchtransient.sensing.time_convolution import check_choice
 DeadTime = Literal["non_paralyzable", "paralyzable"]
 
 
+@in_single
 def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non_paralyzable") -> Tensor:
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
@@ -54,6 +56,7 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     return FreeRunningState(image(rows.detected), image(rows.armed), image(rows.late), rows.whole)
 
 
+@in_single
 def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin of a free-running detector in its stationary state.
 
@@ -84,6 +87,7 @@ def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
     return torch.exp(-low) * torch.where(small, 1 - width / 2 + width**2 / 6, -torch.expm1(-safe) / safe)
 
 
+@in_single
 def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin when every photon, counted or not, starts the dead time anew.
 
@@ -149,6 +153,7 @@ class FreeRunningSPAD(RandomSensor):
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)
         if kind == "non_paralyzable":
             self._check_dead_time(dead)
@@ -167,6 +172,7 @@ class FreeRunningSPAD(RandomSensor):
     def _dead_bins(self) -> Tensor:
         return self.dead_time_s / self.bin_width_s
 
+    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per period and bin."""
         if self.kind == "paralyzable":

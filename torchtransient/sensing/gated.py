@@ -94,6 +94,7 @@ class GatedIntegration(Sensor):
         if not delays or len(widths) != len(delays):
             raise ShapeError(f"{me}: expected one width or one per delay, got {len(delays)} and {len(widths)}.")
         self.axis = check_time_axis(axis, me)
+        self.num_bins = self.axis.num_bins
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
         window_s = axis.num_bins * axis.bin_width_s

@@ -371,6 +371,7 @@ class ImpulseResponse(Sensor):
             )
         self.response = response
         self.bin_width_s = bin_width_of(axis, bin_width_s, "ImpulseResponse")
+        self.num_bins = None if axis is None else axis.num_bins
         self.boundary: Boundary = boundary
         self.method: Method = method
 

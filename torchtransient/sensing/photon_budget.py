@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_tensor, check_transient
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.tensor_record import TensorRecord
@@ -156,6 +157,7 @@ class PhotonBudget(Sensor):
             )
         self.register_buffer("dark_count_rate_hz", dark)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         if (cycles is None) == (exposure_s is None):
             raise UnitError(f"{where}: expected either cycles or exposure_s, got both or neither.")
         if exposure_s is not None:
@@ -173,6 +175,7 @@ class PhotonBudget(Sensor):
         photons = self.pulse_energy_j * self.optics.etendue_m2_sr / self.photon_energy_j
         return photons * self.quantum_efficiency
 
+    @in_single
     def signal(self, x: Tensor) -> Tensor:
         """Expected detections of laser light per cycle and bin, without background."""
         check_transient(x, "PhotonBudget")
@@ -196,6 +199,7 @@ class PhotonBudget(Sensor):
         background_hz = self.ambient_rate_hz * self.quantum_efficiency + self.dark_count_rate_hz.double()
         return self.signal(x) + (background_hz * self.bin_width_s).to(x.dtype)
 
+    @in_single
     def report(self, x: Tensor) -> BudgetReport:
         """Signal and background of every pixel (dark counts: the mean over pixels), for a transient of radiance."""
         window_s = x.shape[TIME] * self.bin_width_s
