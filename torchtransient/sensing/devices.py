@@ -25,7 +25,9 @@ from torch import nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.quantities import shown
+from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
@@ -44,6 +46,7 @@ from torchtransient.sensing.impulse_response import (
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.shot_noise import ShotNoise
@@ -67,11 +70,12 @@ KINDS: Mapping[str, Callable[..., Any]] = {
     **{
         made.__name__: made
         for made in (
-            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
-            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCorrelation,
-            LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic, ShotNoise,
-            StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse,
-            fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
+            Afterpulsing, AfterpulsingSPAD, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk,
+            DetectionSkew, EquiDepthHistogram, FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse,
+            ImpulseResponse, ItofCorrelation, LensBlur, MeasuredDelays, MeasuredResponse, Optics, PhotonBudget,
+            PixelElectronics, PixelSkew, PolarizationMosaic, PowerLawDelays, ShotNoise, StreakCamera,
+            SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse, fourier_codes, hamiltonian_code,
+            linear_analysers, measured_code, sine_code, square_code,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,
