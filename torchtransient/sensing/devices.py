@@ -45,6 +45,7 @@ from torchtransient.sensing.impulse_response import (
 )
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
@@ -70,12 +71,13 @@ KINDS: Mapping[str, Callable[..., Any]] = {
     **{
         made.__name__: made
         for made in (
-            Afterpulsing, AfterpulsingSPAD, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk,
-            DetectionSkew, EquiDepthHistogram, FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse,
-            ImpulseResponse, ItofCorrelation, LensBlur, MeasuredDelays, MeasuredResponse, Optics, PhotonBudget,
-            PixelElectronics, PixelSkew, PolarizationMosaic, PowerLawDelays, ShotNoise, StreakCamera,
-            SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse, fourier_codes, hamiltonian_code,
-            linear_analysers, measured_code, sine_code, square_code,
+            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
+            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCalibration,
+            ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic,
+            ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, TapDifference,
+            TwoTapCode, UniformResponse,
+            fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
+            AfterpulsingSPAD, DetectionSkew, MeasuredDelays, PixelSkew, PowerLawDelays,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,
