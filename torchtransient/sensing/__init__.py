@@ -1,9 +1,13 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.afterpulse_delays import AfterpulseDelays as AfterpulseDelays
+from torchtransient.sensing.afterpulse_delays import MeasuredDelays as MeasuredDelays
+from torchtransient.sensing.afterpulse_delays import PowerLawDelays as PowerLawDelays
 from torchtransient.sensing.afterpulsing import Afterpulsing as Afterpulsing
 from torchtransient.sensing.afterpulsing import add_afterpulses as add_afterpulses
 from torchtransient.sensing.afterpulsing import afterpulse_kernel as afterpulse_kernel
 from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rates
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD as AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
@@ -82,8 +86,12 @@ from torchtransient.sensing.linear_part import linearity_error as linearity_erro
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
+from torchtransient.sensing.photon_budget import ambient_photon_rate as ambient_photon_rate
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
+from torchtransient.sensing.pixel_skew import DetectionSkew as DetectionSkew
+from torchtransient.sensing.pixel_skew import PixelSkew as PixelSkew
+from torchtransient.sensing.pixel_skew import shift_time as shift_time
 from torchtransient.sensing.polarization import Analysers as Analysers
 from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
 from torchtransient.sensing.polarization import analyse as analyse
