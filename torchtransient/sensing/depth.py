@@ -247,7 +247,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     from torchtransient.sensing.response_shapes import FWHM_PER_SIGMA
     from torchtransient.units import SPEED_OF_LIGHT
 
-    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1.0)
+    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
 
 

@@ -164,6 +164,8 @@ class ItofCorrelation(Sensor):
     Noise, saturation and converter follow in `PixelElectronics`; phase and depth in `itof_depth.py`.
     """
 
+    takes, gives = ("electrons", "counts"), "electrons"
+
     weights: Tensor
 
     def __init__(
