@@ -34,6 +34,8 @@ ON_AN_AXIS = {
     "SynchronousSPAD": lambda axis: sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=axis),
     "FreeRunningSPAD": lambda axis: sensing.FreeRunningSPAD(100, 1 * NS, axis=axis),
     "Afterpulsing": lambda axis: sensing.Afterpulsing(0.01, 1 * NS, 1 * NS, axis=axis),
+    "PixelSkew": lambda axis: sensing.PixelSkew(50 * PS, axis),
+    "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
     "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),
     "StreakCamera": lambda axis: sensing.StreakCamera(axis, time_fwhm_s=300 * PS, jitter_fwhm_s=300 * PS),
     "GatedIntegration": lambda axis: sensing.GatedIntegration([2 * NS], 1 * NS, axis),

@@ -74,8 +74,14 @@ def check_stages(chain: nn.Module) -> None:
             continue
         _check_quantity(light, stage)
         light = _after(stage, _same_bins(light, stage))
-    _check_cycles([s for s in stages if s is not None])
+    _check_cycles(_parts_of(chain))
     check_window(chain, None)
+
+
+def _parts_of(chain: nn.Module) -> list[Stage]:
+    """Every sensor of a chain, those that other sensors are made of too."""
+    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules() if part is not chain)
+    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor)]
 
 
 # ------------------------------------------------------------------------------------------------------------- bins
@@ -201,7 +207,7 @@ def check_window(chain: nn.Module, num_bins: int | None) -> None:
     `SynchronousSPAD` with a dead time has to be armed again when the next cycle begins. ``num_bins``: of the light,
     None while there is none, which leaves out stages that were made with a width alone.
     """
-    stages = [s for s in stages_of(chain) if s is not None]
+    stages = _parts_of(chain)
     for budget in stages:
         rate_hz = getattr(budget.sensor, "repetition_rate_hz", None)
         if isinstance(rate_hz, float):

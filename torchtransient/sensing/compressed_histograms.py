@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.layout import TIME, check_count, check_transient, without_autocast
+from torchtransient.sensing.layout import TIME, check_count, check_transient, product
 from torchtransient.sensing.sensor import Sensor
 
 
@@ -72,9 +72,9 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     return table / lengths
 
 
-@without_autocast
 def _coded_sums(x: Tensor, matrix: Tensor) -> Tensor:
-    return torch.einsum("kt,...thw->...khw", matrix, x)
+    sums = product(matrix, x.flatten(-2))
+    return sums.reshape(*sums.shape[:-1], *x.shape[-2:])
 
 
 class CodedHistogram(Sensor):

@@ -27,7 +27,9 @@ from torch import nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.quantities import shown
+from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
@@ -45,8 +47,10 @@ from torchtransient.sensing.impulse_response import (
 )
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
 from torchtransient.sensing.layout import check_number
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.shot_noise import ShotNoise
@@ -71,10 +75,12 @@ KINDS: Mapping[str, Callable[..., Any]] = {
         made.__name__: made
         for made in (
             Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
-            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCorrelation,
-            LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic, ShotNoise,
-            StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse,
+            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCalibration,
+            ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic,
+            ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, TapDifference,
+            TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
+            AfterpulsingSPAD, DetectionSkew, MeasuredDelays, PixelSkew, PowerLawDelays,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchtransient.axes import WIDEST_BIN_S, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
 from torchtransient.quantities import as_number, shown
 

@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.layout import check_number, check_tensor, without_autocast
+from torchtransient.sensing.layout import check_number, check_tensor, product, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -65,7 +65,7 @@ def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     _check_stokes(stokes, "analyse")
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise ShapeError(f"analyse: expected rows (A, 4), got {tuple(rows.shape)}.")
-    return torch.einsum("as,...scthw->...acthw", rows.to(stokes), stokes)
+    return _by_rows(rows.to(stokes), stokes)
 
 
 @in_single
@@ -83,7 +83,13 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
             f"{tuple(measurements.shape)} and {tuple(rows.shape)}."
         )
     inverse = torch.linalg.pinv(rows.double(), rtol=1e-9)
-    return torch.einsum("sa,...acthw->...scthw", inverse.to(measurements), measurements)
+    return _by_rows(inverse.to(measurements), measurements)
+
+
+def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
+    """(..., M, C, T, H, W): a matrix (M, K) times the components of (..., K, C, T, H, W)."""
+    mixed = product(matrix, x.flatten(TRANSIENT_DIM + 1))
+    return mixed.reshape(*mixed.shape[:-1], *x.shape[TRANSIENT_DIM + 1 :])
 
 
 # ------------------------------------------------------------------------------------------------------ physicality
@@ -174,9 +180,9 @@ class PolarizationMosaic(Sensor):
         return f"block={tuple(self.rows.shape[:2])}"
 
 
-@without_autocast
 def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
-    return torch.einsum("shw,...scthw->...cthw", weights, stokes)
+    # No product of matrices, which autocast would round.
+    return (weights[:, None, None] * stokes).sum(TRANSIENT_DIM)
 
 
 def mosaic_rows(
