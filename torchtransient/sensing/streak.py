@@ -43,6 +43,8 @@ class SweepJitter(RandomSensor):
     its ordinary gradient, which is unbiased for any loss.
     """
 
+    gives = "the same"
+
     def __init__(
         self,
         jitter_fwhm_s: float,
