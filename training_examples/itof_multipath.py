@@ -102,7 +102,7 @@ class MultipathNetwork(nn.Module):
         late = reading.phase.squeeze(1) - 2 * torch.pi * frequencies * tt.units.opl_to_seconds(2 * depth)
         amplitude = reading.amplitude.squeeze(1).clamp_min(1.0).log()
         ratios = amplitude[:, 1:] - amplitude[:, :1]
-        features = [late.cos(), late.sin(), ratios, reading.confidence.squeeze(1), amplitude[:, :1] - 7, depth - 3]
+        features = [late.cos(), late.sin(), ratios, reading.contrast.squeeze(1), amplitude[:, :1] - 7, depth - 3]
         return depth + self.layers(torch.cat(features, 1)) / 10
 
 

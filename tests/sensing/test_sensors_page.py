@@ -27,7 +27,7 @@ def test_first_example():
     wanted = 0.5 * 133.5 * names["axis"].bin_width_opl
     assert float((names["depth_m"] - wanted).abs().max()) < 0.15
     assert abs(float(names["depth_m"].mean()) - wanted) < 0.01
-    assert bool(torch.isfinite(names["reading"].confidence).all())
+    assert bool(torch.isfinite(names["reading"].depth_std_m).all())
 
 
 def test_devices_example():

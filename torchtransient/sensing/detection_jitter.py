@@ -31,6 +31,8 @@ class DetectionJitter(MovedCounts):
     the detector alone. Raises UnitError, ShapeError. Not modelled: jitter that depends on the rate (time walk).
     """
 
+    takes, gives = ("counts",), "counts"
+
     def __init__(
         self,
         response: Response,
@@ -46,6 +48,7 @@ class DetectionJitter(MovedCounts):
         check_choice(within_bin, WithinBin, "within_bin", "DetectionJitter")
         self.response = check_response(response, "DetectionJitter")
         self.bin_width_s = bin_width_of(axis, bin_width_s, "DetectionJitter")
+        self.num_bins = None if axis is None else axis.num_bins
         self.boundary: Boundary = boundary
         self.within_bin: WithinBin = within_bin
 

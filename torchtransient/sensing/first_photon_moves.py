@@ -62,14 +62,14 @@ def moved_first_photons(
     check_generator(generator, type(spad).__name__)
     p = moved_probabilities(spad, moves, x)
     if policy == "gaussian":
-        return (p * spad.cycles + multinomial_noise(p, spad.cycles, generator)).to(x.dtype)
+        return p * spad.cycles + multinomial_noise(p, spad.cycles, generator)
     with torch.no_grad():
         counts = sample_multinomial(spad.cycles, p, generator)
     if policy == "straight_through" and torch.is_grad_enabled():
         counts = straight_through(counts, p * spad.cycles)
     elif policy == "score":
         record_score(lambda: multinomial_log_prob(counts, p, spad.cycles), type(spad).__name__)
-    return counts.to(x.dtype)
+    return counts
 
 
 def multinomial_log_prob(counts: Tensor, probabilities: Tensor, trials: int) -> Tensor:

@@ -42,6 +42,8 @@ class ImpulseResponse(Sensor):
     evenly in its bin; "center": in the middle (`Response.kernel`). Raises UnitError, ShapeError.
     """
 
+    gives = "the same"
+
     def __init__(
         self,
         response: Response,
@@ -58,6 +60,7 @@ class ImpulseResponse(Sensor):
         check_choice(within_bin, WithinBin, "within_bin", "ImpulseResponse")
         self.response = check_response(response, "ImpulseResponse")
         self.bin_width_s = bin_width_of(axis, bin_width_s, "ImpulseResponse")
+        self.num_bins = None if axis is None else axis.num_bins
         self.boundary: Boundary = boundary
         self.method: Method = method
         self.within_bin: WithinBin = within_bin

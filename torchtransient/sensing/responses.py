@@ -53,7 +53,7 @@ class Response(PhysicalModule):
     def __init__(self, delay_s: float, learnable: bool) -> None:
         super().__init__()
         self.learnable = bool(learnable)
-        delay = check_number(delay_s, "delay_s", type(self).__name__, low=-1.0, high=1.0)
+        delay = check_seconds(delay_s, "delay_s", type(self).__name__, signed=True)
         self._hold("delay_ps", torch.tensor(delay * 1e12, dtype=torch.float64))
 
     def _hold(self, name: str, value: Tensor) -> None:

@@ -73,4 +73,4 @@ class StreakCamera(Compose):
             camera,
         ]
         super().__init__([s for s in stages if s is not None], grad=grad)
-        self.axis = axis
+        self.axis, self.num_bins = axis, axis.num_bins

@@ -29,6 +29,8 @@ class SweepJitter(RandomSensor):
     its ordinary gradient, which is unbiased for any loss.
     """
 
+    gives = "the same"
+
     def __init__(
         self,
         jitter_fwhm_s: float,
@@ -45,6 +47,7 @@ class SweepJitter(RandomSensor):
         self.boundary: Boundary = boundary
         self.jitter_fwhm_s = check_seconds(jitter_fwhm_s, "jitter_fwhm_s", me)
         self.bin_width_s = bin_width_of(axis, bin_width_s, me)
+        self.num_bins = None if axis is None else axis.num_bins
         self.sweeps = check_count(sweeps, "sweeps", me)
 
     @property

@@ -73,6 +73,8 @@ class TDC(MovedCounts):
     ShapeError when T does not fit.
     """
 
+    gives = "the same"
+
     code_widths: Tensor
     bands: Tensor
 

@@ -9,7 +9,6 @@ from torchtransient import sensing
 from torchtransient.errors import GradientError, ShapeError, UnitError
 
 PS = 1e-12
-ALL = (torch.bfloat16, torch.float32, torch.float64)
 
 
 def impulse(response, **keywords):
@@ -40,7 +39,7 @@ def composed():
 
 
 ENTRIES = [
-    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True)), dtypes=ALL),
+    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True))),
     Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
     Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
     Entry(
@@ -59,7 +58,6 @@ ENTRIES = [
         lambda: sensing.LensBlur(0.8, "circular", size=3, learnable=True),
         shape=(2, 1, 3, 4, 5),
         conserves=lambda y: y.sum((-1, -2)),
-        dtypes=ALL,
     ),
     Entry(
         "SpatialPSF", lambda: sensing.SpatialPSF(torch.arange(9.0).view(3, 3), learnable=True), shape=(2, 1, 3, 4, 5)
@@ -75,9 +73,8 @@ ENTRIES = [
             ambient_rate_hz=1e6,
             bin_width_s=20 * PS,
         ),
-        dtypes=ALL,
     ),
-    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), dtypes=ALL, random=True),
+    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), random=True),
     Entry(
         "SynchronousSPAD-gate",
         lambda **k: sensing.SynchronousSPAD(500, gate=torch.linspace(0, 1, 12), **k),
@@ -125,7 +122,6 @@ ENTRIES = [
         lambda **k: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0)), **k),
         input=whole_counts,
         conserves=lambda y: y.sum(-3),
-        dtypes=ALL,
         random=True,
         # none of its numbers is learnt: nothing for a score of its own
         policies=("expected", "gaussian", "straight_through"),
@@ -143,7 +139,7 @@ ENTRIES = [
         ),
     ),
     Entry("TDC-rates", lambda: sensing.TDC(torch.ones(12), dither=True, acts_on="rates", boundary="zero")),
-    Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True, dtypes=ALL),
+    Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True),
     Entry("DetectionJitter-zero", jitter(measured, boundary="zero"), input=whole_counts, random=True),
     Entry(
         "DetectionJitter-composed",
@@ -156,7 +152,7 @@ ENTRIES = [
             (lambda: sensing.DetectionJitter(tails(), bin_width_s=20.0), UnitError),
         ),
     ),
-    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True, dtypes=ALL),
+    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True),
     Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
     Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
     Entry(
