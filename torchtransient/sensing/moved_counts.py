@@ -21,7 +21,9 @@ from torchtransient.sensing.thinning import halve, thin
 from torchtransient.sensing.time_convolution import Boundary
 
 _BLOCK = 1 << 18  # entries at a time, so that temporaries stay in the cache
-_RARE = 0.05  # share of a branch below which single events are sought instead of tossing coins for all
+_RARE = 0.3  # counts of an entry in a branch, on average, below which single events are sought
+_TURNED = 1.0  # coins of an entry that an uneven share turns, on average, above which tossing them does not pay
+_TOSSED = (0.7, 60.0)  # counts of an entry, on average, between which it pays
 _FEW = 0.25  # share of occupied entries below which these alone are followed
 
 
@@ -108,6 +110,10 @@ def _by_blocks(data: Tensor, moves: Moves, generator: torch.Generator | None) ->
     return torch.cat([_Tree(moves, p.contiguous(), None).run(generator) for p in pieces], 2)
 
 
+def _binomial(counts: Tensor, share: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.binomial(counts, share.contiguous(), generator=generator)
+
+
 class _Tree:
     """Splits counts (N, T, P) over lags, adding them up where they go."""
 
@@ -130,17 +136,23 @@ class _Tree:
         if len(lags) == 1:
             self._leaf(lags[0], place, counts)
             return
-        small, large = self._split(lags)
+        level = float(counts.sum(dtype=torch.float64)) / counts.numel()
+        small, large = self._split(lags, level)
         few, whole = (self.shares[list(part)].sum(0) for part in (small, lags))
         share = (few / whole.clamp_min(1e-300)).clamp(0, 1)
-        if float(share.max()) < _RARE:
+        highest = float(share.max())
+        if highest * level < _RARE:
             events = thin(counts, self._of_entries(share, place, counts), generator)
             rest = counts.clone()
             rest.view(-1)[events.place] -= events.number
             few_place = events.place if place is None else place[events.place]
             parts = [(small, few_place, events.number), (large, place, rest)]
         else:
-            taken = halve(counts, self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts), generator)
+            even = max(highest, 1 - float(share.min())) * 2 - 1
+            tossed = _TOSSED[0] < level < _TOSSED[1] and even * level < _TURNED
+            shares = self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts)
+            draw = halve if tossed else _binomial
+            taken = draw(counts, shares, generator)
             parts = [(small, place, taken), (large, place, counts - taken)]
         for part, where, number in parts:
             occupied = int(torch.count_nonzero(number))
@@ -151,11 +163,14 @@ class _Tree:
             if occupied:
                 self._node(part, where, number, generator)
 
-    def _split(self, lags: list[int]) -> tuple[list[int], list[int]]:
-        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get."""
+    def _split(self, lags: list[int], level: float) -> tuple[list[int], list[int]]:
+        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get.
+
+        `level`: counts of an entry, on average.
+        """
         order = sorted(lags, key=self.weights.__getitem__)
         whole, total, rare = sum(self.weights[i] for i in lags), 0.0, 0
-        while rare < len(order) - 1 and total + self.weights[order[rare]] < _RARE * whole:
+        while rare < len(order) - 1 and (total + self.weights[order[rare]]) * level < _RARE * whole:
             total += self.weights[order[rare]]
             rare += 1
         if rare:
