@@ -28,7 +28,7 @@ from torchtransient.losses.layouts import as_columns, bins_dim, check_held
 from torchtransient.losses.likelihoods import Options, check_constant, check_counts, check_rates, floored
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
-from torchtransient.sensing.running_sums import split_dead_time
+from torchtransient.sensing.dead_time_cycle import check_dead_bins
 from torchtransient.sensing.spad import first_photon_log_prob
 
 _TIME = -3
@@ -38,7 +38,7 @@ def _check_dead_time(dead_bins: float, where: str) -> float:
     check_number("dead_bins", dead_bins, where)
     number = positive(f"{where}: dead_bins", dead_bins)
     try:
-        split_dead_time(number)
+        check_dead_bins(number)
     except UnitError as error:
         raise UnitError(f"{where}: {error}") from None
     return number
