@@ -120,9 +120,12 @@ class Afterpulsing(AddedCounts):
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
         self.num_bins = None if axis is None else axis.num_bins
+        self.period_s: float | None = None
         self.period_bins: int | None = None
+        self.window_is_period = period_s is None
         if period_s is not None:
-            self.period_bins = round(check_seconds(period_s, "period_s", where, open_low=True) / self.bin_width_s)
+            self.period_s = check_seconds(period_s, "period_s", where, open_low=True, high=1.0)
+            self.period_bins = round(self.period_s / self.bin_width_s)
             _check_period(self.period_bins, 1)
         self.delays, self.counted_from = delays, counted_from
         self._keep(probability, [] if tau_s is None else tau_s, learnable)

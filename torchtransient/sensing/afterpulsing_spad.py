@@ -37,6 +37,8 @@ class AfterpulsingSPAD(Sensor):
     histogram vary as photons do.
     """
 
+    takes, gives = ("rate",), "counts"
+
     def __init__(
         self,
         detector: SynchronousSPAD | FreeRunningSPAD,

@@ -29,6 +29,8 @@ class BinaryFrames(RandomSensor):
     with probability 1 - exp(-mean). All four policies. Source: Fossum et al., Sensors 16 (2016).
     """
 
+    takes, gives = ("electrons",), "counts"
+
     def __init__(self, frames: int, *, grad: GradPolicy = "expected") -> None:
         super().__init__(grad)
         self.frames = check_count(frames, "frames", "BinaryFrames")

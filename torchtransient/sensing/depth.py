@@ -274,7 +274,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     if not isinstance(detections, Tensor) or bool((detections.detach() < 0).any()):
         got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
         raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
-    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1.0)
+    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
 
 

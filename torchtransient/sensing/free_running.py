@@ -22,7 +22,15 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
 from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state, whole_and_part
-from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_tensor, check_transient
+from torchtransient.sensing.layout import (
+    TIME,
+    bin_width_of,
+    bins_of_period,
+    check_count,
+    check_seconds,
+    check_tensor,
+    check_transient,
+)
 from torchtransient.sensing.policies import GradPolicy, record_score
 from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.sensor import RandomSensor
@@ -124,7 +132,8 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
 class FreeRunningSPAD(RandomSensor):
     """Histogram (..., C, T, H, W) over laser phase, in counts, of a SPAD that runs free for `cycles` laser periods.
 
-    The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period.
+    The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period,
+    which `period_s` looks at: UnitError for an axis of another length, ShapeError for light with another T.
     `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
     "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
 
@@ -135,6 +144,8 @@ class FreeRunningSPAD(RandomSensor):
     as described here, dead and armed detectors at the start of the period included.
     """
 
+    takes, gives, window_is_period = ("rate",), "counts", True
+
     log_dead_time_s: Tensor
 
     def __init__(
@@ -144,6 +155,7 @@ class FreeRunningSPAD(RandomSensor):
         *,
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
+        period_s: float | None = None,
         kind: DeadTime = "non_paralyzable",
         learnable: bool = False,
         grad: GradPolicy = "expected",
@@ -154,6 +166,8 @@ class FreeRunningSPAD(RandomSensor):
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
         self.num_bins = None if axis is None else axis.num_bins
+        if period_s is not None:
+            self.num_bins = bins_of_period(period_s, self.bin_width_s, self.num_bins, "FreeRunningSPAD")
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)
         if kind == "non_paralyzable":
             self._check_dead_time(dead)

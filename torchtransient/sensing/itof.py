@@ -243,6 +243,8 @@ class ItofCorrelation(Sensor):
     other pixels than those of the map.
     """
 
+    takes, gives = ("electrons", "counts"), "electrons"
+
     weights: Tensor
     phases_rad: Tensor | None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +40,10 @@ class PhysicalModule(nn.Module):
         return self
 
 
+# What stages hand on: W / (m^2 sr) per bin, detections per laser cycle and bin, the mean charge (or photons) of a whole
+# exposure, or what a detector has drawn.
+Quantity = Literal["radiance", "rate", "electrons", "counts"]
+
 # Where light enters a sensor, and the place of the light among the arguments.
 _ENTRANCES = {"expected": 0, "forward": 0, "sample": 0, "variance": 0, "gaussian": 0, "log_prob": 1}
 
@@ -67,6 +71,11 @@ class Sensor(PhysicalModule):
     """
 
     num_bins: int | None = None
+    # What chains compare: what the sensor takes (anything, if it does not say) and gives (None: nobody knows), and
+    # whether it takes its bins for one whole laser period.
+    takes: tuple[Quantity, ...] = ()
+    gives: Quantity | Literal["the same"] | None = None
+    window_is_period: bool = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -79,8 +88,8 @@ class Sensor(PhysicalModule):
         if self.num_bins is None or not isinstance(x, Tensor) or x.ndim < 4 or x.shape[TIME] == self.num_bins:
             return
         raise ShapeError(
-            f"{type(self).__name__}: expected T = {self.num_bins} bins as in the axis that it was made with, got "
-            f"{x.shape[TIME]} of {tuple(x.shape)}. Make it with the axis of the light, or with bin_width_s= for any T."
+            f"{type(self).__name__}: expected T = {self.num_bins} bins as in the axis (or period) it was made with, "
+            f"got {x.shape[TIME]} of {tuple(x.shape)}. Make it with the axis of the light; bin_width_s= takes any T."
         )
 
     def expected(self, x: Tensor) -> Tensor:

@@ -44,6 +44,8 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 class ShotNoise(RandomSensor):
     """Poisson counts of a mean (..., C, T, H, W), in counts. Fano factor 1. All four gradient policies."""
 
+    takes, gives = ("electrons",), "counts"
+
     def expected(self, x: Tensor) -> Tensor:
         return check_transient(x, "ShotNoise")
 

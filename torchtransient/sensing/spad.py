@@ -21,7 +21,6 @@ from torchtransient.sensing.layout import (
     bin_width_of,
     check_count,
     check_seconds,
-    check_time_axis,
     check_transient,
 )
 from torchtransient.sensing.policies import GradPolicy, gaussian_noise
@@ -134,6 +133,8 @@ class SynchronousSPAD(RandomSensor):
     takes the re-arming of a share of cycles on average. Afterpulses and crosstalk are modules of their own, behind.
     """
 
+    takes, gives = ("rate",), "counts"
+
     gate: Tensor | None
 
     def __init__(
@@ -148,7 +149,10 @@ class SynchronousSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "SynchronousSPAD")
-        self.num_bins = None if axis is None else check_time_axis(axis, "SynchronousSPAD").num_bins
+        self.bin_width_s: float | None = None
+        if axis is not None or bin_width_s is not None:
+            self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
         self.dead_time_s = dead_time_s
         self.dead_bins: float | None = None
         if dead_time_s is not None:
