@@ -118,7 +118,7 @@ def zero():
         lambda: [Compose([budget()]), Compose([zero()])],
         lambda: [torch.nn.Sequential(budget(), torch.nn.Identity()), zero()],
         lambda: [budget(ambient_rate_hz=0.0, dark_count_rate_hz=torch.eye(2)), zero()],
-        lambda: [budget(), SynchronousSPAD(10), DetectionJitter(response(), AXIS, boundary="zero")],
+        lambda: [budget(), SynchronousSPAD(1000), DetectionJitter(response(), AXIS, boundary="zero")],
         lambda: [budget(), SweepJitter(400 * PS, AXIS, boundary="zero")],
         lambda: [budget(), StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")],
         lambda: [budget(), TDC(torch.ones(64), boundary="zero")],
@@ -136,7 +136,7 @@ def test_constant_light_in_front_of_a_closed_window_is_refused(stages):
         lambda: [budget(ambient_rate_hz=0.0), zero()],
         lambda: [budget(quantum_efficiency=0.0), zero()],
         lambda: [budget(), ImpulseResponse(response(), AXIS, boundary="periodic")],
-        lambda: [budget(), SynchronousSPAD(10), DetectionJitter(response(), AXIS), TDC(torch.ones(64))],
+        lambda: [budget(), SynchronousSPAD(1000), DetectionJitter(response(), AXIS), TDC(torch.ones(64))],
     ],
 )
 def test_orders_that_are_right(stages):
@@ -146,11 +146,11 @@ def test_orders_that_are_right(stages):
 
 def test_gates_that_leave_the_window_see_less_ambient_light():
     """Half a gate before the first bin: an image at half the ambient light, which no scene has."""
-    inside = GatedIntegration([600 * PS, 1200 * PS], 1e-9, AXIS, rise_s=100 * PS)
+    inside = GatedIntegration([600 * PS, 1200 * PS], 1e-9, AXIS, rise_s=100 * PS, electrons_per_unit=1000)
     x = torch.zeros(1, 64, 1, 1, dtype=torch.float64)
     assert flatness(Compose([budget(), inside]).expected(x)) < 1e-6
     for delay in (-500 * PS, 2.9e-9, 0.0):
-        leaving = GatedIntegration([600 * PS, delay], 1e-9, AXIS, rise_s=100 * PS)
+        leaving = GatedIntegration([600 * PS, delay], 1e-9, AXIS, rise_s=100 * PS, electrons_per_unit=1000)
         with pytest.raises(UnitError, match=r"gates inside the window.*gate 1"):
             Compose([budget(), leaving])
         assert Compose([budget(ambient_rate_hz=0.0), leaving]).expected(x).shape == (1, 2, 1, 1)
