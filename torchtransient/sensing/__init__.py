@@ -1,9 +1,13 @@
 """After the light: detectors, noise and calibration as differentiable torch modules. Torch only, never Mitsuba."""
 
+from torchtransient.sensing.afterpulse_delays import AfterpulseDelays as AfterpulseDelays
+from torchtransient.sensing.afterpulse_delays import MeasuredDelays as MeasuredDelays
+from torchtransient.sensing.afterpulse_delays import PowerLawDelays as PowerLawDelays
 from torchtransient.sensing.afterpulsing import Afterpulsing as Afterpulsing
 from torchtransient.sensing.afterpulsing import add_afterpulses as add_afterpulses
 from torchtransient.sensing.afterpulsing import afterpulse_kernel as afterpulse_kernel
 from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rates
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD as AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.compose import Compose as Compose
@@ -11,6 +15,10 @@ from torchtransient.sensing.compressed_histograms import CodedHistogram as Coded
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
 from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
 from torchtransient.sensing.compressed_histograms import fourier_codes as fourier_codes
+from torchtransient.sensing.cramer_rao import CramerRaoBound as CramerRaoBound
+from torchtransient.sensing.cramer_rao import covariance_bound as covariance_bound
+from torchtransient.sensing.cramer_rao import crlb as crlb
+from torchtransient.sensing.cramer_rao import return_rates as return_rates
 from torchtransient.sensing.crosstalk import Crosstalk as Crosstalk
 from torchtransient.sensing.crosstalk import add_crosstalk as add_crosstalk
 from torchtransient.sensing.depth import Returns as Returns
@@ -78,8 +86,12 @@ from torchtransient.sensing.linear_part import linearity_error as linearity_erro
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
+from torchtransient.sensing.photon_budget import ambient_photon_rate as ambient_photon_rate
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
+from torchtransient.sensing.pixel_skew import DetectionSkew as DetectionSkew
+from torchtransient.sensing.pixel_skew import PixelSkew as PixelSkew
+from torchtransient.sensing.pixel_skew import shift_time as shift_time
 from torchtransient.sensing.polarization import Analysers as Analysers
 from torchtransient.sensing.polarization import PolarizationMosaic as PolarizationMosaic
 from torchtransient.sensing.polarization import analyse as analyse
