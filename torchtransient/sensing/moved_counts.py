@@ -7,11 +7,13 @@ entries that reach them; the others part in halves of nearly equal weight, which
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchtransient.errors import UnitError
 from torchtransient.sensing.added_counts import is_whole
 from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces
 from torchtransient.sensing.layout import TIME, check_transient
@@ -89,6 +91,8 @@ def move_counts(
     """
     given = counts.detach()
     bins, shape = given.shape[TIME], given.shape
+    if given.numel() == 0:
+        return given.clone(), given.new_zeros(moves.shares.shape[0], *shape[:TIME], *shape[-2:]) if tally else None
     data = given.reshape(-1, bins, shape[-2] * shape[-1])
     tallies: Tensor | None = None
     if tally:
@@ -127,8 +131,7 @@ class _Tree:
         self.total = torch.zeros_like(data)
 
     def run(self, generator: torch.Generator | None) -> Tensor:
-        if self.data.numel():
-            self._node(list(range(len(self.weights))), None, self.data, generator)
+        self._node(list(range(len(self.weights))), None, self.data, generator)
         return self.total
 
     def _node(self, lags: list[int], place: Tensor | None, counts: Tensor, generator: torch.Generator | None) -> None:
@@ -219,9 +222,10 @@ class _Tree:
 class MovedCounts(RandomSensor):
     """A sensor that moves detections in time. All four policies.
 
-    Whole counts move one by one. What is not whole, the means of another stage, stays a mean under every policy but
-    "gaussian", which takes its input for a normal surrogate of counts. Under "score" the probabilities are those of
-    the moves; the counts given pass with the gradient of the mean, as under "straight_through".
+    Whole counts move one by one; draws refuse NaN and infinity with UnitError. What is not whole, the means of another
+    stage, stays a mean under every policy but "gaussian", which takes its input for a normal surrogate of counts.
+    Under "score" the probabilities are those of the moves; the counts given pass with the gradient of the mean, as
+    under "straight_through".
     """
 
     def moves(self, x: Tensor) -> Moves:
@@ -238,9 +242,12 @@ class MovedCounts(RandomSensor):
     def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
         given = check_transient(x, type(self).__name__).detach()
         counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+        highest = float(counts.abs().amax()) if counts.numel() else 0.0
+        if not math.isfinite(highest):
+            raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
         if not is_whole(counts):
             return self.expected(given), None
-        if counts.dtype == torch.float32 and counts.numel() and float(counts.amax()) > WHOLE_FLOAT32 / 2:
+        if counts.dtype == torch.float32 and highest > WHOLE_FLOAT32 / 2:
             counts = counts.double()
         moved, tallies = move_counts(counts, self.moves(x), generator, tally=tally)
         return moved.to(x.dtype), tallies
