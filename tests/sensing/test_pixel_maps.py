@@ -164,8 +164,8 @@ def test_a_delay_is_found_by_its_gradient():
     x = torch.exp(-0.5 * ((k - 12) / 2.5) ** 2)
     wanted = shift_time(x, 3.37)
     sensor = PixelSkew(torch.full((1, 1), 240e-12), AXIS, learnable=True)
-    optimizer = torch.optim.Adam(sensor.parameters(), lr=5.0)
-    for _ in range(150):
+    optimizer = torch.optim.Adam(sensor.parameters(), lr=6.0)
+    for _ in range(110):
         optimizer.zero_grad()
         (sensor(x) - wanted).square().sum().backward()
         optimizer.step()

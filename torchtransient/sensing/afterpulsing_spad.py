@@ -12,14 +12,14 @@ from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.policies import GradPolicy
-from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.time_convolution import filter_rows
+from torchtransient.sensing.wrapped_detector import WrappedDetector
 
 _LEFT = 1e-7  # of the afterpulses, where generations end
 
 
-class AfterpulsingSPAD(Sensor):
+class AfterpulsingSPAD(WrappedDetector):
     """A `SynchronousSPAD` or `FreeRunningSPAD` with afterpulses: rates (..., C, T, H, W) in, counts out.
 
     Carriers that are set free act on the detector as photons do: they fire it when it is armed and are lost when it is
@@ -37,6 +37,8 @@ class AfterpulsingSPAD(Sensor):
     histogram vary as photons do.
     """
 
+    detector: SynchronousSPAD | FreeRunningSPAD
+
     def __init__(
         self,
         detector: SynchronousSPAD | FreeRunningSPAD,
@@ -44,7 +46,6 @@ class AfterpulsingSPAD(Sensor):
         *,
         grad: GradPolicy | None = None,
     ) -> None:
-        super().__init__()
         where = "AfterpulsingSPAD"
         if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD)):
             raise UnitError(f"{where}: expected detector to be a SynchronousSPAD or FreeRunningSPAD, got {detector!r}.")
@@ -56,9 +57,8 @@ class AfterpulsingSPAD(Sensor):
                 f"{where}: expected the detector's dead time of {float(own):g} s in afterpulsing, got "
                 f"{afterpulsing.dead_time_s:g} s. One detector has one dead time."
             )
-        self.detector, self.afterpulsing = detector, afterpulsing
-        if grad is not None:
-            detector.grad = grad
+        super().__init__(detector, grad)
+        self.afterpulsing = afterpulsing
 
     def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
         """In the frequencies of a period, and of two windows for what has to be left out; the period in bins."""
@@ -95,19 +95,6 @@ class AfterpulsingSPAD(Sensor):
             free = self._released(self.detector.probabilities(x + free), transfers).to(x.dtype)
         return free
 
-    def expected(self, x: Tensor) -> Tensor:
-        return self.detector.expected(x + self.released(x))
-
-    def variance(self, x: Tensor) -> Tensor:
-        """That of the detector at the rate of photons and carriers."""
-        return self.detector.variance(x + self.released(x))
-
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """One draw, without gradient."""
-        with torch.no_grad():
-            return self.detector.sample(x + self.released(x), generator)
-
-    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The measurement under the policy of the detector."""
-        result: Tensor = self.detector(x + self.released(x), generator=generator)
-        return result
+    def rate(self, x: Tensor) -> Tensor:
+        """Photons and carriers set free."""
+        return x + self.released(x)

@@ -29,6 +29,7 @@ from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDel
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
+from torchtransient.sensing.coincidence import CoincidencePixel
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
 from torchtransient.sensing.crosstalk import Crosstalk
@@ -46,6 +47,7 @@ from torchtransient.sensing.impulse_response import (
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
 from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
+from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
@@ -77,7 +79,8 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, TapDifference,
             TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
-            AfterpulsingSPAD, DetectionSkew, MeasuredDelays, PixelSkew, PowerLawDelays,
+            AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelSkew, PowerLawDelays,
+            ZoneSum,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,
