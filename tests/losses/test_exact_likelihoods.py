@@ -13,6 +13,7 @@ from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD
 
 BINS = 64
+EACH = {"reduction": "none"}
 SINGLE = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
 
@@ -73,6 +74,10 @@ def test_background_under_a_bright_peak(dtype):
     error = found.mean(0) - torch.tensor(truth, dtype=torch.float64)
     assert bool((error.abs() < 4 * bound / items**0.5).all()), error / bound * items**0.5
     assert bool((found.std(0) < 1.05 * bound).all()), found.std(0) / bound
+    # what docs/losses.md says of a floor of 1e-3 of the mean bin
+    floor = 1e-3 * float(mean.mean())
+    biased = fitted(lambda p: losses.poisson_nll(model(p), counts, floor=floor, reduction="none"), start).double()
+    assert float(biased[:, 1].mean()) / truth[1] - 1 == pytest.approx(-0.16, abs=0.01)
 
 
 @SINGLE
@@ -97,6 +102,10 @@ def test_background_behind_a_strong_return_of_first_photons(photons, dtype):
     bound = float((armed / torch.expm1(rate)).sum()) ** -0.5
     assert abs(float(found.mean()) - weak) < 4 * bound / items**0.5
     assert float(found.std()) < 1.06 * bound
+    if photons == 20:
+        floor = 1e-3 * float(rate.mean())
+        biased = fitted(lambda p: losses.first_photon_nll(model(p), counts, cycles, floor=floor, **EACH), start)
+        assert float(biased.double().mean()) / weak - 1 == pytest.approx(-0.31, abs=0.01)
 
 
 @SINGLE
@@ -136,7 +145,6 @@ def test_a_background_of_few_counts_in_a_large_image(dtype):
         assert abs(float(slope)) < 1e-4 * n * unit
 
 
-EACH = {"reduction": "none"}
 LOSSES = {
     "poisson": (lambda m, n: losses.poisson_nll(m, n, **EACH), 1),
     "first photon": (lambda m, n: losses.first_photon_nll(m, n, 1000, **EACH), 1000),

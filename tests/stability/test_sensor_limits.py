@@ -94,8 +94,8 @@ def test_half_precision_is_drawn_in_single(dtype):
         sensing.BinaryFrames(100, grad="straight_through"),
     ):
         y = module(rate, generator=g)
-        assert y.dtype == dtype
-        assert bool(torch.isfinite(y).all()) and float(y.float().sum()) > 0
+        assert y.dtype == torch.float32
+        assert bool(torch.isfinite(y).all()) and float(y.sum()) > 0
 
 
 # --- pile-up -----------------------------------------------------------------------------------------------------

@@ -16,6 +16,10 @@ from torchtransient.sensing.compressed_histograms import CodedHistogram as Coded
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
 from torchtransient.sensing.compressed_histograms import equi_depth_edges as equi_depth_edges
 from torchtransient.sensing.compressed_histograms import fourier_codes as fourier_codes
+from torchtransient.sensing.cramer_rao import CramerRaoBound as CramerRaoBound
+from torchtransient.sensing.cramer_rao import covariance_bound as covariance_bound
+from torchtransient.sensing.cramer_rao import crlb as crlb
+from torchtransient.sensing.cramer_rao import return_rates as return_rates
 from torchtransient.sensing.crosstalk import Crosstalk as Crosstalk
 from torchtransient.sensing.crosstalk import add_crosstalk as add_crosstalk
 from torchtransient.sensing.depth import Returns as Returns

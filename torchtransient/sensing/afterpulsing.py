@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
 from torchtransient.sensing.draws import by_pieces
@@ -36,6 +37,7 @@ def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: fl
     return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
 
 
+@in_single
 def add_afterpulses(
     counts: Tensor,
     probability: Tensor | float,
@@ -117,9 +119,13 @@ class Afterpulsing(AddedCounts):
         check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
+        self.period_s: float | None = None
         self.period_bins: int | None = None
+        self.window_is_period = period_s is None
         if period_s is not None:
-            self.period_bins = round(check_seconds(period_s, "period_s", where, open_low=True) / self.bin_width_s)
+            self.period_s = check_seconds(period_s, "period_s", where, open_low=True, high=1.0)
+            self.period_bins = round(self.period_s / self.bin_width_s)
             _check_period(self.period_bins, 1)
         self.delays, self.counted_from = delays, counted_from
         self._keep(probability, [] if tau_s is None else tau_s, learnable)
@@ -188,6 +194,7 @@ class Afterpulsing(AddedCounts):
         tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
         return self._seen() @ exponential_shares(tau, dead, 0, bins)
 
+    @in_single
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
         return add_afterpulses(x, 1.0, self.kernel(self._period_bins(x)), only_added=True)

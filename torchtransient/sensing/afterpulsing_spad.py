@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
@@ -38,6 +39,7 @@ class AfterpulsingSPAD(WrappedDetector):
     """
 
     detector: SynchronousSPAD | FreeRunningSPAD
+    takes, gives = ("rate",), "counts"
 
     def __init__(
         self,
@@ -86,6 +88,7 @@ class AfterpulsingSPAD(WrappedDetector):
             free = (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
         return free.movedim(-1, TIME)
 
+    @in_single
     def released(self, x: Tensor) -> Tensor:
         """Rate of carriers set free, per cycle and bin, in the shape and dtype of `x`; they fire an armed detector."""
         transfers = self._transfers(x)
@@ -95,6 +98,7 @@ class AfterpulsingSPAD(WrappedDetector):
             free = self._released(self.detector.probabilities(x + free), transfers).to(x.dtype)
         return free
 
+    @in_single
     def rate(self, x: Tensor) -> Tensor:
         """Photons and carriers set free."""
         return x + self.released(x)

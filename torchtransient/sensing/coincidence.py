@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running import FreeRunningSPAD
@@ -90,6 +91,8 @@ class CoincidencePixel(RandomSensor):
     a window longer than the dead time, and light that has more than one coincidence per cycle in a bin.
     """
 
+    takes, gives = ("rate",), "counts"
+
     def __init__(
         self,
         detector: SynchronousSPAD | FreeRunningSPAD | AfterpulsingSPAD,
@@ -111,6 +114,7 @@ class CoincidencePixel(RandomSensor):
         if self.coincidence > sum(number for _, number in self.groups):
             raise UnitError(f"{where}: expected a coincidence of at most {spads} SPADs with light, got {coincidence}.")
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
         inner = detector.detector if isinstance(detector, AfterpulsingSPAD) else detector
         self.periodic = isinstance(inner, FreeRunningSPAD)
@@ -126,6 +130,7 @@ class CoincidencePixel(RandomSensor):
         """Laser cycles of an exposure."""
         return cycles_of(self.detector)
 
+    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected coincidences per cycle and bin."""
         check_transient(x, "CoincidencePixel")
@@ -134,8 +139,7 @@ class CoincidencePixel(RandomSensor):
             raise UnitError(
                 f"CoincidencePixel: expected window_s within the {bins} bins of the light, got {window:g} bins."
             )
-        work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-        parts = [self._one(work * share, number) for share, number in self.groups]
+        parts = [self._one(x * share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
         # the rear edge of the window passes a border of bins when its front edge has gone `window` - `whole` into one

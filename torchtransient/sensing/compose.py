@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.agreement import check_axis as check_axis
+from torchtransient.sensing.agreement import check_stages, check_window
 from torchtransient.sensing.itof import ItofCorrelation
-from torchtransient.sensing.layout import not_a_transient
+from torchtransient.sensing.layout import TIME, not_a_transient
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
-
-# Two axes are the same when their bins agree to a millionth of a bin over the whole length.
-_SAME_BIN = 1e-6
 
 
 class Compose(Sensor):
@@ -29,7 +28,9 @@ class Compose(Sensor):
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
     order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
-    results. Raises ShapeError for no stage or something that is no module, UnitError for axes that disagree.
+    results. Raises ShapeError for no stage or something that is no module, UnitError where one stage is not made for
+    what those before it give: other bins, another number of cycles, another laser period, or another quantity, as
+    the rates of one cycle where the counts of all are meant (see `agreement`).
     """
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
@@ -40,6 +41,7 @@ class Compose(Sensor):
         if not len(stages) or wrong:
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
         self.stages = nn.ModuleList(stages)
+        check_stages(self)
         if grad is not None:
             self.set_grad(grad)
 
@@ -77,6 +79,8 @@ class Compose(Sensor):
         else:
             y, used = self._opened(x)
             stages = stages[used:]
+        if y.ndim >= 4:
+            check_window(self, y.shape[TIME])
         for stage in stages:
             y = step(stage, y)
         return y
@@ -114,24 +118,3 @@ class Compose(Sensor):
         if not isinstance(axis, TimeAxis):
             raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
         check_axis(self, axis)
-
-
-def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
-    """UnitError when a sensor, or one that is part of it, was made for other bins than those of ``axis``."""
-    for name, module in sensor.named_modules():
-        if not isinstance(module, Sensor):
-            continue  # a measured response has bins of its own
-        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
-        if isinstance(own, TimeAxis):
-            slack = _SAME_BIN * axis.bin_width_opl
-            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
-            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
-        elif isinstance(width_s, float):
-            own, same = width_s, abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
-        else:
-            continue
-        if not same:
-            raise UnitError(
-                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {own}), got {axis}. Make "
-                "the sensor with the renderer's axis."
-            )

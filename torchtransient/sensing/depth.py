@@ -18,11 +18,13 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import TIME, check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
 
 
+@in_single
 def log_matched_filter(
     histogram: Tensor,
     kernel: Tensor,
@@ -53,6 +55,7 @@ def log_matched_filter(
     return convolve_time(histogram, weights.flip(0), -(first + kernel.numel() - 1), boundary=boundary)
 
 
+@in_single
 def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     """Position of the largest entry, (..., C, H, W); with ``refine`` the top of the parabola through it and its
     neighbours, within half a bin of it.
@@ -82,6 +85,7 @@ def _parabola(scores: Tensor, index: Tensor) -> Tensor:
     return torch.where(usable, offset, 0.0).clamp(-0.5, 0.5)
 
 
+@in_single
 def centre_of_mass(
     histogram: Tensor, *, background: Tensor | float = 0.0, half_width_bins: int | None = None
 ) -> Tensor:
@@ -127,6 +131,7 @@ def centre_of_mass(
     return torch.minimum(torch.maximum(position, first), last).squeeze(TIME).to(dtype)
 
 
+@in_single
 def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     """``sum_k softmax(scores / temperature)_k (k + 1/2)``, (..., C, H, W): a smooth stand-in for the largest entry.
 
@@ -153,6 +158,7 @@ class Returns(TensorRecord):
     valid: Tensor
 
 
+@in_single
 def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     """Where a histogram first reaches the threshold: `Returns` with R = 1.
 
@@ -176,6 +182,7 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     return Returns(torch.where(valid, position, 0.0), torch.where(valid, here, 0.0), valid)
 
 
+@in_single
 def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_separation_bins: int = 1) -> Returns:
     """Up to ``max_returns`` (R) local maxima of at least ``threshold``, the strongest ones, in order of time.
 
@@ -218,6 +225,7 @@ def background_per_bin(histogram: Tensor) -> Tensor:
     return check_transient(histogram, "background_per_bin").detach().median(TIME).values
 
 
+@in_single
 def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     """Metres one way for positions in bins: half the optical path ``start_opl + position bin_width_opl``.
 
@@ -228,6 +236,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
+@in_single
 def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     """Points (..., H, W, 3) in the frame of the camera for distances (..., H, W) along the rays of its pixels, metres.
 
@@ -252,6 +261,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     return points.reshape(*distance_m.shape, 3)
 
 
+@in_single
 def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     """Cramer-Rao bound of the distance from one normal pulse without background: ``c sigma / (2 sqrt(N))`` in metres.
 
@@ -264,7 +274,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     if not isinstance(detections, Tensor) or bool((detections.detach() < 0).any()):
         got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
         raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
-    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1.0)
+    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
 
 

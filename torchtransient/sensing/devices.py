@@ -2,7 +2,9 @@
 
 A stage is a dictionary with a ``kind`` (a name in `KINDS`) and the arguments of that class or function; arguments may
 be stages themselves (a response, a code). The strings ``"@axis"`` and ``"@num_bins"`` stand for the axis that the
-sensor is built for. Only kinds in the list are ever called, so that a file from elsewhere runs no code of its own.
+sensor is built for, ``"@cycles"`` and ``"@period_s"`` for the laser cycles and the laser period of the chain's
+`PhotonBudget`, so that one change reaches all stages that have to agree. Only kinds in the list are ever called, so
+that a file from elsewhere runs no code of its own.
 
     device = tt.sensing.device("kinect_v2_like")
     sensor = device.sensor(axis, grad="gaussian")          # a Compose, behind a TransientRenderer with that axis
@@ -47,6 +49,7 @@ from torchtransient.sensing.impulse_response import (
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
 from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
+from torchtransient.sensing.layout import check_number
 from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
@@ -128,7 +131,8 @@ class Device:
         """The chain of modules for transients on ``axis`` (by default `axis()`, from t = 0), under one policy."""
         if axis is None and self.bin_width_s is not None:
             axis = self.axis()
-        stages = [build_stage(s, axis) for s in self.stages]
+        budget = next((s for s in self.stages if s["kind"] == "PhotonBudget"), None)
+        stages = [build_stage(s, axis, budget) for s in self.stages]
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if wrong:
             raise StorageError(f"Device '{self.name}': expected stages that are modules, got {', '.join(wrong)}.")
@@ -203,24 +207,21 @@ class Device:
             raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
 
 
-def build_stage(spec: Any, axis: TimeAxis | None = None) -> Any:
+def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, Any] | None = None) -> Any:
     """The object that a stage stands for: a sensor, response, code, or the value itself where it is no dictionary.
 
-    Raises StorageError for an unknown kind, an argument that the kind does not take, or a placeholder without axis;
-    errors of the values themselves (UnitError, ShapeError) pass.
+    ``budget``: the stage of the `PhotonBudget` that ``"@cycles"`` and ``"@period_s"`` refer to. Raises StorageError for
+    an unknown kind, an argument that the kind does not take, or a placeholder for what is not there; errors of the
+    values themselves (UnitError, ShapeError) pass.
     """
     if isinstance(spec, str) and spec.startswith("@"):
-        if spec not in ("@axis", "@num_bins"):
-            raise StorageError(f"build_stage: expected '@axis' or '@num_bins', got {spec!r}.")
-        if axis is None:
-            raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
-        return axis if spec == "@axis" else axis.num_bins
+        return _placeholder(spec, axis, budget)
     if isinstance(spec, (list, tuple)):
-        return [build_stage(s, axis) for s in spec]
+        return [build_stage(s, axis, budget) for s in spec]
     if not isinstance(spec, dict) or "kind" not in spec:
         return spec
     _check_spec(spec, "build_stage")
-    arguments = {k: build_stage(v, axis) for k, v in spec.items() if k != "kind"}
+    arguments = {k: build_stage(v, axis, budget) for k, v in spec.items() if k != "kind"}
     try:
         return KINDS[spec["kind"]](**arguments)
     except TorchTransientError:
@@ -229,6 +230,22 @@ def build_stage(spec: Any, axis: TimeAxis | None = None) -> Any:
         raise StorageError(
             f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
         ) from error
+
+
+def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Any:
+    if name in ("@axis", "@num_bins"):
+        if axis is None:
+            raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
+        return axis if name == "@axis" else axis.num_bins
+    if name not in ("@cycles", "@period_s"):
+        raise StorageError(f"build_stage: expected '@axis', '@num_bins', '@cycles' or '@period_s', got {name!r}.")
+    if budget is None:
+        raise StorageError(f"build_stage: expected a PhotonBudget in the chain for {name!r}. Give the number itself.")
+    rate_hz = check_number(budget.get("repetition_rate_hz", 0.0), "repetition_rate_hz", "PhotonBudget", open_low=True)
+    if name == "@period_s":
+        return 1 / rate_hz
+    exposure_s = budget.get("exposure_s")
+    return budget.get("cycles") if exposure_s is None else round(exposure_s * rate_hz)
 
 
 def _check_spec(spec: Any, where: str) -> None:

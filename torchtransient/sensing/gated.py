@@ -71,6 +71,8 @@ class GatedIntegration(Sensor):
     and read noise follow in `PixelElectronics`.
     """
 
+    takes, gives = ("electrons", "counts"), "electrons"
+
     delay_ps: Tensor
     log_width_s: Tensor
 
@@ -88,12 +90,13 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
-        delays = [check_number(d, "delays_s", me, low=-1.0, high=1.0) for d in delays_s]
+        delays = [check_seconds(d, "delays_s", me, signed=True) for d in delays_s]
         given = list(widths_s) if isinstance(widths_s, Sequence) else [widths_s] * len(delays)
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]
         if not delays or len(widths) != len(delays):
             raise ShapeError(f"{me}: expected one width or one per delay, got {len(delays)} and {len(widths)}.")
         self.axis = check_time_axis(axis, me)
+        self.num_bins = self.axis.num_bins
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
         window_s = axis.num_bins * axis.bin_width_s

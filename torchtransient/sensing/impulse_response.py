@@ -44,7 +44,7 @@ class Response(PhysicalModule):
     def __init__(self, delay_s: float, learnable: bool) -> None:
         super().__init__()
         self.learnable = bool(learnable)
-        delay = check_number(delay_s, "delay_s", type(self).__name__, low=-1.0, high=1.0)
+        delay = check_seconds(delay_s, "delay_s", type(self).__name__, signed=True)
         self._hold("delay_ps", torch.tensor(delay * 1e12, dtype=torch.float64))
 
     def _hold(self, name: str, value: Tensor) -> None:
@@ -352,6 +352,8 @@ class ImpulseResponse(Sensor):
     but this one belongs before detection: jitter of the detector, applied to rates, is exact only far from pile-up.
     """
 
+    gives = "the same"
+
     def __init__(
         self,
         response: Response,
@@ -371,6 +373,7 @@ class ImpulseResponse(Sensor):
             )
         self.response = response
         self.bin_width_s = bin_width_of(axis, bin_width_s, "ImpulseResponse")
+        self.num_bins = None if axis is None else axis.num_bins
         self.boundary: Boundary = boundary
         self.method: Method = method
 

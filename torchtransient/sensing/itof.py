@@ -27,6 +27,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.quantities import real_array
 from torchtransient.sensing.itof_codes import CorrelationCode
 from torchtransient.sensing.itof_pixels import ItofCalibration, in_direction
@@ -120,6 +121,7 @@ def check_code(code: object, where: str) -> CorrelationCode:
     return code
 
 
+@in_single
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
 
@@ -241,6 +243,8 @@ class ItofCorrelation(Sensor):
     other pixels than those of the map.
     """
 
+    takes, gives = ("electrons", "counts"), "electrons"
+
     weights: Tensor
     phases_rad: Tensor | None
 
@@ -276,6 +280,7 @@ class ItofCorrelation(Sensor):
             weights = torch.zeros(0, axis.num_bins, dtype=torch.float64)
         self.register_buffer("weights", weights)
         self.register_buffer("phases_rad", phases if mapped else None)
+        self.num_bins = axis.num_bins
 
     def expected(self, x: Tensor) -> Tensor:
         # Scaled on the small side: taps are fewer than bins.

@@ -91,7 +91,7 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
     """(..., C, F, N, taps of a pixel, H, W)."""
     if readout not in get_args(Readout):
         raise UnitError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
-    frames = _frames(taps, where)
+    frames = _precise(as_frames(taps, where), where)
     each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
     count = check_count(num_taps, "num_taps", where)
     known = count >= least and frames.ndim >= 4 and frames.shape[-3] > 0 and frames.shape[-3] % (count * each) == 0
@@ -105,12 +105,16 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
     return frames.reshape(*frames.shape[:-3], frequencies, count, each, *frames.shape[-2:])
 
 
-def _frames(taps: Frames, where: str) -> Tensor:
-    """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
+def as_frames(taps: Frames, where: str) -> Tensor:
+    """A tensor as it is, an array as one. UnitError for what holds no numbers."""
     try:
-        frames = taps if isinstance(taps, Tensor) else torch.from_numpy(np.ascontiguousarray(taps))
+        return taps if isinstance(taps, Tensor) else torch.from_numpy(np.ascontiguousarray(taps))
     except TypeError as error:
         raise UnitError(f"{where}: expected frames as a tensor or an array of numbers, got {shown(taps)}.") from error
+
+
+def _precise(frames: Tensor, where: str) -> Tensor:
+    """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
     if frames.is_complex() or frames.dtype == torch.bool:
         raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
     if not frames.is_floating_point():
@@ -127,7 +131,8 @@ def phase_of(phasor: Tensor) -> Tensor:
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
     scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
-    wrapped = angle + torch.where(angle.detach() < 0, _TURN, 0.0)
+    # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
+    wrapped = angle + _TURN * (angle.detach() < 0).to(angle)
     # The sum of a tiny negative angle and a turn rounds to the turn itself.
     return torch.where(wrapped.detach() >= _TURN, wrapped - _TURN, wrapped)
 

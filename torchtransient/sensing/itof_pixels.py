@@ -114,6 +114,8 @@ class TapDifference(Sensor):
     number of taps.
     """
 
+    gives = "the same"
+
     def expected(self, x: Tensor) -> Tensor:
         check_transient(x, "TapDifference")
         if x.shape[-3] % 2:

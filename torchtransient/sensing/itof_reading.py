@@ -29,6 +29,7 @@ from torchtransient.sensing.itof_depth import (
     Frames,
     Readout,
     amplitude_of,
+    as_frames,
     depth_of_phase,
     offset_of,
     phase_of,
@@ -205,6 +206,7 @@ def read_itof(
     """
     me = "read_itof"
     values = check_frequencies(frequencies_hz, me)
+    taps = as_frames(taps, me)
     steps = steps_of(taps, num_taps, readout, me)
     if steps.shape[-4] != len(values):
         raise ShapeError(
@@ -258,10 +260,10 @@ def _slopes(phasor: Tensor, num_taps: int) -> Tensor:
 
 
 def _depth_std(
-    taps: Frames, steps: Tensor, slopes: Tensor, values: tuple[float, ...], readout: str, noise: ItofNoise | None
+    taps: Tensor, steps: Tensor, slopes: Tensor, values: tuple[float, ...], readout: str, noise: ItofNoise | None
 ) -> Tensor | None:
     """(..., C, H, W) metres, or None where the noise cannot be known."""
-    if noise is None and not (torch.is_floating_point(taps) if isinstance(taps, Tensor) else taps.dtype.kind == "f"):
+    if noise is None and not taps.is_floating_point():
         return None  # nobody said how many electrons a number of the converter is
     known = noise or ItofNoise()
     gain = known.electrons_per_unit

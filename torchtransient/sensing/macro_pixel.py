@@ -59,6 +59,8 @@ class MacroPixel(WrappedDetector):
     another number of weights, UnitError for weights below 0.
     """
 
+    takes, gives = ("rate",), "counts"
+
     def __init__(
         self,
         detector: SynchronousSPAD | FreeRunningSPAD | AfterpulsingSPAD,
@@ -125,6 +127,8 @@ class ZoneSum(Sensor):
     Behind detectors, crosstalk and the like, where every SPAD is a pixel of the render. Linear. Raises ShapeError for
     an image that is not made of whole zones.
     """
+
+    gives = "the same"
 
     def __init__(self, rows: int, columns: int) -> None:
         super().__init__()

@@ -10,19 +10,24 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
 from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
+_DARKEST = 1e3  # f-number of a pinhole; millimetres over metres are a thousand times those of lenses
+_MOST_WATTS = 1e3  # on average, of a laser; nanojoules taken for joules are megawatts
+_LONGEST_S = 3600.0  # exposure of one histogram; megahertz taken for hertz make a million of it
+
 PLANCK_J_S = 6.626_070_15e-34  # exact by the definition of the kilogram (SI)
 
 
 def photon_energy_j(wavelength_m: float) -> float:
-    """Energy of one photon in joules: h c / wavelength. `wavelength_m` of 1 m or more (nanometres?) is refused."""
+    """Energy of one photon in joules: h c / wavelength. Refuses wavelengths that are none of light: 10 nm to 1 mm."""
     wavelength = check_number(wavelength_m, "wavelength_m", "photon_energy_j", open_low=True)
-    if wavelength >= 1e-2:
+    if not 1e-8 <= wavelength < 1e-3:
         raise UnitError(f"photon_energy_j: expected wavelength_m in metres, got {wavelength!r}. 532 nm is 532e-9.")
     return PLANCK_J_S * SPEED_OF_LIGHT / wavelength
 
@@ -45,7 +50,7 @@ class Optics:
         if (self.f_number is None) == (self.solid_angle_sr is None):
             raise UnitError("Optics: expected either f_number or solid_angle_sr, got both or neither.")
         if self.f_number is not None:
-            check_number(self.f_number, "f_number", "Optics", open_low=True)
+            check_number(self.f_number, "f_number", "Optics", low=0.1, high=_DARKEST)
         if self.solid_angle_sr is not None:
             check_number(self.solid_angle_sr, "solid_angle_sr", "Optics", high=2 * math.pi, open_low=True)
         # a pixel larger than 1 cm^2 is most likely given in square micrometres
@@ -59,6 +64,11 @@ class Optics:
         """The optics of a lens of this focal length and aperture."""
         focal = check_number(focal_length_m, "focal_length_m", "Optics", open_low=True)
         diameter = check_number(aperture_diameter_m, "aperture_diameter_m", "Optics", open_low=True)
+        if not 0.1 <= focal / diameter <= _DARKEST:
+            raise UnitError(
+                f"Optics: expected focal_length_m and aperture_diameter_m in one unit, metres, got {focal!r} and "
+                f"{diameter!r}, which is f/{focal / diameter:g}. 25 mm are 25e-3."
+            )
         return cls(focal / diameter, pixel_area_m2, transmission)
 
     @property
@@ -155,10 +165,13 @@ class PhotonBudget(Sensor):
     numbers or maps, (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other
     maps are buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`).
 
-    Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period,
-    ShapeError for maps of other images. Not modelled: angle dependence of the filter, speckle; vignetting is a map of
-    the efficiency as far as it acts on ambient and laser light alike.
+    Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period, for
+    more than 1 kW on average, for exposures of more than an hour or of less than one cycle, ShapeError for maps of
+    other images. Not modelled: angle dependence of the filter, speckle; vignetting is a map of the efficiency as far as
+    it acts on ambient and laser light alike.
     """
+
+    takes, gives = ("radiance",), "rate"
 
     dark_count_rate_hz: Tensor
     ambient_rate_hz: float | Tensor
@@ -192,11 +205,31 @@ class PhotonBudget(Sensor):
         dark = check_map(dark_count_rate_hz, "dark_count_rate_hz", where)
         keep_map(self, "dark_count_rate_hz", dark if isinstance(dark, Tensor) else torch.tensor(dark).double())
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         if (cycles is None) == (exposure_s is None):
             raise UnitError(f"{where}: expected either cycles or exposure_s, got both or neither.")
         if exposure_s is not None:
-            cycles = max(1, round(check_number(exposure_s, "exposure_s", where) * self.repetition_rate_hz))
+            cycles = self._cycles_of(check_number(exposure_s, "exposure_s", where))
         self.cycles = check_count(cycles or 0, "cycles", where)
+        if self.exposure_s > _LONGEST_S:
+            raise UnitError(
+                f"{where}: expected an exposure of at most {_LONGEST_S:g} s, got {self.exposure_s:g} s: {self.cycles} "
+                f"cycles at {self.repetition_rate_hz:g} Hz. 10 MHz are 10e6 Hz, 5 ms are 5e-3 s."
+            )
+        if self.pulse_energy_j * self.repetition_rate_hz > _MOST_WATTS:
+            raise UnitError(
+                f"{where}: expected a laser of at most {_MOST_WATTS:g} W on average, got {self.pulse_energy_j!r} J at "
+                f"{self.repetition_rate_hz:g} Hz, {self.pulse_energy_j * self.repetition_rate_hz:g} W. 1 nJ is 1e-9 J."
+            )
+
+    def _cycles_of(self, exposure_s: float) -> int:
+        """Laser cycles of an exposure, rounded. UnitError for less than one."""
+        if exposure_s * self.repetition_rate_hz < 1 - 1e-6:
+            raise UnitError(
+                f"PhotonBudget: expected exposure_s of at least one laser period, {1 / self.repetition_rate_hz:g} s, "
+                f"got {exposure_s!r} s. Is repetition_rate_hz ({self.repetition_rate_hz:g}) in hertz? 10 MHz are 10e6."
+            )
+        return round(exposure_s * self.repetition_rate_hz)
 
     @property
     def exposure_s(self) -> float:
@@ -209,6 +242,7 @@ class PhotonBudget(Sensor):
         photons = self.pulse_energy_j * self.optics.etendue_m2_sr / self.photon_energy_j
         return photons * wide(self.quantum_efficiency)
 
+    @in_single
     def signal(self, x: Tensor) -> Tensor:
         """Expected detections of laser light per cycle and bin, without background."""
         check_transient(x, "PhotonBudget")
@@ -230,11 +264,13 @@ class PhotonBudget(Sensor):
         dark = over_time(self.dark_count_rate_hz.double(), x, "dark_count_rate_hz", where)
         return ambient, torch.as_tensor(dark)
 
+    @in_single
     def expected(self, x: Tensor) -> Tensor:
         signal = self.signal(x)
         ambient_hz, dark_hz = self._background_hz(x)
         return signal + ((ambient_hz + dark_hz) * self.bin_width_s).to(x.dtype)
 
+    @in_single
     def report(self, x: Tensor) -> BudgetReport:
         """Signal and background of every pixel, for a transient of radiance: maps where the budget has them."""
         signal = self.signal(x).sum(TIME)

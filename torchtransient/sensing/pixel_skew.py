@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError, UnitError
+from torchtransient.errors import GradientError
+from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import is_whole
-from torchtransient.sensing.layout import TIME, bin_width_of, check_transient
+from torchtransient.sensing.layout import TIME, bin_width_of, check_seconds, check_transient
 from torchtransient.sensing.pixel_maps import check_map, pixels_of
 from torchtransient.sensing.policies import GradPolicy, gaussian_noise
 from torchtransient.sensing.sensor import PhysicalModule, RandomSensor, Sensor
@@ -41,23 +42,22 @@ def _moved(x: Tensor, whole: Tensor, boundary: Boundary) -> Tensor:
     return moved if boundary == "periodic" else moved * inside.to(x.dtype)
 
 
+@in_single
 def shift_time(x: Tensor, delay_bins: Tensor | float, *, boundary: Boundary = "periodic") -> Tensor:
     """(..., C, T, H, W) later by `delay_bins`, a number or a map that broadcasts to (..., C, H, W); below 0 earlier.
 
     "periodic": the window is one laser period, sums are conserved and constant light stays constant. "zero": what
     leaves the window is lost and nothing comes in. Differentiable in `x` and in the delays (piecewise linear); dtype
-    and device of `x` are kept, half precision is computed in float32. Raises ShapeError for maps of other images.
+    and device of `x` are kept, half precision gives float32. Raises ShapeError for maps of other images.
     """
     check_transient(x, "shift_time")
     check_choice(boundary, Boundary, "boundary", "shift_time")
     pixels_of(delay_bins, x, "delay_bins", "shift_time")
-    work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
     if x.numel() == 0:
         return x
     whole, part = _whole_and_part(delay_bins, x)
-    part = part.to(work.dtype)
-    first = _moved(work, whole, boundary)
-    return (first + part * (_moved(work, whole + 1, boundary) - first)).to(x.dtype)
+    first = _moved(x, whole, boundary)
+    return first + part.to(x.dtype) * (_moved(x, whole + 1, boundary) - first)
 
 
 class _Delays(PhysicalModule):
@@ -69,8 +69,8 @@ class _Delays(PhysicalModule):
         super().__init__()
         given = check_map(delay_s, "delay_s", where, low=-1.0, high=1.0)
         delay = torch.as_tensor(given, dtype=torch.float64).detach()
-        if delay.numel() and float(delay.abs().max()) >= 1.0:
-            raise UnitError(f"{where}: expected delay_s in seconds, below 1 s. Picoseconds? 50 ps is 50e-12.")
+        if delay.numel():
+            check_seconds(float(delay.abs().max()), "delay_s", where)
         self.bin_width_s = bin_width_s
         if learnable:
             self.register_parameter("delay_ps", nn.Parameter(delay * 1e12))
@@ -90,8 +90,10 @@ class PixelSkew(Sensor):
     late by its electronics is a `DetectionSkew`, behind it. `delay_s`: a number or a map (H, W) or what broadcasts to
     (..., C, H, W), seconds, of either sign. `learnable`: `delays.delay_ps` is a parameter, in picoseconds.
 
-    Raises UnitError for a second or more (picoseconds?), ShapeError for maps of other images.
+    Raises UnitError for a millisecond or more (picoseconds?), ShapeError for maps of other images.
     """
+
+    gives = "the same"
 
     def __init__(
         self,
@@ -107,6 +109,7 @@ class PixelSkew(Sensor):
         check_choice(boundary, Boundary, "boundary", where)
         self.boundary: Boundary = boundary
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
 
     def expected(self, x: Tensor) -> Tensor:
@@ -126,6 +129,8 @@ class DetectionSkew(RandomSensor):
     which is a GradientError; "gaussian" has the covariance of the binomials.
     """
 
+    takes, gives = ("counts",), "counts"
+
     def __init__(
         self,
         delay_s: float | Tensor,
@@ -141,6 +146,7 @@ class DetectionSkew(RandomSensor):
         check_choice(boundary, Boundary, "boundary", where)
         self.boundary: Boundary = boundary
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
 
     def _delay_bins(self, x: Tensor) -> Tensor:
@@ -166,13 +172,11 @@ class DetectionSkew(RandomSensor):
         with torch.no_grad():
             delay = self._delay_bins(x)
             counts = x.detach()
-            work = counts.float() if x.dtype in (torch.float16, torch.bfloat16) else counts
-            if not is_whole(work):
+            if not is_whole(counts):
                 return self.expected(counts)
             whole, part = _whole_and_part(delay, x)
-            late = halve(work.contiguous(), part.to(work.dtype).expand(work.shape).contiguous(), generator)
-            moved = _moved(work - late, whole, self.boundary) + _moved(late, whole + 1, self.boundary)
-            return moved.to(x.dtype)
+            late = halve(counts.contiguous(), part.to(x.dtype).expand(x.shape).contiguous(), generator)
+            return _moved(counts - late, whole, self.boundary) + _moved(late, whole + 1, self.boundary)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         """Zero: draws from counts without gradient have none. Raises GradientError where they would have one."""

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import check_number, check_tensor, product, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
@@ -57,6 +58,7 @@ def circular_analysers(extinction_ratio: float = math.inf, transmission: float =
     return factor * torch.stack([right + share * left, left + share * right])
 
 
+@in_single
 @without_autocast
 def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
@@ -66,6 +68,7 @@ def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     return _by_rows(rows.to(stokes), stokes)
 
 
+@in_single
 @without_autocast
 def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     """Least-squares Stokes vectors (..., 4, C, T, H, W) of measurements (..., A, C, T, H, W) behind analysers (A, 4).
@@ -192,6 +195,7 @@ def mosaic_rows(
     return linear_analysers(flat, extinction_ratio, transmission).reshape(len(angles_deg), -1, 4)
 
 
+@in_single
 @without_autocast
 def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     """(..., P Q, C, T, H, W) from raw light (..., C, T, H, W): every pixel of a block spread over the others.

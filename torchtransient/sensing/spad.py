@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.draws import check_rates, sample_first_photons
 from torchtransient.sensing.layout import (
     TIME,
@@ -36,6 +37,7 @@ def _working(x: Tensor) -> Tensor:
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 
+@in_single
 def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
 
@@ -57,6 +59,7 @@ class CoatesEstimate(NamedTuple):
     valid: Tensor
 
 
+@in_single
 def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
     """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
 
@@ -75,6 +78,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     return CoatesEstimate((-torch.log1p(-share.clamp(0, highest))).to(counts.dtype), valid)
 
 
+@in_single
 def sample_detections(
     rate: Tensor, cycles: int, dead_bins: float | None = None, generator: torch.Generator | None = None
 ) -> Tensor:
@@ -129,6 +133,8 @@ class SynchronousSPAD(RandomSensor):
     takes the re-arming of a share of cycles on average. Afterpulses and crosstalk are modules of their own, behind.
     """
 
+    takes, gives = ("rate",), "counts"
+
     gate: Tensor | None
 
     def __init__(
@@ -143,6 +149,10 @@ class SynchronousSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "SynchronousSPAD")
+        self.bin_width_s: float | None = None
+        if axis is not None or bin_width_s is not None:
+            self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
         self.dead_time_s = dead_time_s
         self.dead_bins: float | None = None
         if dead_time_s is not None:
@@ -166,6 +176,7 @@ class SynchronousSPAD(RandomSensor):
             raise ShapeError(f"SynchronousSPAD: expected T = {self.gate.shape[0]} as in gate, got {x.shape[TIME]}.")
         return x * self.gate.to(x.dtype).view(-1, 1, 1)
 
+    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per cycle and bin, after pile-up."""
         rate = self._gated(x)
@@ -207,6 +218,7 @@ class SynchronousSPAD(RandomSensor):
         return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
 
 
+@in_single
 def first_photon_log_prob(
     counts: Tensor,
     rate: Tensor,

@@ -43,6 +43,8 @@ class SweepJitter(RandomSensor):
     its ordinary gradient, which is unbiased for any loss.
     """
 
+    gives = "the same"
+
     def __init__(
         self,
         jitter_fwhm_s: float,
@@ -56,6 +58,7 @@ class SweepJitter(RandomSensor):
         me = type(self).__name__
         self.jitter_fwhm_s = check_seconds(jitter_fwhm_s, "jitter_fwhm_s", me)
         self.bin_width_s = bin_width_of(axis, bin_width_s, me)
+        self.num_bins = None if axis is None else axis.num_bins
         self.sweeps = check_count(sweeps, "sweeps", me)
 
     @property
@@ -162,4 +165,4 @@ class StreakCamera(Compose):
             camera,
         ]
         super().__init__([s for s in stages if s is not None], grad=grad)
-        self.axis = axis
+        self.axis, self.num_bins = axis, axis.num_bins

@@ -56,6 +56,8 @@ class TDC(Sensor):
     ShapeError when T does not fit.
     """
 
+    gives = "the same"
+
     code_widths: Tensor
     bands: Tensor
 
