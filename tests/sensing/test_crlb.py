@@ -193,7 +193,7 @@ def test_of_chains():
     counts = [given[0], *(100 * g for g in given[1:])]
     wanted = crlb(NORMAL, AXIS, *counts).covariance
     torch.testing.assert_close(covariance_bound(light, counts), wanted, rtol=1e-9, atol=0)
-    blur = sensing.ImpulseResponse(sensing.GaussianResponse(300 * PS), AXIS)
+    blur = sensing.ImpulseResponse(sensing.GaussianResponse(300 * PS), AXIS, within_bin="center")
     wider = covariance_bound(lambda *p: blur.expected(spad.expected(light(*p))), given, cycles=300)
     assert bool((wider.diagonal(dim1=-2, dim2=-1) > direct.diagonal(dim1=-2, dim2=-1)).all())
     # as if the response had been wider, where no pile-up is

@@ -256,7 +256,7 @@ def test_half_precision_leaves_physical_numbers_alone(dtype):
         bin_width_s=50 * PS,
     )
     network = torch.nn.Conv3d(1, 1, 1)
-    chain = sensing.Compose([budget, sensing.ImpulseResponse(response, bin_width_s=50 * PS), network])
+    chain = sensing.Compose([sensing.ImpulseResponse(response, bin_width_s=50 * PS), budget, network])
     model = torch.nn.Sequential(chain, sensing.FreeRunningSPAD(10, 75e-9, bin_width_s=1e-9)).to(dtype)
     assert network.weight.dtype == dtype
     assert float(response.fwhm_s.detach()) == pytest.approx(60e-12, rel=1e-12)

@@ -34,6 +34,7 @@ ON_AN_AXIS = {
     "SynchronousSPAD": lambda axis: sensing.SynchronousSPAD(100, dead_time_s=1 * NS, axis=axis),
     "FreeRunningSPAD": lambda axis: sensing.FreeRunningSPAD(100, 1 * NS, axis=axis),
     "Afterpulsing": lambda axis: sensing.Afterpulsing(0.01, 1 * NS, 1 * NS, axis=axis),
+    "DetectionJitter": lambda axis: sensing.DetectionJitter(sensing.GaussianResponse(300 * PS), axis),
     "PixelSkew": lambda axis: sensing.PixelSkew(50 * PS, axis),
     "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
     "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),

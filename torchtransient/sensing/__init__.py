@@ -33,6 +33,7 @@ from torchtransient.sensing.depth import multi_return as multi_return
 from torchtransient.sensing.depth import peak_position as peak_position
 from torchtransient.sensing.depth import range_deviation_m as range_deviation_m
 from torchtransient.sensing.depth import soft_argmax as soft_argmax
+from torchtransient.sensing.detection_jitter import DetectionJitter as DetectionJitter
 from torchtransient.sensing.devices import Device as Device
 from torchtransient.sensing.devices import build_stage as build_stage
 from torchtransient.sensing.electronics import PixelElectronics as PixelElectronics

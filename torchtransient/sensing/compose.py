@@ -12,6 +12,8 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.agreement import check_axis as check_axis
 from torchtransient.sensing.agreement import check_stages, check_window
+from torchtransient.sensing.chain_order import check_order
+from torchtransient.sensing.first_photon_moves import moved_first_photons, moving_together
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.layout import TIME, not_a_transient
 from torchtransient.sensing.policies import GradPolicy, check_policy
@@ -28,9 +30,12 @@ class Compose(Sensor):
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
     order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
-    results. Raises ShapeError for no stage or something that is no module, UnitError where one stage is not made for
-    what those before it give: other bins, another number of cycles, another laser period, or another quantity, as
-    the rates of one cycle where the counts of all are meant (see `agreement`).
+    results. A first-photon detector and the `DetectionJitter` and `TDC` behind it are drawn at once, under one policy:
+    the same distribution, in less time. Raises ShapeError for no stage or something that is no module, UnitError where
+    one stage is not made for what those before it give: other bins, another number of cycles, another laser period,
+    or another quantity, as the rates of one cycle where the counts of all are meant (see `agreement`); and for an
+    order in which constant light starves at the ends of the window: light's own shape, then `PhotonBudget`, the
+    detector, and what acts on detections.
     """
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
@@ -40,6 +45,7 @@ class Compose(Sensor):
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if not len(stages) or wrong:
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
+        check_order(stages, "Compose")
         self.stages = nn.ModuleList(stages)
         check_stages(self)
         if grad is not None:
@@ -59,7 +65,18 @@ class Compose(Sensor):
 
     def forward(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """The measurement, every random stage under its own policy and with the same generator in turn."""
-        return self._run(x, lambda stage, y: stage(y, generator=generator) if isinstance(stage, Sensor) else stage(y))
+
+        def measure(stage: nn.Module, y: Tensor) -> Any:
+            return stage(y, generator=generator) if isinstance(stage, Sensor) else stage(y)
+
+        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
+            found = moving_together(stages, policy=True)
+            if found is None:
+                return y, 0
+            spad, moves = found
+            return moved_first_photons(spad, moves, y, generator, spad.grad), 1 + len(moves)
+
+        return self._run(x, measure, at_once)
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """One draw of every random stage, whatever its policy, without gradient."""
@@ -69,10 +86,23 @@ class Compose(Sensor):
                 return stage.sample(y, generator)
             return stage.expected(y) if isinstance(stage, Sensor) else stage(y)
 
-        with torch.no_grad():
-            return self._run(x, draw)
+        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
+            found = moving_together(stages, policy=False)
+            if found is None:
+                return y, 0
+            spad, moves = found
+            return moved_first_photons(spad, moves, y, generator), 1 + len(moves)
 
-    def _run(self, x: Any, step: Callable[[nn.Module, Tensor], Any]) -> Tensor:
+        with torch.no_grad():
+            return self._run(x, draw, at_once)
+
+    def _run(
+        self,
+        x: Any,
+        step: Callable[[nn.Module, Tensor], Any],
+        at_once: Callable[[list[nn.Module], Tensor], tuple[Tensor, int]] | None = None,
+    ) -> Tensor:
+        """`step` for one stage after another; `at_once` takes several where it can, and says how many."""
         stages = list(self.stages)
         if isinstance(x, Tensor):
             y = x
@@ -81,8 +111,11 @@ class Compose(Sensor):
             stages = stages[used:]
         if y.ndim >= 4:
             check_window(self, y.shape[TIME])
-        for stage in stages:
-            y = step(stage, y)
+        while stages:
+            y, used = at_once(stages, y) if at_once is not None else (y, 0)
+            if not used:
+                y, used = step(stages[0], y), 1
+            stages = stages[used:]
         return y
 
     def _opened(self, output: Any) -> tuple[Tensor, int]:

@@ -35,6 +35,7 @@ from torchtransient.sensing.coincidence import CoincidencePixel
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
 from torchtransient.sensing.crosstalk import Crosstalk
+from torchtransient.sensing.detection_jitter import DetectionJitter
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.gated import GatedIntegration
@@ -76,11 +77,11 @@ KINDS: Mapping[str, Callable[..., Any]] = {
     **{
         made.__name__: made
         for made in (
-            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
-            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCalibration,
-            ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic,
-            ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, TapDifference,
-            TwoTapCode, UniformResponse,
+            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, DetectionJitter,
+            EquiDepthHistogram, FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse,
+            ItofCalibration, ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics,
+            PolarizationMosaic, ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC,
+            TailedResponse, TapDifference, TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
             AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelSkew, PowerLawDelays,
             ZoneSum,

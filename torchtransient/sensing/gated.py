@@ -10,7 +10,6 @@ Laurenzis et al., "Time-of-flight range gating" (2007).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -20,7 +19,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import correlate
 from torchtransient.sensing.layout import check_number, check_seconds, check_time_axis
-from torchtransient.sensing.response_shapes import normal_cdf
+from torchtransient.sensing.response_shapes import normal_integral
 from torchtransient.sensing.sensor import Sensor
 
 # A normal cumulative edge takes this many standard deviations from 10 % to 90 %.
@@ -58,8 +57,7 @@ def gate_profiles(
 
 def _edge_integral(time_s: Tensor, middle_s: Tensor, sigma_s: float) -> Tensor:
     """Integral of ``Phi((t - middle) / sigma)`` up to each time, seconds."""
-    u = (time_s - middle_s) / sigma_s
-    return sigma_s * (u * normal_cdf(u) + torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi))
+    return sigma_s * normal_integral((time_s - middle_s) / sigma_s)
 
 
 class GatedIntegration(Sensor):
@@ -127,6 +125,14 @@ class GatedIntegration(Sensor):
             fall_s=self.fall_s,
             leakage=self.leakage,
         )
+
+    def outside(self) -> Tensor:
+        """(G,) float64: share of each gate's open time that lies outside the window, leakage left out."""
+        with torch.no_grad():
+            widths = self.log_width_s.double().exp()
+            delays = self.delay_ps.double() * 1e-12
+            inside = gate_profiles(delays, widths, self.axis, rise_s=self.rise_s, fall_s=self.fall_s)
+            return 1 - inside.sum(1) * self.axis.bin_width_s / widths
 
     def expected(self, x: Tensor) -> Tensor:
         return correlate(x, self.profiles()) * self.electrons_per_unit

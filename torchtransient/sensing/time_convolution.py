@@ -47,17 +47,22 @@ def convolve_time(
     if kernel.ndim != 1 or kernel.numel() == 0:
         raise ShapeError(f"convolve_time: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
     bins, kernel = x.shape[TIME], kernel.to(x.device)
-    if boundary == "periodic":
-        kernel, first = _fold(kernel, first, bins)
-    else:
-        kernel, first = _crop(kernel, first, bins)
-        if kernel.numel() == 0:
-            return x * 0
+    kernel, first = window_lags(kernel, first, bins, boundary)
+    if kernel.numel() == 0:
+        return x * 0
     if method == "auto":
         method = "direct" if kernel.numel() <= _DIRECT_TAPS else "fft"
     rows = x.movedim(TIME, -1)
     y = _direct(rows, kernel, first, boundary) if method == "direct" else _by_fft(rows, kernel, first, boundary)
     return y.movedim(-1, TIME)
+
+
+def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
+    """(kernel, first) as far as it matters in a window of `bins`: folded into one period, or cut to lags inside.
+
+    A kernel that misses the window altogether comes back empty.
+    """
+    return _fold(kernel, first, bins) if boundary == "periodic" else _crop(kernel, first, bins)
 
 
 def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:

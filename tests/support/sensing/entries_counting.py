@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from support.sensing.contract import Entry
+from support.sensing.contract import Entry, counts_like
 from torchtransient import sensing
 from torchtransient.errors import GradientError, ShapeError, UnitError
 
@@ -13,6 +13,14 @@ PS = 1e-12
 
 def impulse(response, **keywords):
     return lambda: sensing.ImpulseResponse(response(), bin_width_s=20 * PS, **keywords)
+
+
+def jitter(response, **keywords):
+    return lambda **k: sensing.DetectionJitter(response(), bin_width_s=20 * PS, **keywords, **k)
+
+
+def whole_counts(shape, seed=0):
+    return torch.poisson(30 * counts_like(shape, seed), generator=torch.Generator().manual_seed(seed))
 
 
 def tails():
@@ -111,10 +119,39 @@ ENTRIES = [
     ),
     Entry(
         "TDC",
-        lambda: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0))),
+        lambda **k: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0)), **k),
+        input=whole_counts,
         conserves=lambda y: y.sum(-3),
+        random=True,
+        # none of its numbers is learnt: nothing for a score of its own
+        policies=("expected", "gaussian", "straight_through"),
     ),
-    Entry("TDC-dither", lambda: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3)),
+    Entry(
+        "TDC-dither",
+        lambda **k: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3, offset_bins=0.3, **k),
+        input=whole_counts,
+        conserves=lambda y: y.sum(-3),
+        random=True,
+        policies=("expected", "gaussian", "straight_through"),
+        errors=(
+            (lambda: sensing.TDC(torch.ones(4), acts_on="light"), ShapeError),
+            (lambda: sensing.TDC(torch.ones(4), boundary="open"), ShapeError),
+        ),
+    ),
+    Entry("TDC-rates", lambda: sensing.TDC(torch.ones(12), dither=True, acts_on="rates", boundary="zero")),
+    Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True),
+    Entry("DetectionJitter-zero", jitter(measured, boundary="zero"), input=whole_counts, random=True),
+    Entry(
+        "DetectionJitter-composed",
+        jitter(composed, within_bin="center"),
+        input=whole_counts,
+        random=True,
+        errors=(
+            (lambda: sensing.DetectionJitter(torch.ones(3), bin_width_s=20 * PS), ShapeError),
+            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20 * PS, boundary="open"), ShapeError),
+            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20.0), UnitError),
+        ),
+    ),
     Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True),
     Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
     Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
