@@ -93,6 +93,7 @@ from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.photon_budget import ambient_photon_rate as ambient_photon_rate
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
+from torchtransient.sensing.pixel_groups import PixelGroups as PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew as DetectionSkew
 from torchtransient.sensing.pixel_skew import PixelSkew as PixelSkew
 from torchtransient.sensing.pixel_skew import shift_time as shift_time

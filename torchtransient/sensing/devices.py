@@ -53,6 +53,7 @@ from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, Ta
 from torchtransient.sensing.layout import check_number
 from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.pixel_groups import PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
@@ -83,8 +84,8 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             PolarizationMosaic, ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC,
             TailedResponse, TapDifference, TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
-            AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelSkew, PowerLawDelays,
-            ZoneSum,
+            AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
+            PowerLawDelays, ZoneSum,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,

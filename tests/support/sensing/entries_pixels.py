@@ -39,6 +39,15 @@ def paralyzable(cycles):
     return sensing.FreeRunningSPAD(cycles, 70 * PS, bin_width_s=20 * PS, kind="paralyzable")
 
 
+def dead_times(**keywords):
+    values = torch.tensor([[40.0, 70, 40], [110, 70, 55]]) * PS
+
+    def spad(dead_time_s):
+        return sensing.SynchronousSPAD(200, dead_time_s=dead_time_s, bin_width_s=20 * PS)
+
+    return sensing.PixelGroups.by_value(values, spad, **keywords)
+
+
 ENTRIES = [
     Entry(
         "PhotonBudget-maps",
@@ -119,6 +128,19 @@ ENTRIES = [
         ),
         shape=(2, 1, 8, 1, 2),
         random=True,
+    ),
+    Entry(
+        "PixelGroups",
+        dead_times,
+        random=True,
+        errors=(
+            (lambda: sensing.PixelGroups([], MAP), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.ones(2, 3)), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.zeros(3)), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise(), sensing.SynchronousSPAD(3)], 0 * MAP), UnitError),
+            (lambda: dead_times()(torch.ones(1, 12, 3, 3)), ShapeError),
+            (lambda: sensing.PixelGroups.by_value(torch.rand(20, 20), lambda d: sensing.ShotNoise()), UnitError),
+        ),
     ),
     Entry(
         "ZoneSum",
