@@ -62,6 +62,10 @@ class AfterpulsingSPAD(WrappedDetector):
         super().__init__(detector, grad)
         self.afterpulsing = afterpulsing
 
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.afterpulsing.check_bins(x)
+
     def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
         """In the frequencies of a period, and of two windows for what has to be left out; the period in bins."""
         check_transient(x, "AfterpulsingSPAD")

@@ -125,6 +125,10 @@ class CoincidencePixel(RandomSensor):
                 "SPAD that fires twice in a window would count twice."
             )
 
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.detector.check_bins(x)
+
     @property
     def cycles(self) -> int:
         """Laser cycles of an exposure."""

@@ -31,6 +31,10 @@ class WrappedDetector(RandomSensor):
     def grad(self, value: GradPolicy) -> None:
         self.detector.grad = check_policy(value, type(self).__name__)
 
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.detector.check_bins(x)
+
     def rate(self, x: Tensor) -> Tensor:
         """The rate that the detector is given."""
         raise NotImplementedError(f"{type(self).__name__} has to define rate(x).")

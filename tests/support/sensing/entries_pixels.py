@@ -71,8 +71,6 @@ ENTRIES = [
         conserves=lambda y: y.sum(-3),
         input=whole_counts,
         random=True,
-        # what is drawn depends on whole counts, which have no gradient
-        policies=("expected", "gaussian", "straight_through"),
         errors=(
             (lambda: sensing.DetectionSkew(50.0, bin_width_s=20 * PS), UnitError),
             (lambda: sensing.PixelSkew(50 * PS), UnitError),
