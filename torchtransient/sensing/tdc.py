@@ -29,20 +29,34 @@ def random_code_widths(num_bins: int, dnl_std: float, generator: torch.Generator
     return widths / widths.mean()
 
 
-def code_bands(edges: Tensor, num_bins: int, *, periodic: bool = False) -> tuple[int, Tensor]:
+def code_bands(
+    edges: Tensor, num_bins: int, *, periodic: bool = False, dither: bool = False
+) -> tuple[int, Tensor]:
     """(first, (T, B) float64): share of the true bin k + first + b that gets the code k.
 
-    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light outside [0, num_bins] is in no bin, or, if
-    `periodic`, in the bin a whole number of windows away.
+    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light lies evenly in its true bin; `dither` adds a
+    time that is uniform over one bin. Light outside [0, num_bins] is in no bin, or, if `periodic`, in the bin a whole
+    number of windows away.
     """
     lower, upper = edges[:-1], edges[1:]
     index = torch.arange(lower.shape[0], dtype=torch.float64, device=edges.device)
-    first = int(torch.floor((lower - index).amin()))
+    first = int(torch.floor((lower - index).amin())) - int(dither)
     last = int(torch.ceil((upper - index).amax()))
     true = index.unsqueeze(1) + torch.arange(first, max(last, first + 1), dtype=torch.float64, device=edges.device)
-    overlap = torch.minimum(upper.unsqueeze(1), true + 1) - torch.maximum(lower.unsqueeze(1), true)
+    before = _triangle if dither else _box
+    share = before(upper.unsqueeze(1) - true) - before(lower.unsqueeze(1) - true)
     inside = 1.0 if periodic else (true >= 0) & (true < num_bins)
-    return first, overlap.clamp(0, 1) * inside
+    return first, share.clamp_min(0) * inside
+
+
+def _box(z: Tensor) -> Tensor:
+    """Share of a bin's light before z, in bins from its start."""
+    return z.clamp(0, 1)
+
+
+def _triangle(z: Tensor) -> Tensor:
+    """The same with a time on top that is uniform over one bin."""
+    return 0.5 * (z.clamp(0, 1).square() + 1 - (2 - z.clamp(1, 2)).square())
 
 
 def _bands_of_loaded_widths(module: nn.Module, incompatible: object) -> None:
@@ -57,9 +71,9 @@ class TDC(MovedCounts):
 
     `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
     Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known start offsets, one code
-    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown offset, uniform over one
-    bin, that is not taken off: half the events get the next code. `offset_bins`: where, in true bins, the first code
-    begins; light then gets earlier codes by as much.
+    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown time, uniform over one
+    bin, that is added before the conversion and not taken off: of equal codes, half the events get the next one.
+    `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
 
     `acts_on` "detections": the input are counts behind a detector. Each of them gets its code: whole counts by a draw,
     under the policies of `MovedCounts`; counts that are not whole stay means. It is the last stage where bins stand
@@ -128,20 +142,12 @@ class TDC(MovedCounts):
             if periodic:
                 # exactly one turn: rounding at the last edge would leave a gap
                 edges[-1] = self.offset_bins + codes
-            parts.append(code_bands(edges, codes, periodic=periodic))
+            parts.append(code_bands(edges, codes, periodic=periodic, dither=self.dither))
         low = min(first for first, _ in parts)
         high = max(first + band.shape[1] for first, band in parts)
         total = widths.new_zeros(codes, high - low)
         for first, band in parts:
             total[:, first - low : first - low + band.shape[1]] += band / self.sliding_scale
-        if self.dither:
-            # half of what code k - 1 would have got goes to code k; the band then begins one bin earlier
-            before = total.roll(1, 0)
-            if not periodic:
-                before[0] = 0
-            later = torch.nn.functional.pad(before, (0, 1))
-            total = 0.5 * torch.nn.functional.pad(total, (1, 0)) + 0.5 * later
-            low -= 1
         return low, total
 
     @property
