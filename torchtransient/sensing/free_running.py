@@ -127,9 +127,10 @@ class FreeRunningSPAD(RandomSensor):
 
     Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Means and
     correlations inside a period are those of the chain of detections, correlations between periods (which make totals
-    up to hundreds of times less variable in saturation) those of its central limit theorem; whole numbers add up to a
-    quarter of a count^2 to the variance of a total, a phase locked by a dead time of whole periods up to one. The cost does not grow with `cycles`. Paralyzable: independent binomials with the
-    exact mean and N d (1 - d) as variance: totals of a real one vary less, down to a quarter.
+    up to hundreds of times less variable in saturation) those of its central limit theorem. Whole numbers add up to a
+    quarter of a count^2 to the variance of a total, a phase locked by a dead time of whole periods up to one. The cost
+    does not grow with `cycles`. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance:
+    totals of a real one vary less, down to a quarter.
 
     Policies: all. `gaussian`: normal numbers with the covariance of the draws (paralyzable: independent bins), whose
     size is differentiated as that of independent bins. `score`: that of `cycles` periods drawn on their own, dead and
