@@ -37,7 +37,7 @@ def effects(bins: int, size: int, cycles: int) -> tuple[Tensor, list[sensing.Sen
     g = torch.Generator().manual_seed(0)
     dark = sensing.hot_pixel_rates(size, size, median_hz=1e3, generator=g).float() * width_s
     chain: list[sensing.Sensor] = [
-        sensing.TDC(sensing.random_code_widths(bins, 0.05, g), dither=True),
+        sensing.TDC(sensing.random_code_widths(bins, 0.05, g), dither=True, acts_on="rates"),
         sensing.SynchronousSPAD(cycles, gate=torch.linspace(0, 1, bins).mul(20).clamp(max=1), grad="straight_through"),
         sensing.Afterpulsing(0.01, 30e-9, 75e-9, bin_width_s=width_s, period_s=100e-9, grad="straight_through"),
         sensing.Crosstalk(0.005, grad="straight_through"),

@@ -31,7 +31,7 @@ PULSES = {"narrow": 0.01, "wide": 0.1}  # standard deviation, metres of path
 OFFSETS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 STEPS, RATE = 150, 0.04
 LOW = tt.FrequencyAxis.uniform(0.2, 0.2, 8)
-first_photon = functools.partial(losses.first_photon_loss, cycles=CYCLES)
+first_photon = functools.partial(losses.first_photon_nll, cycles=CYCLES)
 
 # (name, what a pixel's loss is, of rates per cycle and of a SPAD's histogram instead of mean counts and counts)
 Pixel = Callable[[Tensor, Tensor], Tensor]
@@ -50,8 +50,8 @@ CASES: dict[str, tuple[Pixel, bool]] = {
     "`root_loss`": (by_bin(losses.root_loss), False),
     "`expected_root_loss`": (by_bin(losses.expected_root_loss), False),
     "`log_ratio_loss`, background 0.1": (by_bin(losses.log_ratio_loss, background=BACKGROUND), False),
-    "`poisson_loss`": (by_bin(losses.poisson_loss, floor=0.0), False),
-    "`first_photon_loss`": (by_bin(first_photon, floor=0.0), True),
+    "`poisson_nll`": (by_bin(losses.poisson_nll), False),
+    "`first_photon_nll`": (by_bin(first_photon), True),
     "`transient_phasor_loss`, 0.2 to 1.6 per m": (
         lambda x, y: losses.transient_phasor_loss(x, y, AXIS, LOW, reduction="none").sum(1), False),
     "the same, `phase_only`": (
@@ -62,18 +62,18 @@ CASES: dict[str, tuple[Pixel, bool]] = {
     "`multiscale_loss` of `squared_loss`": (by_record(losses.multiscale_loss), False),
     "`multiscale_loss` of `expected_root_loss`": (
         by_record(losses.multiscale_loss, losses.expected_root_loss), False),
-    "`multiscale_loss` of `poisson_loss`": (
-        by_record(losses.multiscale_loss, functools.partial(losses.poisson_loss, floor=0.0)), False),
-    "`multiscale_loss` of `first_photon_loss`": (
-        by_record(losses.multiscale_loss, functools.partial(first_photon, floor=0.0)), True),
+    "`multiscale_loss` of `poisson_nll`": (
+        by_record(losses.multiscale_loss, losses.poisson_nll), False),
+    "`multiscale_loss` of `first_photon_nll`": (
+        by_record(losses.multiscale_loss, first_photon), True),
 }  # fmt: skip
 DRAWN = {
     "squared": "`squared_loss`",
-    "Poisson": "`poisson_loss`",
+    "Poisson": "`poisson_nll`",
     "expected root": "`expected_root_loss`",
     "Wasserstein": "`wasserstein_loss`",
     "running sums": "`cumulative_loss`",
-    "Poisson,\nmany scales": "`multiscale_loss` of `poisson_loss`",
+    "Poisson,\nmany scales": "`multiscale_loss` of `poisson_nll`",
 }
 
 

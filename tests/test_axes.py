@@ -41,6 +41,41 @@ def test_seconds():
     torch.testing.assert_close(axis.edges_s, 1e-8 + 1e-11 * torch.arange(8, dtype=torch.float64), rtol=1e-14, atol=0)
 
 
+WRONG_UNITS = {
+    "picoseconds": lambda: TimeAxis.from_seconds(0, 50, 128),
+    "nanoseconds": lambda: TimeAxis.from_seconds(0.0, 0.05, 128),
+    "a picosecond in nanoseconds": lambda: TimeAxis.from_seconds(0.0, 1e-3, 128),
+    "a picosecond in microseconds": lambda: TimeAxis.from_seconds(0.0, 1e-6, 128),
+    "metres as seconds": lambda: TimeAxis.from_seconds(0.0, 0.015, 128),
+    "a start in nanoseconds": lambda: TimeAxis.from_seconds(20.0, 50e-12, 128),
+    "a start in picoseconds": lambda: TimeAxis.from_seconds(-500.0, 50e-12, 128),
+    "seconds as metres": lambda: TimeAxis(0.0, 50e-12, 128),
+    "100 ns as metres": lambda: TimeAxis(0.0, 99e-9, 128),
+    "megahertz": lambda: FrequencyAxis.from_hertz([0.0, 60.6]),
+    "megahertz, negative": lambda: FrequencyAxis.from_hertz([-80.0]),
+    "gigahertz": lambda: FrequencyAxis.from_hertz([0.06]),
+    "cycles per metre as hertz": lambda: FrequencyAxis.from_hertz([0.2]),
+    "hertz as cycles per metre": lambda: FrequencyAxis([20e6]),
+    "a step in hertz": lambda: FrequencyAxis.uniform(0.0, 10e6, 3),
+}
+
+
+@pytest.mark.parametrize("make", WRONG_UNITS.values(), ids=WRONG_UNITS)
+def test_numbers_of_another_unit_are_told(make):
+    with pytest.raises(UnitError, match=r"expected .* got .*(from_seconds|in metres|from_hertz|are \d+e)"):
+        make()
+
+
+def test_unusual_records_are_taken():
+    """Streak cameras, lidars of clouds and satellites; what `from_seconds` takes for a mistake is said in metres."""
+    for start, width in ((0.0, 0.2e-12), (5e-6, 0.9e-6), (-9.9e-3, 100e-9), (3.3e-3, 1e-9)):
+        assert TimeAxis.from_seconds(start, width, 7).bin_width_s == pytest.approx(width, rel=1e-12)
+    assert TimeAxis(0.0, 50 * SPEED_OF_LIGHT, 128).bin_width_s == 50
+    assert TimeAxis(2.56 * SPEED_OF_LIGHT, 0.003, 128).start_s == pytest.approx(2.56)  # the moon
+    assert FrequencyAxis.from_hertz([0.0, 1e3, -1e9]).num_frequencies == 3
+    assert FrequencyAxis([1 / 266e-9, 60.6 / SPEED_OF_LIGHT]).num_frequencies == 2
+
+
 def test_every_edge_starts_its_bin():
     edges = AXIS.edges_opl
     assert torch.equal(AXIS.bin_index(edges), torch.arange(301))

@@ -13,6 +13,14 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT, opl_to_seconds, seconds_to_opl
 
+# What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
+# or femtoseconds that is 1e-3 to 1e9, and in seconds taken for metres at most 1e-6.
+WIDEST_BIN_S = 1e-6  # 300 m of path; a picosecond in microseconds is as much
+LATEST_START_S = 1e-2  # light comes back from 1500 km away: satellites
+NARROWEST_BIN_OPL = 1e-7  # 0.3 fs, a quarter of a period of visible light; 300 ns taken for metres
+LOWEST_HERTZ = 1e3  # 1 GHz in megahertz
+MOST_PER_METRE = 5e6  # a wavelength of 200 nm; 5 MHz taken for cycles per metre
+
 
 @dataclass(frozen=True)
 class TimeAxis:
@@ -21,8 +29,8 @@ class TimeAxis:
     The origin is the moment when the light leaves the emitter. Frozen, hashable and picklable; two axes are equal when
     their three numbers are. Tensors it returns are float64 on the CPU: at 1 km, float32 resolves 6e-5 m only.
 
-    Raises UnitError when a length is not finite, the width is not positive, or the bins are too narrow for float64 at
-    that distance; ShapeError when `num_bins` is not a positive whole number.
+    Raises UnitError when a length is not finite, the width is not positive, below 1e-7 m (a time in seconds) or too
+    narrow for float64 at that distance; ShapeError when `num_bins` is not a positive whole number.
     """
 
     start_opl: float
@@ -48,6 +56,11 @@ class TimeAxis:
                 f"TimeAxis: bins of {width!r} m between {start!r} m and {end!r} m cannot be told apart in float64. "
                 "Use wider bins or an earlier start."
             )
+        if width < NARROWEST_BIN_OPL:
+            raise UnitError(
+                f"TimeAxis: expected bin_width_opl in metres of optical path, at least {NARROWEST_BIN_OPL:g} (0.3 fs; "
+                f"light itself swings more slowly), got {width!r}. Seconds? TimeAxis.from_seconds takes them."
+            )
         # numpy scalars and tensors become plain numbers, so that axes hash and pickle alike wherever they come from
         object.__setattr__(self, "start_opl", start)
         object.__setattr__(self, "bin_width_opl", width)
@@ -55,8 +68,19 @@ class TimeAxis:
 
     @classmethod
     def from_seconds(cls, start_s: float, bin_width_s: float, num_bins: int) -> TimeAxis:
-        """The axis whose bins start at `start_s` and are `bin_width_s` wide, both in seconds. Errors as the class."""
+        """The axis whose bins start at `start_s` and are `bin_width_s` wide, both in seconds. Errors as the class.
+
+        Refuses bins of 1 us or more and starts 10 ms or more from zero, which are most likely picoseconds, nanoseconds
+        or metres: UnitError. Records of that kind are made in metres, `TimeAxis(start_opl, bin_width_opl, num_bins)`.
+        """
         start, width = _finite(start_s, "start_s"), _finite(bin_width_s, "bin_width_s")
+        for name, value, limit in (("bin_width_s", width, WIDEST_BIN_S), ("start_s", abs(start), LATEST_START_S)):
+            if value >= limit:
+                raise UnitError(
+                    f"TimeAxis.from_seconds: expected {name} in seconds, below {limit:g} s, got {value!r} s, which is "
+                    f"{seconds_to_opl(value):.4g} m of optical path. 50 ps are 50e-12 s, 4 ns are 4e-9 s. If it is "
+                    "meant, say it in metres: TimeAxis(start_opl, bin_width_opl, num_bins)."
+                )
         return cls(seconds_to_opl(start), seconds_to_opl(width), num_bins)
 
     @property
@@ -116,7 +140,7 @@ class FrequencyAxis:
     A phasor is the sum of `radiance * exp(-2 pi i frequency (opl - start_opl))` over all arrivals; with `start_opl`
     zero its phase counts from the moment when the light leaves the emitter. Any iterable of numbers is taken for
     `frequencies`, zero and negative ones too. Frozen, hashable and picklable. Raises UnitError for a number that is
-    not finite, ShapeError for no frequency at all.
+    not finite or beyond 5e6 (hertz), ShapeError for no frequency at all.
     """
 
     frequencies: tuple[float, ...]
@@ -128,6 +152,12 @@ class FrequencyAxis:
         numbers = tuple(_finite(value, "a frequency", "FrequencyAxis") for value in values)
         if not numbers:
             raise ShapeError("FrequencyAxis: expected at least one frequency, got none.")
+        highest = max(numbers, key=abs)
+        if abs(highest) > MOST_PER_METRE:
+            raise UnitError(
+                f"FrequencyAxis: expected cycles per metre of optical path, up to {MOST_PER_METRE:g} (200 nm each), "
+                f"got {highest!r}. Hertz? FrequencyAxis.from_hertz takes them."
+            )
         object.__setattr__(self, "frequencies", numbers)
         object.__setattr__(self, "start_opl", _finite(self.start_opl, "start_opl", "FrequencyAxis"))
 
@@ -138,8 +168,17 @@ class FrequencyAxis:
 
     @classmethod
     def from_hertz(cls, frequencies_hz: Iterable[float], start_opl: float = 0.0) -> FrequencyAxis:
-        """Modulation frequencies in hertz."""
-        return cls(tuple(float(f) / SPEED_OF_LIGHT for f in frequencies_hz), start_opl)
+        """Modulation frequencies in hertz. Refuses those below 1 kHz but zero, which are most likely megahertz:
+        UnitError. Cycles as long as that, 300 km, are given per metre.
+        """
+        given = tuple(_finite(f, "a frequency", "FrequencyAxis.from_hertz") for f in frequencies_hz)
+        for f in given:
+            if 0 < abs(f) < LOWEST_HERTZ:
+                raise UnitError(
+                    f"FrequencyAxis.from_hertz: expected frequencies in hertz, zero or at least {LOWEST_HERTZ:g}, got "
+                    f"{f!r}. Megahertz? 80 MHz are 80e6. Cycles per metre go to FrequencyAxis(frequencies)."
+                )
+        return cls(tuple(f / SPEED_OF_LIGHT for f in given), start_opl)
 
     @property
     def num_frequencies(self) -> int:

@@ -107,7 +107,7 @@ def fit_diffusion(counts: Tensor) -> Fit:
     def closure() -> Tensor:
         optimizer.zero_grad()
         light = diffused(*logs.exp())[late]
-        loss = tt.losses.poisson_loss(light * (counts[late].sum() / light.sum()), counts[late])
+        loss = tt.losses.poisson_nll(light * (counts[late].sum() / light.sum()), counts[late])
         loss.backward()
         return loss
 

@@ -159,7 +159,7 @@ def loss_of(share: float, model: Tensor, counts: Tensor) -> Tensor:
     """
     if share < FAR_SHARE:
         return tt.losses.wasserstein_loss(model, counts, AXIS.bin_width_opl)
-    return tt.losses.poisson_loss(model, counts)
+    return tt.losses.poisson_nll(model, counts)
 
 
 def errors_of(found: Planes, truth: Planes) -> tuple[float, float]:

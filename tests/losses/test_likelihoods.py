@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import inspect
 import pickle
+import warnings
 
 import pytest
 import torch
 
 from support import loss_cases
 from torchtransient import losses
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError
 from torchtransient.losses import (
     FirstPhotonNLL,
     FreeRunningNLL,
     PoissonNLL,
     ReadNoiseNLL,
-    first_photon_loss,
     first_photon_nll,
     free_running_nll,
-    poisson_loss,
     poisson_nll,
     read_noise_nll,
 )
@@ -40,22 +39,22 @@ def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-# name, loss(counts, rate), a draw of counts at `rate`
+# name, loss(rate, counts), a draw of counts at `rate`
 CASES = {
     "poisson": (
-        lambda n, r, **k: poisson_nll(n, 100 * r, **k),
+        lambda r, n, **k: poisson_nll(100 * r, n, **k),
         lambda r, g: torch.poisson(100 * r, generator=g),
     ),
     "first photon": (
-        lambda n, r, **k: first_photon_nll(n, r, CYCLES, **k),
+        lambda r, n, **k: first_photon_nll(r, n, CYCLES, **k),
         lambda r, g: SynchronousSPAD(CYCLES).sample(r, g),
     ),
     "first photon with dead time": (
-        lambda n, r, **k: first_photon_nll(n, r, CYCLES, dead_bins=4.5, **k),
+        lambda r, n, **k: first_photon_nll(r, n, CYCLES, dead_bins=4.5, **k),
         lambda r, g: SynchronousSPAD(CYCLES, dead_time_s=4.5e-10, bin_width_s=1e-10).sample(r, g),
     ),
     "read noise": (
-        lambda n, r, **k: read_noise_nll(n, 100 * r, 5.0, **{a: b for a, b in k.items() if a != "floor"}),
+        lambda r, n, **k: read_noise_nll(100 * r, n, 5.0, **{a: b for a, b in k.items() if a != "floor"}),
         lambda r, g: 100 * r + (25 + 100 * r).sqrt() * torch.randn(r.shape, dtype=r.dtype, generator=g),
     ),
 }
@@ -67,7 +66,7 @@ def test_gradcheck_with_zero_counts(loss, draw):
     n = draw(rates(0.3), seeded())
     n[0, 3] = 0
     x = rates(0.3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda r: loss(n, r, floor=1e-3, reduction="none"), x)
+    assert torch.autograd.gradcheck(lambda r: loss(r, n, reduction="none"), x)
 
 
 @each
@@ -75,7 +74,7 @@ def test_the_score_has_mean_zero_at_the_truth(loss, draw):
     repeats = 4000
     x = rates().unsqueeze(0).expand(repeats, 1, BINS, 1, 1).clone().requires_grad_()
     n = draw(x.detach(), seeded(1))
-    loss(n, x, floor=0.0, reduction="sum").backward()
+    loss(x, n, reduction="sum").backward()
     z = x.grad.mean(0) / (x.grad.std(0) / repeats**0.5)
     assert float(z.abs().max()) < 4.5
 
@@ -85,46 +84,46 @@ def test_finite_for_no_light_and_no_counts(loss, draw):
     for n_value, r_value in ((0.0, 0.0), (0.0, 0.3), (3.0, 0.0), (60.0, 0.0), (3.0, 1e-30), (60.0, 1e-38)):
         n = torch.full((1, 4, 1, 1), n_value)
         r = torch.full((1, 4, 1, 1), r_value, requires_grad=True)
-        value = loss(n, r, floor=1e-4)
+        value = loss(r, n, floor=1e-4)
         value.backward()
         assert bool(torch.isfinite(value)) and bool(torch.isfinite(r.grad).all())
         leaf = r.detach().clone().requires_grad_()
-        default = loss(n, leaf)
+        default = loss(leaf, n)
         default.backward()
-        assert bool(torch.isfinite(default.detach())) and bool(torch.isfinite(leaf.grad).all())
+        assert bool(torch.isfinite(default.detach())) and bool(torch.isfinite(leaf.grad.square()).all())
 
 
 @each
 def test_reductions_and_dtype(loss, draw):
     n, r = draw(rates(), seeded()), rates()
-    each_bin = loss(n, r, reduction="none")
+    each_bin = loss(r, n, reduction="none")
     assert each_bin.shape == r.shape
-    torch.testing.assert_close(loss(n, r, reduction="sum"), each_bin.sum())
-    torch.testing.assert_close(loss(n, r), each_bin.mean())
-    single = loss(n.float(), r.float(), reduction="none")
+    torch.testing.assert_close(loss(r, n, reduction="sum"), each_bin.sum())
+    torch.testing.assert_close(loss(r, n), each_bin.mean())
+    single = loss(r.float(), n.float(), reduction="none")
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), each_bin, rtol=1e-4, atol=1e-3)
     with pytest.raises(ShapeError, match="reduction"):
-        loss(n, r, reduction="median")
+        loss(r, n, reduction="median")
     with pytest.raises(ShapeError, match="one shape"):
-        loss(n[:, 1:], r)
+        loss(r, n[:, 1:])
 
 
 def test_poisson_value():
     n = torch.tensor([0.0, 3, 0, 12], dtype=torch.float64)
     m = torch.tensor([0.5, 2, 1, 10], dtype=torch.float64)
     wanted = -torch.distributions.Poisson(m).log_prob(n)
-    torch.testing.assert_close(poisson_nll(n, m, floor=0, constant=True, reduction="none"), wanted)
-    assert float(poisson_nll(torch.tensor([3.0]), torch.tensor([0.0]), floor=0)) == float("inf")
+    torch.testing.assert_close(poisson_nll(m, n, constant=True, reduction="none"), wanted)
+    assert float(poisson_nll(torch.tensor([0.0]), torch.tensor([3.0]), floor=0)) == float("inf")
     with pytest.raises(UnitError, match="negative"):
-        poisson_nll(n, -m)
+        poisson_nll(-m, n)
 
 
-def test_default_floor_keeps_gradients_usable():
+def test_a_relative_floor_keeps_gradients_small():
     """A count where the model is dark: with an absolute floor of 1e-8 the gradient is 3e8."""
     n = torch.tensor([3.0, 100.0, 100.0])
     m = torch.tensor([0.0, 100.0, 100.0], requires_grad=True)
-    poisson_nll(n, m, reduction="sum").backward()
+    poisson_nll(m, n, floor=losses.relative_floor(m, measured=n), reduction="sum").backward()
     assert 1 < float(m.grad[0].abs()) < 100
 
 
@@ -133,9 +132,9 @@ def test_first_photon_is_least_at_coates(dead_bins):
     spad = SynchronousSPAD(CYCLES, dead_time_s=None if dead_bins is None else dead_bins * 1e-10, bin_width_s=1e-10)
     n = spad.sample(rates(2.0), seeded(3))
     best = coates(n, CYCLES, dead_bins).rate
-    least = first_photon_nll(n, best, CYCLES, dead_bins=dead_bins, floor=0.0, reduction="none")
+    least = first_photon_nll(best, n, CYCLES, dead_bins=dead_bins, reduction="none")
     for factor in (0.9, 1.1):
-        other = first_photon_nll(n, best * factor, CYCLES, dead_bins=dead_bins, floor=0.0, reduction="none")
+        other = first_photon_nll(best * factor, n, CYCLES, dead_bins=dead_bins, reduction="none")
         assert bool((other >= least - 1e-9).all())
 
 
@@ -146,7 +145,7 @@ def test_free_running(dead_bins):
     n = spad(rates())
     best = n / armed_periods(n, 50_000, dead_bins)
     r = best.clone().requires_grad_()
-    free_running_nll(n, r, 50_000, dead_bins, floor=0.0, reduction="sum").backward()
+    free_running_nll(r, n, 50_000, dead_bins, reduction="sum").backward()
     assert float(r.grad.abs().max()) < 1e-9 * 50_000
     # where in its bin a detection lies is not known: an error of second order
     errors = []
@@ -157,15 +156,15 @@ def test_free_running(dead_bins):
         assert errors[-1] < float(found.max()) / 50_000 * float(rates(total).max())
     assert errors[1] < errors[0] / 2.5
     assert torch.autograd.gradcheck(
-        lambda v: free_running_nll(n, v, 50_000, dead_bins, floor=1e-3, reduction="none"), rates().requires_grad_()
+        lambda v: free_running_nll(v, n, 50_000, dead_bins, reduction="none"), rates().requires_grad_()
     )
     with pytest.raises(UnitError, match="fit into"):
-        free_running_nll(n, rates(), 5_000, dead_bins)
+        free_running_nll(rates(), n, 5_000, dead_bins)
 
 
 def test_free_running_at_zero():
     r = torch.zeros(1, 8, 1, 1, requires_grad=True)
-    value = free_running_nll(torch.zeros(1, 8, 1, 1), r, 100, 3.5)
+    value = free_running_nll(r, torch.zeros(1, 8, 1, 1), 100, 3.5)
     value.backward()
     assert bool(torch.isfinite(r.grad).all()) and float(value) == pytest.approx(0.0, abs=1e-6)
 
@@ -173,25 +172,25 @@ def test_free_running_at_zero():
 def test_read_noise_value():
     y, m = torch.tensor([3.0, -2.0, 40.0], dtype=torch.float64), torch.tensor([1.0, 0.0, 50.0], dtype=torch.float64)
     wanted = -torch.distributions.Normal(m, (4 + m).sqrt()).log_prob(y)
-    torch.testing.assert_close(read_noise_nll(y, m, 2.0, reduction="none"), wanted)
+    torch.testing.assert_close(read_noise_nll(m, y, 2.0, reduction="none"), wanted)
     plain = -torch.distributions.Normal(m, torch.full_like(m, 2.0)).log_prob(y)
-    torch.testing.assert_close(read_noise_nll(y, m, 2.0, shot_noise=False, reduction="none"), plain)
+    torch.testing.assert_close(read_noise_nll(m, y, 2.0, shot_noise=False, reduction="none"), plain)
     sigma = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda s: read_noise_nll(y, m, s), sigma)
+    assert torch.autograd.gradcheck(lambda s: read_noise_nll(m, y, s), sigma)
     with pytest.raises(UnitError, match="read_noise greater than zero"):
-        read_noise_nll(y, m, 0.0)
+        read_noise_nll(m, y, 0.0)
 
 
 def test_modules_are_the_functions():
     n, r = SynchronousSPAD(CYCLES).sample(rates(), seeded()), rates()
     pairs = [
-        (PoissonNLL(), poisson_nll(n, r)),
-        (FirstPhotonNLL(CYCLES), first_photon_nll(n, r, CYCLES)),
-        (FreeRunningNLL(CYCLES, 2.5), free_running_nll(n, r, CYCLES, 2.5)),
-        (ReadNoiseNLL(3.0), read_noise_nll(n, r, 3.0)),
+        (PoissonNLL(), poisson_nll(r, n)),
+        (FirstPhotonNLL(CYCLES), first_photon_nll(r, n, CYCLES)),
+        (FreeRunningNLL(CYCLES, 2.5), free_running_nll(r, n, CYCLES, 2.5)),
+        (ReadNoiseNLL(3.0), read_noise_nll(r, n, 3.0)),
     ]
     for module, wanted in pairs:
-        assert torch.equal(pickle.loads(pickle.dumps(module))(n, r), wanted)
+        assert torch.equal(pickle.loads(pickle.dumps(module))(r, n), wanted)
 
 
 def test_fit_by_likelihood_beats_the_raw_histogram():
@@ -207,7 +206,7 @@ def test_fit_by_likelihood_beats_the_raw_histogram():
 
     def closure():
         optimiser.zero_grad()
-        value = first_photon_nll(n, model(position), 5000, floor=0.0)
+        value = first_photon_nll(model(position), n, 5000)
         value.backward()
         return value
 
@@ -217,13 +216,13 @@ def test_fit_by_likelihood_beats_the_raw_histogram():
     assert float((n * t).sum() / n.sum()) < 10.0
 
 
-# name, loss(counts, rates, mask): all four, also the two with the model first
+# name, loss(rates, counts, mask)
 MASKED = {
-    "poisson": lambda n, r, **k: poisson_nll(n, r, **k),
-    "poisson, constant": lambda n, r, **k: poisson_nll(n, r, constant=True, **k),
-    "first photon": lambda n, r, **k: first_photon_nll(n, r, CYCLES, **k),
-    "free running": lambda n, r, **k: free_running_nll(n, r, 50_000, 7.5, **k),
-    "read noise": lambda n, r, **k: read_noise_nll(n, r, 2.0, **k),
+    "poisson": poisson_nll,
+    "poisson, constant": lambda r, n, **k: poisson_nll(r, n, constant=True, **k),
+    "first photon": lambda r, n, **k: first_photon_nll(r, n, CYCLES, **k),
+    "free running": lambda r, n, **k: free_running_nll(r, n, 50_000, 7.5, **k),
+    "read noise": lambda r, n, **k: read_noise_nll(r, n, 2.0, **k),
 }
 
 
@@ -232,17 +231,17 @@ def test_masked_pixels_are_not_looked_at(loss):
     """Dead pixels (NaN), hot ones (more counts than cycles) and models that mean nothing there, as if absent."""
     r = rates().expand(2, 1, BINS, 2, 3) * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     n = torch.poisson(50 * r, generator=seeded(7))
-    wanted = loss(n[..., 1:], r[..., 1:])
+    wanted = loss(r[..., 1:], n[..., 1:])
     n[..., 0], r = float("nan"), r.clone()
     n[1, ..., 0] = 1e9
     r[..., 0] = -1.0
     mask = torch.tensor([False, True, True])
     r.requires_grad_()
-    value = loss(n, r, mask=mask)
+    value = loss(r, n, mask=mask)
     torch.testing.assert_close(value, wanted)
     value.backward()
     assert bool(torch.isfinite(r.grad).all()) and bool((r.grad[..., 0] == 0).all())
-    assert bool((loss(n, r, mask=mask, reduction="none")[..., 0] == 0).all())
+    assert bool((loss(r, n, mask=mask, reduction="none")[..., 0] == 0).all())
 
 
 def test_masked_bins_still_take_cycles():
@@ -250,17 +249,40 @@ def test_masked_bins_still_take_cycles():
     r, mask = rates(3.0), torch.zeros(BINS, 1, 1, dtype=torch.bool)
     mask[10:] = True
     n = SynchronousSPAD(CYCLES).sample(r, seeded(8))
-    each = first_photon_nll(n, r, CYCLES, floor=0.0, reduction="none")
-    torch.testing.assert_close(first_photon_nll(n, r, CYCLES, floor=0.0, mask=mask), each[:, 10:].mean())
-    alone = first_photon_nll(n[:, 10:], r[:, 10:], CYCLES, floor=0.0)
+    each = first_photon_nll(r, n, CYCLES, reduction="none")
+    torch.testing.assert_close(first_photon_nll(r, n, CYCLES, mask=mask), each[:, 10:].mean())
+    alone = first_photon_nll(r[:, 10:], n[:, 10:], CYCLES)
     assert abs(float(alone) - float(each[:, 10:].mean())) > 0.1
 
 
-def test_model_first():
-    n, r = torch.poisson(50 * rates(), generator=seeded(7)), rates()
-    torch.testing.assert_close(poisson_loss(r, n, floor=1e-3), poisson_nll(n, r, floor=1e-3), rtol=0, atol=0)
-    found = first_photon_loss(r, n, CYCLES, dead_bins=4.5)
-    torch.testing.assert_close(found, first_photon_nll(n, r, CYCLES, dead_bins=4.5), rtol=0, atol=0)
+SWAPPED = {
+    "poisson_nll": poisson_nll,
+    "first_photon_nll": lambda r, n: first_photon_nll(r, n, 10**4),
+    "free_running_nll": lambda r, n: free_running_nll(r, n, 10**4, 2.5),
+    "read_noise_nll": lambda r, n: read_noise_nll(r, n, 2.0),
+}
+
+
+@pytest.mark.parametrize("name", SWAPPED)
+def test_counts_in_the_place_of_the_prediction_are_told(name):
+    """By their dtype, by the gradient of what stands in their place, and, with neither, by their numbers."""
+    loss = SWAPPED[name]
+    r = rates(bins=64)
+    n = torch.poisson(50 * r, generator=seeded(7))
+    leaf = r.clone().requires_grad_()
+    for counts in (n.long(), n.int(), n > 0):
+        with pytest.raises(UnitError, match=f"^{name}: expected a prediction of a floating dtype first"):
+            loss(counts, r)
+    with pytest.raises(GradientError, match=f"^{name}: expected the prediction first"):
+        loss(n, leaf)
+    with pytest.warns(TorchTransientWarning, match=f"^{name}: the first argument holds counts") as caught:
+        loss(n, r)
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loss(leaf, n), loss(r, n), loss(r, n.long()), loss(leaf.detach(), n > 0)
+        loss(torch.full_like(n, 2.0), r), loss(n, n.flip(1)), loss(leaf, leaf)
+        loss(n[:, 30:40], r[:, 30:40])  # an example made by hand may be of whole numbers
 
 
 # --------------------------------------------------------------------------------- one rule for what counts may be

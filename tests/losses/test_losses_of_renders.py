@@ -10,6 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient import losses
+from torchtransient.errors import GradientError, UnitError
 from torchtransient.testing.small_room import VARIANT, make_room
 
 GREY = "wall.bsdf.reflectance.value"
@@ -50,18 +51,14 @@ HISTOGRAMS = {
     losses.root_loss: ({}, {}),
     losses.expected_root_loss: ({}, {}),
     losses.log_ratio_loss: ({"background": 0.1}, {}),
-    losses.poisson_loss: ({"floor": 1e-3}, {}),
-    losses.first_photon_loss: ({"cycles": 1000, "floor": 1e-3}, {}),
+    losses.poisson_nll: ({"floor": 1e-3}, {}),
+    losses.first_photon_nll: ({"cycles": 1000, "floor": 1e-3}, {}),
+    losses.free_running_nll: ({"periods": 1000, "dead_bins": 2.0, "floor": 1e-3}, {}),
+    losses.read_noise_nll: ({"read_noise": 0.5}, {}),
     losses.cumulative_loss: ({}, WIDTH),
     losses.wasserstein_loss: ({}, WIDTH),
     losses.transient_phasor_loss: ({"frequencies": BAND}, {"axis": tt.TimeAxis(6.0, 0.25, 24)}),
     losses.multiscale_loss: ({}, {}),
-}
-COUNTS_FIRST = {
-    losses.poisson_nll: {"floor": 1e-3},
-    losses.first_photon_nll: {"cycles": 1000, "floor": 1e-3},
-    losses.free_running_nll: {"periods": 1000, "dead_bins": 2.0, "floor": 1e-3},
-    losses.read_noise_nll: {"read_noise": 0.5},
 }
 OTHER = (losses.two_render_loss, losses.measurement_consistency, losses.phasor_loss, losses.ssim_loss)
 # Of depth maps, hidden volumes and meshes, which a renderer does not return.
@@ -81,7 +78,7 @@ def slope_of(value, renderer):
 def test_every_loss_is_here():
     functions = {f for f in vars(losses).values() if inspect.isfunction(f)}
     reducing = {f for f in functions if "reduction" in inspect.signature(f).parameters}
-    assert reducing == {*HISTOGRAMS, *COUNTS_FIRST, *OTHER, *OF_OTHER_RESULTS}
+    assert reducing == {*HISTOGRAMS, *OTHER, *OF_OTHER_RESULTS}
 
 
 @by_name
@@ -100,19 +97,27 @@ def test_of_two_renders(loss, renderer, shared):
         torch.testing.assert_close(loss(*pair, **options), wanted, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("loss", COUNTS_FIRST, ids=lambda loss: loss.__name__)
-def test_likelihoods_of_two_renders(loss, renderer, shared):
+@pytest.mark.parametrize(
+    "loss, options",
+    [
+        (losses.poisson_nll, {}),
+        (losses.first_photon_nll, {"cycles": 1000}),
+        (losses.free_running_nll, {"periods": 1000, "dead_bins": 2.0}),
+        (losses.read_noise_nll, {"read_noise": 0.5}),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_counts_and_renders_that_are_swapped(loss, options, renderer, shared):
+    """The render first; in the place of the counts its gradient tells it."""
     out, target = shared
-    counts = as_counts(target)
-    found = loss(counts, out, **COUNTS_FIRST[loss])
-    torch.testing.assert_close(found, loss(counts.transient, out.transient, **COUNTS_FIRST[loss]), rtol=0, atol=0)
-    slope_of(found, renderer)
-
-
-def as_counts(target):
-    """The render as a record of counts."""
     generator = torch.Generator().manual_seed(1)
-    return target.map(lambda t: torch.poisson(t.clamp_min(0), generator=generator))
+    counts = target.map(lambda t: torch.poisson(t.clamp_min(0), generator=generator))
+    slope_of(loss(out, counts, **options), renderer)
+    with pytest.raises(GradientError, match=f"^{loss.__name__}: expected the prediction first"):
+        loss(counts, out, **options)
+    whole = counts.map(lambda t: t.long())
+    with pytest.raises(UnitError, match=f"^{loss.__name__}: expected a prediction of a floating dtype first"):
+        loss(whole, out.detach(), **options)
 
 
 def test_of_pictures_volumes_and_a_second_render(renderer, shared):

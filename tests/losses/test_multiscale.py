@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import pytest
@@ -35,13 +36,13 @@ def test_every_layout_of_places():
     """Batches, channels and places do not mix: each pixel alone has the same value."""
     g = torch.Generator().manual_seed(0)
     x, y = (torch.rand(2, 3, 9, 4, 5, generator=g, dtype=torch.float64) for _ in range(2))
-    whole = losses.multiscale_loss(x, y, losses.poisson_loss, reduction="none")
+    whole = losses.multiscale_loss(x, y, losses.poisson_nll, reduction="none")
     assert whole.shape == (2, 3, 4, 5)
-    # a floor that is given: its own is that of an item
-    fixed = functools.partial(losses.poisson_loss, floor=1e-2)
-    whole = losses.multiscale_loss(x, y, fixed, reduction="none")
-    for i, c, j, k in ((0, 0, 0, 0), (1, 2, 3, 4), (1, 0, 2, 3)):
-        alone = losses.multiscale_loss(*(t[i, c, None, :, j, k, None, None] for t in (x, y)), fixed)
+    fixed = functools.partial(losses.poisson_nll, floor=1e-2)
+    places = ((0, 0, 0, 0), (1, 2, 3, 4), (1, 0, 2, 3))
+    for loss, (i, c, j, k) in itertools.product((losses.poisson_nll, fixed), places):
+        whole = losses.multiscale_loss(x, y, loss, reduction="none")
+        alone = losses.multiscale_loss(*(t[i, c, None, :, j, k, None, None] for t in (x, y)), loss)
         torch.testing.assert_close(alone, whole[i, c, j, k])
 
 
@@ -51,7 +52,7 @@ def test_coarse_first_photons_are_those_of_a_coarser_detector(scale):
     g = torch.Generator().manual_seed(3)
     rate = 0.3 * torch.rand(1, 12, 2, 2, generator=g, dtype=torch.float64)
     counts = SynchronousSPAD(500)(rate, generator=g)
-    compare = functools.partial(losses.first_photon_loss, cycles=500, floor=0.0)
+    compare = functools.partial(losses.first_photon_nll, cycles=500)
     found = 12 * losses.multiscale_loss(rate, counts, compare, scales=[scale], reduction="none")
 
     def coarse(x, place):
@@ -59,8 +60,8 @@ def test_coarse_first_photons_are_those_of_a_coarser_detector(scale):
         return padded.unflatten(1, (-1, scale)).sum(2)
 
     each = [
-        losses.first_photon_loss(
-            coarse(rate, p), coarse(counts, p), 500, floor=0.0, dim=-3, reduction="none"
+        losses.first_photon_nll(
+            coarse(rate, p), coarse(counts, p), 500, dim=-3, reduction="none"
         ).sum(1)
         for p in range(scale)
     ]  # fmt: skip
@@ -95,10 +96,10 @@ def test_first_photons_come_home_from_ten_centimetres():
     truth = torch.full((16,), 0.96, dtype=torch.float64)
     rate = pulse(truth, torch.full((16,), 0.3, dtype=torch.float64), 0.01)
     histogram = SynchronousSPAD(1000)(rate, generator=torch.Generator().manual_seed(0))
-    likelihood = functools.partial(losses.first_photon_loss, cycles=1000, dim=-3, reduction="sum")
+    likelihood = functools.partial(losses.first_photon_nll, cycles=1000, dim=-3, reduction="sum")
     many = functools.partial(
         losses.multiscale_loss,
-        compare=functools.partial(losses.first_photon_loss, cycles=1000),
+        compare=functools.partial(losses.first_photon_nll, cycles=1000),
         reduction="sum",
         dim=-3,
     )
@@ -125,7 +126,7 @@ def test_where_time_is_may_be_said_by_what_is_compared():
     g = torch.Generator().manual_seed(2)
     x = 0.1 + torch.rand(2, 5, 9, 4, generator=g, dtype=torch.float64)
     y = torch.poisson(3 * x, generator=g)
-    for loss in (functools.partial(losses.first_photon_loss, cycles=100), losses.poisson_loss, losses.log_ratio_loss):
+    for loss in (functools.partial(losses.first_photon_nll, cycles=100), losses.poisson_nll, losses.log_ratio_loss):
         held = functools.partial(loss, dim=-2)
         wanted = losses.multiscale_loss(x[..., None], y[..., None], loss, reduction="none")[..., 0]
         for compare, dim in ((loss, -2), (held, -2), (held, 2), (held, None)):
@@ -145,7 +146,7 @@ def test_light_of_bins_adds_up(masked):
     mask = torch.rand(x.shape, generator=g) < 0.7 if masked else None
     for level in (0.3, torch.tensor(0.3), 0.1 + torch.rand(9, 1, 1, generator=g, dtype=torch.float64),
                   0.1 + torch.rand(2, 1, 1, 4, 5, generator=g, dtype=torch.float64)):  # fmt: skip
-        for loss, name in ((losses.poisson_loss, "floor"), (losses.log_ratio_loss, "background")):
+        for loss, name in ((losses.poisson_nll, "floor"), (losses.log_ratio_loss, "background")):
             tiny = 0.0 if name == "floor" else 1e-300
             added = y if name == "floor" else y + level
             wanted = losses.multiscale_loss(x + level, added, functools.partial(loss, **{name: tiny}), mask=mask)
@@ -156,7 +157,7 @@ def test_light_of_bins_adds_up(masked):
 def test_levels_that_are_held_are_checked():
     x = torch.rand(1, 8, 2, 2)
     for loss, name, values in (
-        (losses.poisson_loss, "floor", (-1.0, "a", math.nan, torch.ones(3))),
+        (losses.poisson_nll, "floor", (-1.0, "a", math.nan, torch.ones(3))),
         (losses.log_ratio_loss, "background", (0.0, -1.0, True, torch.zeros(2))),
     ):
         for value in values:
@@ -172,8 +173,8 @@ def of_a_record(input, target, *, mask, reduction):
 
 NO_COMPARES = {
     "bin_width_opl=0.1": functools.partial(losses.wasserstein_loss, bin_width_opl=0.1),
-    "dead_bins=3": functools.partial(losses.first_photon_loss, cycles=100, dead_bins=3.0),
-    "cycles": losses.first_photon_loss,
+    "dead_bins=3": functools.partial(losses.first_photon_nll, cycles=100, dead_bins=3.0),
+    "cycles": losses.first_photon_nll,
     "the module SquaredLoss": losses.SquaredLoss(),
     "function": 3,
     "mask": torch.nn.functional.mse_loss,

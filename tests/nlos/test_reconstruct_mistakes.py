@@ -28,10 +28,10 @@ every = pytest.mark.parametrize("name", METHODS)
 SIZES = {
     "a wall in millimetres": (600.0, AXIS),
     "a wall in kilometres": (6e-4, AXIS),
-    "bins in seconds": (1.0, tt.TimeAxis(0.0, 16e-12, 64)),
-    "bins of picoseconds taken for seconds": (1.0, tt.TimeAxis.from_seconds(0.0, 16.0, 64)),
-    "a start in picoseconds, early": (1.0, tt.TimeAxis.from_seconds(-100.0, 16e-12, 64)),
-    "a start in picoseconds, late": (1.0, tt.TimeAxis.from_seconds(100.0, 16e-10, 64)),
+    "bins in seconds": (1.0, tt.TimeAxis(0.0, 250e-9, 64)),
+    "bins of picoseconds taken for seconds": (1.0, tt.TimeAxis(0.0, tt.units.seconds_to_opl(16.0), 64)),
+    "a start in picoseconds, early": (1.0, tt.TimeAxis(-100 * tt.units.SPEED_OF_LIGHT, 5e-3, 64)),
+    "a start in picoseconds, late": (1.0, tt.TimeAxis(100 * tt.units.SPEED_OF_LIGHT, 0.5, 64)),
 }
 
 

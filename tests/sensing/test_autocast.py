@@ -11,20 +11,25 @@ from torchtransient import TimeAxis, sensing
 
 
 @each
-def test_expectation_and_gradient_are_those_outside(entry):
-    """The backward pass runs behind the context, as torch asks for."""
+def test_expectation_and_derivatives_are_those_outside(entry):
+    """First and second derivatives, whether the backward pass runs behind the context, as torch asks for, or in it."""
     module, x = entry.module(torch.float32), entry.x(torch.float32)
 
-    def run(enabled):
+    def run(forward, backward):
         light = x.clone().requires_grad_()
-        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+        leaves = [light, *(p for p in module.parameters() if p.requires_grad)]
+        with torch.autocast("cpu", torch.bfloat16, enabled=forward):
             value = parts(module.expected(light))[0]
-        (gradient,) = torch.autograd.grad(value.square().mean(), light)
-        return value.detach(), gradient
+        with torch.autocast("cpu", torch.bfloat16, enabled=backward):
+            first = torch.autograd.grad(value.square().mean(), leaves, create_graph=True)
+            second = torch.autograd.grad(sum(g.square().mean() for g in first), leaves, allow_unused=True)
+        return [value, *first, *(g for g in second if g is not None)]
 
-    for a, b in zip(run(True), run(False), strict=True):
-        assert a.dtype == b.dtype
-        assert torch.equal(a, b)
+    wanted = run(False, False)
+    for inside in ((True, False), (True, True), (False, True)):
+        for a, b in zip(run(*inside), wanted, strict=True):
+            assert a.dtype == b.dtype
+            assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("code", [None, sensing.hamiltonian_code(3)], ids=["fourier", "by shape"])
@@ -37,6 +42,26 @@ def test_phases_are_those_outside(code):
         found = sensing.read_itof(camera(light), (40e6,), 3, code=code)
     assert found.depth_m.dtype == torch.float32
     assert torch.equal(found.depth_m, wanted.depth_m)
+
+
+@pytest.mark.parametrize("name", ["tap_phasor", "stokes_from", "demosaic", "correlate"])
+def test_backward_of_functions_inside_is_that_outside(name):
+    g = torch.Generator().manual_seed(1)
+    taps, stokes = torch.rand(1, 4, 3, 4, generator=g), torch.rand(4, 1, 3, 4, 4, generator=g)
+    weights = torch.rand(7, 4, generator=g)
+    call, x = {
+        "tap_phasor": (lambda x: sensing.tap_phasor(x, 4).abs(), taps),
+        "stokes_from": (lambda x: sensing.stokes_from(x, sensing.linear_analysers([0, 45, 90, 135])), stokes),
+        "demosaic": (sensing.demosaic, stokes),
+        "correlate": (lambda x: sensing.correlate(x, weights), taps),
+    }[name]
+    found = []
+    for enabled in (False, True):
+        leaf = x.clone().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            call(leaf).square().sum().backward()
+        found.append(leaf.grad)
+    assert torch.equal(*found)
 
 
 def test_taps_in_half_precision_have_phases():

@@ -78,7 +78,8 @@ def test_stages_in_order():
 
 @pytest.mark.parametrize("policy", ["gaussian", "straight_through", "score"])
 def test_policy_reaches_every_stage(policy):
-    sensor = Compose([chain(), Compose([ShotNoise()])]).set_grad(policy)
+    response, taps, electronics = chain().stages
+    sensor = Compose([Compose([response]), taps, Compose([Compose([electronics])])]).set_grad(policy)
     assert {m.grad for m in sensor.modules() if hasattr(m, "grad") and isinstance(m.grad, str)} == {policy}
     with pytest.raises(GradientError, match="expected"):
         sensor.set_grad("none")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.sensing.all_entries import ENTRIES, each
-from support.sensing.contract import LOOSE, expected, parts, pickled, through_state_dict
+from support.sensing.contract import HALVES, LOOSE, expected, parts, pickled, through_state_dict
 from torchtransient.errors import ShapeError
 from torchtransient.sensing import ScoreFunction
 
@@ -56,6 +56,27 @@ def test_dtype_and_device_are_kept(entry):
             assert value.dtype == (dtype.to_complex() if exact.is_complex() else dtype)
             error = (value.to(exact.dtype) - exact).abs().max()
             assert error <= LOOSE[dtype] * (exact.abs().max() + 1e-12)
+
+
+@each
+@pytest.mark.parametrize("dtype", HALVES, ids=str)
+def test_half_precision_is_measured_in_single(entry, dtype):
+    """The mean and every draw of it: of the same numbers in float32, to the bit; the gradient goes back in halves."""
+    for policy in entry.policies if entry.random else (None,):
+        module = entry.module(torch.float32, **({"grad": policy} if policy else {}))
+        x = entry.x(dtype)
+
+        def measured(light, module=module):
+            with ScoreFunction():
+                drawn = module(light, generator=torch.Generator().manual_seed(2))
+                return [value.detach() for value in (*parts(expected(module, light)), *parts(drawn))]
+
+        for found, wanted in zip(measured(x), measured(x.float()), strict=True):
+            assert found.dtype == (torch.complex64 if wanted.is_complex() else torch.float32)
+            assert torch.equal(found, wanted)
+    leaf = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(parts(expected(entry.module(torch.float32), leaf))[0].sum(), leaf)
+    assert gradient.dtype == dtype
 
 
 @each

@@ -163,3 +163,94 @@ def test_distances_and_points():
 def test_errors(call, error):
     with pytest.raises(error, match=r"\w+: expected"):
         call(torch.ones(1, 8, 2, 2))
+
+
+# ------------------------------------------------------------------------------------------- weak and negative light
+
+WINDOW = 128
+ESTIMATORS = {
+    "mass": depth.centre_of_mass,
+    "mass, background off": lambda h: depth.centre_of_mass(h, background=0.05),
+    "mass near": lambda h: depth.centre_of_mass(h, half_width_bins=6),
+    "peak": depth.peak_position,
+    "peak of scores": lambda h: depth.peak_position(
+        depth.log_matched_filter(h, *reversed(GaussianResponse(471e-12).kernel(WIDTH_S)))
+    ),
+    "soft": depth.soft_argmax,
+    "first": lambda h: depth.first_return(h, 0.5).position.squeeze(-3),
+    "first, any light": lambda h: depth.first_return(h, -1.0).position.squeeze(-3),
+    "several": lambda h: depth.multi_return(h, 3, threshold=0.1).position.amax(-3),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("estimate", ESTIMATORS.values(), ids=ESTIMATORS.keys())
+def test_positions_stay_in_the_window(estimate, dtype):
+    """Six counts under the normal surrogate reached +-38000 bins of 128; totals of any sign, none, and huge ones."""
+    g = torch.Generator().manual_seed(0)
+    mean = (torch.tensor([0.0, 1.0, 6.0, 30.0, 1e4], dtype=torch.float64) * pulse(90.3, bins=WINDOW) + 0.05).expand(
+        1, WINDOW, 400, 5
+    )
+    noise = torch.randn(mean.shape, generator=g, dtype=torch.float64)
+    surrogate = mean + mean.sqrt() * noise
+    for x in (surrogate, torch.poisson(mean, generator=g), noise, -mean, surrogate - surrogate.mean(1, keepdim=True)):
+        found = estimate(x.to(dtype))
+        assert found.dtype == torch.promote_types(dtype, torch.float32) and bool(torch.isfinite(found).all())
+        assert bool((found >= 0).all()) and bool((found <= WINDOW).all()), (float(found.min()), float(found.max()))
+
+
+@pytest.mark.parametrize("half_width", [None, 6])
+def test_the_slope_of_a_mass_of_weak_light_is_bounded(half_width):
+    """(reach + 2 reach) over the noise of what counts, N >= the largest entry: none larger, of any total.
+
+    d(M S / N^2) = (x S + M) / N^2 - 2 M S e / N^4 for S < N, with |M| <= reach sqrt(bins) N.
+    """
+    g = torch.Generator().manual_seed(1)
+    mean = (6 * pulse(90.3, bins=WINDOW) + 0.05).expand(1, WINDOW, 40, 100)
+    x = (mean + mean.sqrt() * torch.randn(mean.shape, generator=g, dtype=torch.float64)).requires_grad_()
+    (slope,) = torch.autograd.grad(depth.centre_of_mass(x, half_width_bins=half_width).sum(), x)
+    reach, bins = (WINDOW / 2, WINDOW) if half_width is None else (half_width, 2 * half_width + 1)
+    if half_width is None:
+        noise = x.detach().square().sum(1, keepdim=True).sqrt()
+        assert bool((slope.abs() * noise <= reach * (1 + 3 * bins**0.5)).all())
+    assert float(slope.abs().max()) < 3 * reach * bins**0.5
+
+
+def test_a_mass_of_positive_light_is_what_it_was():
+    """One photon anywhere, the ends too; and unbiased over counts less their background as soon as there are some."""
+    for k in (0, 1, 63, WINDOW - 1):
+        x = torch.zeros(1, WINDOW, 1, 1)
+        x[0, k] = 3.0
+        assert float(depth.centre_of_mass(x)) == k + 0.5
+        assert float(depth.centre_of_mass(x, half_width_bins=4)) == k + 0.5
+        leaf = x.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(depth.centre_of_mass(leaf).sum(), leaf)
+        wanted = (torch.arange(WINDOW) - k) / 3.0
+        torch.testing.assert_close(slope.flatten(), wanted)
+    mean = (200 * pulse(90.3, bins=WINDOW) + 0.05).expand(1, WINDOW, 50, 200)
+    g = torch.Generator().manual_seed(2)
+    counts = torch.poisson(mean, generator=g)
+    surrogate = mean + mean.sqrt() * torch.randn(mean.shape, generator=g, dtype=torch.float64)
+    for x in (counts, surrogate):
+        found = depth.centre_of_mass(x, background=0.05)
+        # a ratio of noisy sums: of second order (position - middle) background / light^2, 1e-2 of the spread here
+        assert abs(float(found.mean()) - 90.3) < 4 * float(found.std()) / 100 + 26.3 * 6.4 / 200**2
+        assert float(found.std()) < 0.7
+
+
+def test_light_that_is_no_light_has_no_returns():
+    """An empty pixel under a threshold that is a share of its largest entry; an even one."""
+    for x in (torch.zeros(1, 12, 1, 2), -torch.ones(1, 12, 1, 2)):
+        assert not bool(depth.first_return(x, 0.5 * x.amax(1)).valid.any())
+        assert not bool(depth.multi_return(x, 2, threshold=-2.0).valid.any())
+    assert not bool(depth.multi_return(torch.ones(1, 12, 1, 1), 2, threshold=0.0).valid.any())
+    x = torch.zeros(1, 12, 1, 1)
+    x[0, 5] = 2.0
+    assert float(depth.first_return(x, 0.0).position) == 4.5  # where it leaves zero
+    assert float(depth.first_return(x, 1.0).position) == 5.0
+
+
+def test_the_bound_wants_numbers_of_detections():
+    for wrong in (torch.tensor([-1.0]), 5.0):
+        with pytest.raises(UnitError, match="range_deviation_m: expected"):
+            depth.range_deviation_m(50e-12, wrong)

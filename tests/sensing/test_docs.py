@@ -19,6 +19,10 @@ def test_example():
     assert names["counts"].shape == (1, 512, 8, 8)
     assert bool(torch.isfinite(names["loss"]))
     assert bool(torch.isfinite(names["rate"]).all())
+    (bound,) = (block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+                if "crlb" in block)  # fmt: skip
+    exec(compile(bound, str(PAGE), "exec"), names)
+    assert 0 < float(names["millimetres"]) < 1
 
 
 def test_modules_that_it_names_exist():

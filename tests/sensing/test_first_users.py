@@ -86,7 +86,7 @@ def test_phase_of_nan_is_nan(code):
     taps = 0.1 + light(1, 3, 2, 3)
     taps[0, 1, 0, 0] = math.nan
     reading = sensing.read_itof(taps, (40e6,), 3, code=code)
-    for value in (reading.phase, reading.amplitude, reading.confidence, reading.depth_m):
+    for value in (reading.phase, reading.amplitude, reading.depth_std_m, reading.depth_m):
         assert bool(value[..., 0, 0].isnan().all())
         assert int(value.isnan().sum()) == 1
 
@@ -95,9 +95,9 @@ def test_phase_of_nan_is_nan(code):
     "loss",
     [
         losses.poisson_nll,
-        lambda n, r: losses.first_photon_nll(n, r, 100),
-        lambda n, r: losses.free_running_nll(n, r, 100, 2.5),
-        lambda n, r: losses.read_noise_nll(n, r, 2.0),
+        lambda r, n: losses.first_photon_nll(r, n, 100),
+        lambda r, n: losses.free_running_nll(r, n, 100, 2.5),
+        lambda r, n: losses.read_noise_nll(r, n, 2.0),
     ],
     ids=["poisson", "first photon", "free running", "read noise"],
 )
@@ -149,7 +149,7 @@ def test_darkness_behind_a_transform_is_dark():
     assert float(rate.min()) == 0.0
     assert float(mean.min()) >= 0.0
     counts = spad.sample(rate, generator())
-    assert bool(torch.isfinite(losses.poisson_nll(counts, mean)))
+    assert bool(torch.isfinite(losses.poisson_nll(mean, counts)))
     # what is negative stays negative, and sums and the transpose are those of the plain transform
     torch.testing.assert_close(response(-x), -rate, rtol=0, atol=1e-14)
     u, v = light(1, 512, 1, 1) - 0.5, light(1, 512, 1, 1, seed=1) - 0.5
@@ -256,7 +256,7 @@ def test_half_precision_leaves_physical_numbers_alone(dtype):
         bin_width_s=50 * PS,
     )
     network = torch.nn.Conv3d(1, 1, 1)
-    chain = sensing.Compose([budget, sensing.ImpulseResponse(response, bin_width_s=50 * PS), network])
+    chain = sensing.Compose([sensing.ImpulseResponse(response, bin_width_s=50 * PS), budget, network])
     model = torch.nn.Sequential(chain, sensing.FreeRunningSPAD(10, 75e-9, bin_width_s=1e-9)).to(dtype)
     assert network.weight.dtype == dtype
     assert float(response.fwhm_s.detach()) == pytest.approx(60e-12, rel=1e-12)
@@ -318,7 +318,7 @@ def test_what_first_users_get_wrong_is_named(call, error, words):
 
 @pytest.mark.parametrize(
     "loss",
-    [losses.poisson_nll, lambda n, r, **k: losses.first_photon_nll(n, r, 10**6, **k)],
+    [losses.poisson_nll, lambda r, n, **k: losses.first_photon_nll(r, n, 10**6, **k)],
     ids=["poisson", "first photon"],
 )
 def test_items_of_a_batch_do_not_touch(loss):
@@ -328,7 +328,7 @@ def test_items_of_a_batch_do_not_touch(loss):
 
     def both(r, n):
         leaf = r.clone().requires_grad_()
-        value = loss(n, leaf, reduction="none")
+        value = loss(leaf, n, reduction="none")
         return value.detach(), torch.autograd.grad(value.sum(), leaf)[0]
 
     together = both(mean, counts)
@@ -341,19 +341,23 @@ def test_items_of_a_batch_do_not_touch(loss):
 def test_loss_of_half_precision_is_single(dtype):
     """A network under autocast: 1e3 counts have a square that float16 cannot hold. 8 bits of the mean: 2 %."""
     counts, mean = torch.full((1, 4, 1, 1), 1000.0), torch.full((1, 4, 1, 1), 3.0, dtype=dtype, requires_grad=True)
-    for loss in (losses.poisson_nll, lambda n, m: losses.read_noise_nll(n, m, 2.0)):
-        value = loss(counts, mean)
-        wanted = loss(counts.double(), mean.detach().double())
+    for loss in (losses.poisson_nll, lambda m, n: losses.read_noise_nll(m, n, 2.0)):
+        value = loss(mean, counts)
+        wanted = loss(mean.detach().double(), counts.double())
         assert value.dtype == torch.float32
         assert float(value.detach()) == pytest.approx(float(wanted), rel=0.02)
         assert bool(torch.isfinite(torch.autograd.grad(value, mean)[0]).all())
 
 
-def test_floor_of_an_item_in_the_dark_is_usable():
+def test_slope_of_an_item_in_the_dark_is_usable():
+    """1e9, whose square single precision holds; with a floor of the model's scale at most 1e4."""
     mean = torch.stack([torch.ones(1, 4, 2, 2), torch.zeros(1, 4, 2, 2)]).requires_grad_()
-    loss = losses.poisson_nll(torch.ones_like(mean), mean, reduction="sum")
-    loss.backward()
-    assert bool(torch.isfinite(loss)) and float(mean.grad.abs().max()) < 1e4
+    counts = torch.ones_like(mean)
+    for floor, most in ((None, 1.001e9), (losses.relative_floor(mean, measured=counts), 1e4)):
+        loss = losses.poisson_nll(mean, counts, floor=floor, reduction="sum")
+        (slope,) = torch.autograd.grad(loss, mean)
+        assert bool(torch.isfinite(loss)) and float(slope.abs().max()) < most
+        assert bool(torch.isfinite(slope.square().sum()))
 
 
 @pytest.mark.parametrize("value", [True, "100", torch.tensor(True), torch.tensor([100.0]), None])
@@ -366,5 +370,5 @@ def test_numbers_are_those_of_the_whole_library(value):
 def test_counts_below_zero_keep_their_weight():
     """A normal surrogate goes below 0: the mean loss over +n and -n is that of no counts."""
     mean = 0.1 + light(1, 6, 1, 1)
-    pair = [losses.poisson_nll(sign * torch.full_like(mean, 0.5), mean, floor=0.0) for sign in (1, -1)]
-    torch.testing.assert_close(sum(pair) / 2, losses.poisson_nll(torch.zeros_like(mean), mean, floor=0.0))
+    pair = [losses.poisson_nll(mean, sign * torch.full_like(mean, 0.5)) for sign in (1, -1)]
+    torch.testing.assert_close(sum(pair) / 2, losses.poisson_nll(mean, torch.zeros_like(mean)))

@@ -15,6 +15,7 @@ from torchtransient.sensing import (
     GaussianResponse,
     ImpulseResponse,
     MeasuredResponse,
+    Response,
     TailedResponse,
     UniformResponse,
     convolve_time,
@@ -73,8 +74,8 @@ def test_emg_derivatives_are_finite_and_right():
         assert bool(torch.isfinite(value))
 
 
-def test_gaussian_kernel_is_the_difference_of_error_functions():
-    first, weights = GaussianResponse(60 * PS, delay_s=13 * PS).kernel(16 * PS)
+def test_central_gaussian_kernel_is_the_difference_of_error_functions():
+    first, weights = GaussianResponse(60 * PS, delay_s=13 * PS).kernel(16 * PS, within_bin="center")
     edges = (np.arange(first, first + weights.numel() + 1) - 0.5) * 16
     wanted = np.diff(stats.norm(13, 60 / FWHM_PER_SIGMA).cdf(edges))
     np.testing.assert_allclose(weights.numpy(), wanted / wanted.sum(), atol=1e-13)
@@ -82,6 +83,118 @@ def test_gaussian_kernel_is_the_difference_of_error_functions():
     assert float(weights[-2]) == pytest.approx(
         np.diff(stats.norm(13, 60 / FWHM_PER_SIGMA).sf(edges))[-2] * -1, rel=1e-6
     )
+
+
+def test_a_narrow_response_over_wide_bins_keeps_what_evenly_spread_photons_keep():
+    """28 ps over 64 ps: 85.2 % stay in the bin, where light in its middle would keep 99.3 %."""
+    first, weights = GaussianResponse(28 * PS).kernel(64 * PS)
+    sigma = 28 / FWHM_PER_SIGMA / 64
+    # 1 - E|delay| / bin, up to delays of more than a bin (5.4 sigma)
+    assert float(weights[-first]) == pytest.approx(1 - sigma * np.sqrt(2 / np.pi), abs=1e-7)
+    assert float(weights[-first]) == pytest.approx(0.852, abs=5e-4)
+    first, central = GaussianResponse(28 * PS).kernel(64 * PS, within_bin="center")
+    assert float(central[-first]) == pytest.approx(0.993, abs=5e-4)
+
+
+SHAPES = {
+    "gaussian": GaussianResponse(60 * PS, 13 * PS),
+    "narrow": GaussianResponse(1 * PS, 5 * PS),
+    "emg": emg_response(40 * PS, 70 * PS, -9 * PS),
+    "tails": TailedResponse(27 * PS, [60 * PS, 200 * PS], [0.3, 0.05]),
+    "uniform": UniformResponse(50 * PS, 3 * PS),
+    "measured": MeasuredResponse(torch.tensor([0.0, 2, 9, 30, 12, 5, 3, 1, 0, 0, 0, 0, 0]), 7 * PS, 4 * PS),
+    "composed": ComposedResponse([GaussianResponse(30 * PS), emg_response(20 * PS, 50 * PS, 6 * PS)]),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_kernels_against_photons_anywhere_in_their_bin(name):
+    """The shares that photons at 1024 places of a bin leave in later bins; a midpoint rule: 1e-5 at corners."""
+    response, width = SHAPES[name], 16.0
+    first, weights = response.kernel(width * PS)
+    lags = torch.arange(first, first + weights.numel() + 1, dtype=torch.float64)
+    place = (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024
+    single = ComposedResponse([response]) if name != "composed" else None
+    edges = (lags.unsqueeze(1) - place) * width * PS
+    if single is None:  # normal cores add up to one
+        core = (30**2 + 20**2) ** 0.5
+        response = emg_response(core * PS, 50 * PS, 6 * PS)
+    else:
+        assert torch.equal(single.kernel(width * PS)[1], weights)
+    shares = response.cdf(edges.flatten()).view(edges.shape).mean(1).diff()
+    corners = name in ("uniform", "measured")
+    np.testing.assert_allclose(weights.numpy(), shares.numpy(), atol=3e-7 + 1e-5 * corners)
+    assert float(weights.min()) >= 0 and float(weights.sum()) == pytest.approx(1, abs=1e-12)
+
+
+def test_late_and_early_tails_keep_their_digits():
+    """Against 40 digits, where the share is below 1e-7: normal on one side, exponential on the other."""
+    sigma, tau, width = 27 / FWHM_PER_SIGMA, 60.0, 16.0
+    first, weights = emg_response(27 * PS, tau * PS).kernel(width * PS)
+    with mpmath.workdps(40):
+        s, e = mpmath.mpf(sigma), mpmath.mpf(tau)
+
+        def integral(t):
+            u = t / s
+            normal = s * (u * mpmath.ncdf(u) + mpmath.npdf(u))
+            tail = mpmath.exp(s * s / (2 * e * e) - t / e) * mpmath.ncdf(u - s / e)
+            return normal - e * (mpmath.ncdf(u) - tail)
+
+        for k in (1, weights.numel() - 3):
+            t = mpmath.mpf(width) * (first + k)
+            exact = (integral(t + width) - 2 * integral(t) + integral(t - width)) / width
+            assert 0 < exact < 1e-7
+            assert float(weights[k]) == pytest.approx(float(exact), rel=1e-8)
+
+
+class Triangle(Response):
+    """A user's own: nothing but the cumulative of a triangle, 2 h wide, around 20 ps."""
+
+    def __init__(self, half_s):
+        super().__init__(20 * PS, learnable=True)
+        self.half_s = half_s
+
+    def cdf(self, time_s):
+        u = ((time_s - self.delay_s) / self.half_s).clamp(-1, 1)
+        return 0.5 + u - 0.5 * u * u.abs()
+
+    def support_s(self):
+        middle = float(self.delay_s.detach())
+        return middle - self.half_s, middle + self.half_s
+
+
+@pytest.mark.parametrize("half, error", [(16.0, 1e-4), (4.0, 1e-4), (0.01, 1e-4), (900.0, 1e-7)])
+def test_a_response_that_gives_its_cumulative_alone(half, error):
+    """Its integral is a cubic: the numerical default against it, wide and narrow, and through gradients."""
+    response, width = Triangle(half * PS), 16.0
+    first, weights = response.kernel(width * PS)
+    t = (torch.arange(first - 1, first + weights.numel() + 1, dtype=torch.float64) * width - 20) / half
+    u = t.clamp(-1, 1)
+    area = half * (0.5 * u + 0.5 * u * u - u.abs() ** 3 / 6 + 1 / 6 + (t - u).clamp_min(0))
+    np.testing.assert_allclose(weights.detach().numpy(), (area.diff().diff() / width).numpy(), atol=error)
+    weights[0].backward()
+    assert bool(torch.isfinite(response.delay_ps.grad))
+
+
+def test_very_long_responses_lose_no_digits():
+    """100 000 bins of width: second differences would leave 1e-4 of noise on every share."""
+    first, weights = GaussianResponse(1e5 * PS).kernel(1 * PS)
+    sigma = 1e5 / FWHM_PER_SIGMA
+    t = np.arange(first, first + weights.numel())
+    np.testing.assert_allclose(weights.numpy(), stats.norm(0, sigma).pdf(t), rtol=1e-8)
+
+
+def test_the_place_in_a_bin_is_a_choice():
+    x = torch.zeros(1, 9, 1, 1, dtype=torch.float64)
+    x[:, 4] = 1
+    response, width = GaussianResponse(28 * PS), 64 * PS
+    layers = [ImpulseResponse(response, bin_width_s=width, within_bin=w) for w in ("uniform", "center")]
+    even, middle = (layer(x).flatten()[4].item() for layer in layers)
+    assert even < 0.86 < 0.99 < middle
+    with pytest.raises(ShapeError, match="within_bin to be one of uniform, center"):
+        ImpulseResponse(GaussianResponse(28 * PS), bin_width_s=64 * PS, within_bin="start")
+    with pytest.raises(ShapeError, match="within_bin"):
+        GaussianResponse(28 * PS).kernel(64 * PS, within_bin="start")
 
 
 @pytest.mark.parametrize(
@@ -109,19 +222,33 @@ def test_moments(response, mean, variance):
     assert float(weights.sum()) == pytest.approx(1, abs=1e-12)
     found_mean, found_variance = moments(first, weights, width)
     assert found_mean == pytest.approx(mean, abs=1e-3 * max(1.0, mean))
-    # binning adds width^2/12, as do the fine grids of a composed response, width^2/12/81 each
+    # the places in both bins add width^2/12 each, as do those of the fine grids of a composed response
     grids = 1 + (3 / 81 if isinstance(response, ComposedResponse) else 0)
-    # the edges of a uniform distribution fall inside bins, whose light counts at their middle
-    loose = 2e-3 if isinstance(response, UniformResponse) else 1e-5
-    assert found_variance - width**2 / 12 * grids == pytest.approx(variance, rel=loose)
+    # (that of a split between two bins averages to width^2/6 over all places, not where a box ends inside a bin)
+    box = isinstance(response, (UniformResponse, ComposedResponse))
+    assert found_variance - width**2 / 6 * grids == pytest.approx(variance, rel=2e-3 if box else 1e-5)
 
 
 def test_composition_of_gaussians_is_a_gaussian():
     together = ComposedResponse([GaussianResponse(30 * PS), GaussianResponse(40 * PS)], oversampling=33)
-    first, weights = together.kernel(10 * PS)
-    begin, wanted = GaussianResponse(50 * PS).kernel(10 * PS)
-    inner = weights[begin - first :][: wanted.numel()]
-    assert float((inner - wanted).abs().max()) < 2e-5  # (10/33)^2/12 of variance twice
+    # (10/33)^2/12 of variance twice on the grid; none in the closed form
+    for within, error in (("center", 2e-5), ("uniform", 1e-8)):
+        first, weights = together.kernel(10 * PS, within)
+        begin, wanted = GaussianResponse(50 * PS).kernel(10 * PS, within)
+        inner = weights[begin - first :][: wanted.numel()]
+        assert float((inner - wanted).abs().max()) < error
+
+
+def test_composition_on_the_grid():
+    """A uniform response among others: against a wider one that is measured finely."""
+    parts = [GaussianResponse(30 * PS), UniformResponse(40 * PS, 7 * PS)]
+    fine_first, fine = ComposedResponse(parts, oversampling=45).kernel(0.25 * PS)
+    measured = MeasuredResponse(fine, 0.25 * PS, (fine_first - 0.5) * 0.25 * PS, align="start", floor=False)
+    first, weights = ComposedResponse(parts, oversampling=9).kernel(10 * PS)
+    begin, wanted = measured.kernel(10 * PS)
+    assert first <= begin
+    # the grids add 2 (10/9)^2/6 to a variance of 300 + 10^2/6: less than 0.15 %, of a peak of a quarter
+    assert float((weights[begin - first :][: wanted.numel()] - wanted).abs().max()) < 3e-4
 
 
 def test_measured_response_keeps_counts_and_centre():
@@ -134,8 +261,8 @@ def test_measured_response_keeps_counts_and_centre():
         mean, variance = moments(first, weights, width / PS)
         assert float(weights.sum()) == pytest.approx(1, abs=1e-12)
         assert mean == pytest.approx(40, abs=0.02 * width / PS)
-        # even spreading inside source and target bins adds the variance of both
-        spread = (8**2 + (width / PS) ** 2) / 12
+        # even spreading inside the bins of the measurement, and inside source and target bins, adds all three
+        spread = (8**2 + 2 * (width / PS) ** 2) / 12
         assert variance == pytest.approx(64 * (4.0**2 + 9.0**2) + spread, rel=0.02)
     # the highest bin, not the mean, would be off by about tau
     peak = int(counts.argmax())

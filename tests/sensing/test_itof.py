@@ -12,7 +12,7 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import itof, itof_codes, itof_depth
+from torchtransient.sensing import itof, itof_codes, itof_depth, itof_reading
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -116,7 +116,7 @@ def test_measured_hamiltonian_functions_look_like_the_code():
     assert best > 0.98
     truth = torch.linspace(0.02, 0.98, 97, dtype=torch.float64)
     taps = (1 + code.evaluate(truth)).reshape(1, 3, 1, -1) / 3
-    phase = itof_depth.decode_code(taps, code, 2048).flatten() / TURN
+    phase = itof_reading.decode_code(taps, code, 2048).flatten() / TURN
     # Samples are 1 / 1939 of a turn apart, joined by straight lines that the decoder's table does not hit exactly.
     assert float(itof_depth.wrapped_difference(phase * TURN, truth * TURN).abs().max()) / TURN < 3e-4
 
@@ -149,10 +149,10 @@ def test_wiggling_in_metres():
     x, axis, truth = delta(torch.arange(0, 1, 1 / 512, dtype=torch.float64), 20e6)
     code = itof_codes.square_code(4)
     taps = itof.ItofCorrelation(code, 20e6, axis).expected(x)
-    error = itof_depth.read_itof(taps, 20e6, 4).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
+    error = itof_reading.read_itof(taps, 20e6, 4).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
     error = torch.remainder(error + 3, SPEED_OF_LIGHT / 40e6) - 3
     assert abs(float(error.abs().max()) - 0.085) < 0.0005
-    decoded = itof_depth.read_itof(taps, 20e6, 4, code=code).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
+    decoded = itof_reading.read_itof(taps, 20e6, 4, code=code).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
     decoded = torch.remainder(decoded + 3, SPEED_OF_LIGHT / 40e6) - 3
     assert float(decoded.abs().max()) < 0.0005
 
@@ -202,7 +202,7 @@ def test_two_paths_give_the_phase_of_the_sum_of_phasors():
         a * torch.exp(torch.tensor(2j * math.pi * 50e6 / SPEED_OF_LIGHT * (k + 0.5) * 0.01, dtype=torch.complex128))
         for k, a in ((200, 3.0), (300, 1.0))
     )
-    reading = itof_depth.read_itof(taps, 50e6, 4)
+    reading = itof_reading.read_itof(taps, 50e6, 4)
     assert abs(float(reading.phase) - float(total.angle())) < 1e-9
     assert 2.005 / 2 + 0.05 < float(reading.depth_m) < 3.005 / 2  # drawn from the first path to the second
 
@@ -225,15 +225,15 @@ def test_phase_noise_within_two_percent(num_taps, read_noise_e):
     swing = modulated * math.cos(3 * TURN * 0.23) if num_taps == 3 else 0.0
     exact = math.sqrt(theory**2 - swing / modulated**2)
     assert abs(float(phase.std()) / exact - 1) < 0.02  # its own standard error is 0.25 %
-    clean = itof_depth.read_itof(taps[..., :1], 20e6, num_taps)
-    predicted = itof_depth.phase_noise_rad(clean.amplitude, clean.offset, num_taps, read_noise_e)
+    clean = itof_reading.read_itof(taps[..., :1], 20e6, num_taps)
+    predicted = itof_reading.phase_noise_rad(clean.amplitude, clean.offset, num_taps, read_noise_e)
     assert abs(float(predicted) / theory - 1) < 1e-5  # the delta stands in a bin of 1 / 4096 turn
-    assert abs(float(clean.confidence) - modulated / total) < 1e-5
+    assert abs(float(clean.amplitude / clean.offset) - modulated / total) < 1e-5
 
 
 def test_the_checked_figure_of_the_phase_noise():
     """B = 10 000, A = 2000 electrons in all: 0.0707 rad."""
-    assert abs(float(itof_depth.phase_noise_rad(torch.tensor(500.0), torch.tensor(2500.0), 4)) - 0.0707) < 1e-4
+    assert abs(float(itof_reading.phase_noise_rad(torch.tensor(500.0), torch.tensor(2500.0), 4)) - 0.0707) < 1e-4
 
 
 @pytest.mark.parametrize("frequencies", [(20e6, 90e6), (60e6, 100e6), (16e6, 80e6, 120e6)])
@@ -278,7 +278,7 @@ def test_decoding_by_shape(name):
     code = CODES[name]
     truth = torch.linspace(0.0, 0.999, 701, dtype=torch.float64)
     taps = (5 + 3 * code.evaluate(truth)).reshape(1, code.num_taps, 1, -1)
-    phase = itof_depth.decode_code(taps, code)
+    phase = itof_reading.decode_code(taps, code)
     error = itof_depth.wrapped_difference(phase.flatten(), TURN * truth)
     assert float(error.abs().max()) < 2e-3  # at the corners of a code the slope is that of neither side
     assert float(error.abs().median()) < 1e-5
@@ -290,7 +290,7 @@ def test_gradient_of_decoding_by_shape(name):
     code = CODES[name]
     truth = torch.tensor([0.11, 0.47, 0.83], dtype=torch.float64, requires_grad=True)
     taps = (5 + 3 * code.evaluate(truth)).reshape(1, code.num_taps, 1, -1)
-    (gradient,) = torch.autograd.grad(itof_depth.decode_code(taps, code).sum() / TURN, truth)
+    (gradient,) = torch.autograd.grad(itof_reading.decode_code(taps, code).sum() / TURN, truth)
     torch.testing.assert_close(gradient, torch.ones_like(gradient), rtol=0.02, atol=0)
 
 
@@ -307,11 +307,12 @@ def test_dark_pixels_have_value_and_gradient_zero():
     taps = torch.zeros(1, 4, 1, 2, dtype=torch.float64)
     taps[..., 1] = 3.0  # light without modulation
     taps.requires_grad_()
-    reading = itof_depth.read_itof(taps, 20e6, 4)
-    (reading.depth_m.sum() + reading.confidence.sum() + reading.amplitude.sum()).backward()
+    reading = itof_reading.read_itof(taps, 20e6, 4)
+    assert bool(reading.depth_std_m.isinf().all())
+    (reading.depth_m.sum() + reading.depth_std_m.sum() + reading.amplitude.sum()).backward()
     assert bool(torch.isfinite(taps.grad).all())
     assert float(reading.depth_m.detach().abs().max()) == 0.0
-    assert float(itof_depth.decode_code(taps.detach(), CODES["hamiltonian4"]).abs().max()) == 0.0
+    assert float(itof_reading.decode_code(taps.detach(), CODES["hamiltonian4"]).abs().max()) == 0.0
 
 
 def test_phasor_loss_crosses_the_branch_cut():
@@ -339,7 +340,8 @@ def test_phase_stays_below_a_turn():
 @pytest.mark.parametrize(
     "call, error",
     [
-        (lambda: itof_codes.sine_code(2), ShapeError),
+        (lambda: itof_codes.sine_code(1), ShapeError),
+        (lambda: itof.tap_weights(itof_codes.sine_code(2), 20e6, TimeAxis(0, 1, 4)), ShapeError),
         (lambda: itof_codes.FourierCode(4, {1: (0.8, 0), 3: (0.3, 0)}), UnitError),
         (lambda: itof_codes.FourierCode(4, {0: (0.8, 0)}), UnitError),
         (lambda: itof_codes.square_code(4, light_duty=1.2), UnitError),
@@ -367,7 +369,7 @@ def test_phase_stays_below_a_turn():
         ),
         (lambda: itof.taps_from_phasor(torch.ones(1, 1, 1, 1), FrequencyAxis((0.0,)), CODES["sine"], 20e6), ShapeError),
         (lambda: itof_depth.tap_phasor(torch.ones(1, 5, 1, 1), 4), ShapeError),
-        (lambda: itof_depth.read_itof(torch.ones(1, 8, 1, 1), 20e6, 4), ShapeError),
+        (lambda: itof_reading.read_itof(torch.ones(1, 8, 1, 1), 20e6, 4), ShapeError),
         (lambda: itof_depth.unwrap_depth(torch.ones(1, 3, 1, 1), (20e6, 50e6)), ShapeError),
         (lambda: itof_depth.unwrap_depth(torch.ones(1, 2, 1, 1), (20e6, 50e6), max_depth_m=-1.0), UnitError),
         (lambda: itof_depth.unwrap_depth(torch.ones(1, 2, 1, 1), (20e6, 50e6), weights=(1, 0)), UnitError),

@@ -10,7 +10,7 @@ import re
 import pytest
 import torch
 
-from torchtransient.sensing import DEVICES, device, frames_to_rate
+from torchtransient.sensing import DEVICES, TailedResponse, device, frames_to_rate
 from torchtransient.sensing.response_shapes import FWHM_PER_SIGMA
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -70,7 +70,7 @@ def test_derived_numbers():
     top = electronics["full_well_e"] / electronics["gain_e_per_dn"] + electronics["black_level_dn"]
     assert 0.99 * 4095 < top < 4095
     for name, sigma_s in (("picoharp300_like", 12e-12), ("hydraharp400_like", 12e-12), ("multiharp150_like", 45e-12)):
-        fwhm_s = stage(name, "ImpulseResponse")["response"]["fwhm_s"]
+        fwhm_s = stage(name, "DetectionJitter")["response"]["fwhm_s"]
         assert abs(fwhm_s - FWHM_PER_SIGMA * sigma_s) < 0.5e-12
     frequencies = stage("kinect_v2_like", "ItofCorrelation")["frequencies_hz"]
     assert abs(SPEED_OF_LIGHT / (2 * math.gcd(*(int(f) for f in frequencies))) - 18.7) < 0.05
@@ -127,10 +127,17 @@ def test_the_fine_chip_has_the_shape_of_its_frames():
     preset = device("tmf882x_like").changed("PhotonBudget", ambient_rate_hz=0.0, dark_count_rate_hz=0.0)
     x = torch.zeros(1, 128, 1, 1, dtype=torch.float64)
     x[:, 40] = 1e-4
-    shape = preset.sensor().stages[1].expected(x).flatten()
+    sensor = preset.sensor()
+    shape = sensor.expected(x * 1e-3).flatten()  # far from pile-up
     shape = shape / shape.sum()
     assert int(shape.argmax()) in (40, 41)
     assert float(shape[:39].sum()) < 0.01
+    # pulse and jitter together are the measured response, but for the places in the bins between the two: 88^2/6 ps^2
+    # more than its variance of 129^2/2.35^2 and 88^2/6, which takes a seventh off the top
+    measured = TailedResponse(129e-12, [103e-12, 549e-12], [0.75, 0.24])
+    first, kernel = measured.kernel(88e-12)
+    wanted = torch.nn.functional.pad(kernel, (40 + first, 0))[:128]
+    assert float((shape - wanted).abs().max()) < float(kernel.max()) / 7
     # Late by 10 bins: 0.24 exp(-880 / 549) and nearly nothing of the fast tail, to the width of a bin.
     late = float(shape[51:].sum())
     assert 0.24 * math.exp(-968 / 549) < late < 0.24 * math.exp(-792 / 549)

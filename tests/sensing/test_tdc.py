@@ -18,17 +18,18 @@ def image(values):
     return torch.as_tensor(values, dtype=torch.float64).reshape(1, -1, 1, 1)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"dither": True},
-        {"sliding_scale": 5},
-        {"offset_bins": 1.3},
-        {"dither": True, "sliding_scale": 3, "offset_bins": -0.4},
-    ],
-)
-def test_against_single_photons(options):
+OPTIONS = [
+    {},
+    {"dither": True},
+    {"sliding_scale": 5},
+    {"offset_bins": 1.3},
+    {"dither": True, "sliding_scale": 3, "offset_bins": -0.4},
+]
+
+
+@pytest.mark.parametrize("boundary", ["zero", "periodic"])
+@pytest.mark.parametrize("options", OPTIONS)
+def test_against_single_photons(options, boundary):
     n, w, rng = 24, widths(), np.random.default_rng(0)
     light = rng.random(n) + 5 * (np.arange(n) == 9)
     times = rng.choice(n, 400_000, p=light / light.sum()) + rng.random(400_000)
@@ -36,15 +37,56 @@ def test_against_single_photons(options):
     dither = rng.random(times.size) if options.get("dither") else 0.0
     codes = np.full(times.size, -1)
     for s in range(options.get("sliding_scale", 1)):
-        edges = np.concatenate([[0.0], np.cumsum(np.roll(w.numpy(), -s))]) + options.get("offset_bins", 0.0)
+        edges = np.concatenate([[0.0], np.cumsum(np.roll(w.numpy(), -s))])
         pick = shift == s
-        codes[pick] = np.searchsorted(edges, times[pick], side="right") - 1
+        local = times[pick] - options.get("offset_bins", 0.0)
+        local = local % n if boundary == "periodic" else local
+        codes[pick] = np.searchsorted(edges, local, side="right") - 1
     # an unknown offset of a fraction of the code that was hit: half the events go to the next one
     codes = codes + (dither > 0.5) * (codes >= 0) if options.get("dither") else codes
+    codes = codes % n if boundary == "periodic" else codes
     seen = np.bincount(codes[(codes >= 0) & (codes < n)], minlength=n)
-    expected = TDC(w, **options)(image(light / light.sum() * times.size)).flatten().numpy()
-    z = (seen - expected) / np.sqrt(np.maximum(expected, 1))
-    assert np.abs(z).max() < 4.5
+    converter = TDC(w, boundary=boundary, **options)
+    counts = image(np.bincount(times.astype(int), minlength=n))
+    expected = converter(image(light / light.sum() * times.size)).flatten().numpy()
+    drawn = converter.sample(counts, torch.Generator().manual_seed(0)).flatten().numpy()
+    for found in (seen, drawn):
+        z = (found - expected) / np.sqrt(np.maximum(expected, 1))
+        assert np.abs(z).max() < 4.5
+    assert np.array_equal(drawn, drawn.round())
+    if boundary == "periodic":
+        assert drawn.sum() == times.size
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_constant_light_has_no_edges(options):
+    """First and last codes get their width, not less for an offset or a dither."""
+    w = widths(24, 0.05)
+    y = TDC(w, **options)(image(torch.full((24,), 3.0))).flatten()
+    long = TDC(w.repeat(5), **options)(image(torch.full((120,), 3.0))).flatten()[48:72]
+    torch.testing.assert_close(y, long, rtol=1e-12, atol=0)
+
+
+def test_dither_draws_whole_counts():
+    """One detection gets one code: the next one for half of them, and never half a count."""
+    x = image(torch.tensor([0.0, 5, 0, 1, 0, 0, 7, 0])).expand(4000, 1, 8, 1, 1)
+    converter = TDC(torch.ones(8), dither=True, grad="straight_through")
+    y = converter(x, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(y, y.round()) and torch.equal(y.sum(-3), x.sum(-3))
+    later = y[:, 0, 7, 0, 0]
+    # binomial(7, 1/2): standard errors of mean and variance over 4000 draws
+    assert abs(float(later.mean()) - 3.5) < 5 * (1.75 / 4000) ** 0.5
+    assert abs(float(later.var()) - 1.75) < 5 * 1.75 * (2 / 4000) ** 0.5
+    # means stay means, and light in front of a detector is never drawn
+    assert torch.equal(converter.sample(0.3 * x), converter.expected(0.3 * x))
+    light = TDC(torch.ones(8), dither=True, acts_on="rates", grad="straight_through")
+    assert torch.equal(light(x), converter.expected(x)) and torch.equal(light.sample(x), converter.expected(x))
+
+
+def test_codes_that_do_not_fill_the_window_have_ends():
+    x = image(torch.ones(24))
+    assert float(TDC(torch.full((24,), 0.9))(x).sum()) == pytest.approx(0.9 * 24)
+    assert not TDC(torch.full((24,), 0.9)).goes_round and TDC(widths().float()).goes_round
 
 
 def test_ideal_converter_changes_nothing_and_widths_show_in_even_light():

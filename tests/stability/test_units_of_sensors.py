@@ -66,10 +66,13 @@ def test_one_speed_of_light():
 def test_a_chain_in_other_bins_is_refused():
     chain = sensing.Compose([sensing.ImpulseResponse(sensing.GaussianResponse(100e-12), AXIS)])
     chain.check_axis(SAME)
+    for make in (lambda: TimeAxis.from_seconds(1.5, 0.006, 1500), lambda: TimeAxis(1.5, AXIS.bin_width_s, 1500)):
+        with pytest.raises(UnitError, match="metres"):  # taken for seconds, and seconds for them
+            make()
     for other in (
-        TimeAxis.from_seconds(1.5, 0.006, 1500),  # metres taken for seconds
-        TimeAxis(1.5, AXIS.bin_width_s, 1500),  # seconds taken for metres
+        TimeAxis(1.5, seconds_to_opl(0.006), 1500),  # metres taken for seconds, and meant
         TimeAxis(1.5, 0.003, 1500),  # distance taken for optical path
+        TimeAxis(1.5, 0.006, 1499),
     ):
         with pytest.raises(UnitError, match="axis of stage"):
             chain.check_axis(other)

@@ -60,7 +60,6 @@ class LossCase:
     mapped: bool = True  # torch.vmap
     floors_detached: bool = False  # the scale of an item goes in without gradient
     dim: int | None = None  # where time is, of losses that want to know it
-    measurement_first: bool = False  # likelihoods (counts, mean)
     second: Callable[..., torch.Tensor] | None = None  # what a loss of (input, another, target) is given as another
 
     def tensors(self, seed=0, dtype=torch.float64):
@@ -73,7 +72,7 @@ class LossCase:
             return (input,)
         if self.second is not None:
             return input, self.second(input), target
-        return (target, input) if self.measurement_first else (input, target)
+        return input, target
 
     def __call__(self, input, target, mask=None, reduction="mean", **more):
         return self.function(*self.arguments(input, target), **self.options, **more, mask=mask, reduction=reduction)
@@ -108,8 +107,8 @@ def _phasors(name, **options):
 
 def _likelihood(name, function, module, **options):
     return LossCase(
-        name, function, module, {"floor": 1e-3, **options}, draw_target=counts, crop=PIXELS, symmetric=False,
-        zero_at_equality=False, mapped=False, dim=-3, measurement_first=function.__name__.endswith("nll"),
+        name, function, module, options, draw_target=counts, crop=PIXELS, symmetric=False,
+        zero_at_equality=False, mapped=False, dim=-3,
     )  # fmt: skip
 
 
@@ -144,7 +143,7 @@ CASES = [
              {**WIDTH, "per_root_count": True}, symmetric=False, floors_detached=True, dim=-3),
     LossCase("many scales", losses.multiscale_loss, losses.MultiscaleLoss, {"scales": (1, 2, 3)}, dim=-3),
     LossCase("many scales, first photon", losses.multiscale_loss, losses.MultiscaleLoss,
-             {"compare": functools.partial(losses.first_photon_loss, cycles=CYCLES, floor=1e-3), "scales": (1, 3)},
+             {"compare": functools.partial(losses.first_photon_nll, cycles=CYCLES), "scales": (1, 3)},
              draw_target=counts, crop=None, symmetric=False, zero_at_equality=False, mapped=False, dim=-3),
     LossCase("Anscombe", losses.root_loss, losses.RootLoss),
     LossCase("expected root", losses.expected_root_loss, losses.ExpectedRootLoss, symmetric=False,
@@ -172,16 +171,14 @@ CASES = [
              symmetric=False, floors_detached=True),
     LossCase("SSIM of projections", losses.projection_ssim_loss, losses.ProjectionSSIMLoss,
              {"window": 3, "value_range": 1.1}, crop=None, **VOLUMES),
-    _likelihood("Poisson", losses.poisson_loss, losses.PoissonLoss),
-    _likelihood("Poisson, own floor", losses.poisson_loss, losses.PoissonLoss, floor=None),
-    _likelihood("first photon", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES),
-    _likelihood("first photon, dead time", losses.first_photon_loss, losses.FirstPhotonLoss, cycles=CYCLES,
-                dead_bins=2.0),
-    _likelihood("Poisson, counts first", losses.poisson_nll, losses.PoissonNLL),
-    _likelihood("first photon, counts first", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES),
+    _likelihood("Poisson", losses.poisson_nll, losses.PoissonNLL),
+    _likelihood("Poisson, floor", losses.poisson_nll, losses.PoissonNLL, floor=1e-3),
+    _likelihood("first photon", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES),
+    _likelihood("first photon, dead time and floor", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES,
+                dead_bins=2.0, floor=1e-3),
     _likelihood("free running", losses.free_running_nll, losses.FreeRunningNLL, periods=CYCLES, dead_bins=2.5),
     LossCase("read noise", losses.read_noise_nll, losses.ReadNoiseNLL, {"read_noise": 0.7}, draw_target=counts,
-             symmetric=False, zero_at_equality=False, measurement_first=True),
+             symmetric=False, zero_at_equality=False),
 ]
 # What is public and no loss of (input, target): parts of losses and losses of other things, of one tensor each.
 OTHERS = {

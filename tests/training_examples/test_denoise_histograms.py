@@ -44,7 +44,7 @@ def test_the_likelihood_that_is_lost():
     assert lost(mean + 1e-9, mean).item() == pytest.approx(0.0, abs=1e-6)
     rate = torch.tensor([2.0, 0.5, 4.0]).reshape(1, 1, 3, 1)
     # The difference of two Poisson log-likelihoods of these counts.
-    likely = [tt.losses.poisson_nll(mean, of, floor=0.0, reduction="sum") for of in (rate, mean)]
+    likely = [tt.losses.poisson_nll(of, mean, reduction="sum") for of in (rate, mean)]
     assert lost(rate, mean).item() == pytest.approx((likely[0] - likely[1]).item(), abs=1e-6)
 
 

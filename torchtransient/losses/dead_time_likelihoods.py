@@ -1,8 +1,8 @@
 """Negative log-likelihoods of detectors that are dead after a detection: first-photon and free-running.
 
-Rates and histograms, floors, masks and `dim` as those of `likelihoods.py`. A bin that does not count still takes cycles
-from those behind it, only pixels without any bin that counts are not looked at: NaN in one is NaN in the loss of those
-behind it (free-running: of the pixel). `first_photon_loss(input, target)` is the same with the model first.
+Rates and histograms, their order, what happens in the dark, floors, masks and `dim` as in `likelihoods.py`. A bin that
+does not count still takes cycles from those behind it, only pixels without any bin that counts are not looked at: NaN
+in one is NaN in the loss of those behind it (free-running: of the pixel).
 """
 
 from __future__ import annotations
@@ -25,11 +25,18 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.comparison import reduce as _reduce
 from torchtransient.losses.layouts import as_columns, bins_dim, check_held
-from torchtransient.losses.likelihoods import Options, check_constant, check_counts, check_rates, floored
+from torchtransient.losses.likelihoods import (
+    check_constant,
+    check_prediction,
+    check_rates,
+    count_log,
+    dark_level,
+    floored,
+)
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
 from torchtransient.sensing.dead_time_cycle import check_dead_bins
-from torchtransient.sensing.spad import first_photon_log_prob
+from torchtransient.sensing.spad import exposed_cycles, first_photon_log_prob
 
 _TIME = -3
 
@@ -44,16 +51,17 @@ def _check_dead_time(dead_bins: float, where: str) -> float:
     return number
 
 
-def _exact(measured: Tensor, mask: Tensor | None, dim: int) -> Tensor:
+def _exact(target: object, mask: Tensor | None, dim: int) -> Tensor:
     """Counts in double precision, 0 in pixels of which no bin counts: detectors that are dead need sums of them."""
-    counts = measured.to(torch.float64)
+    # as they were given: single precision, that of the pair, may not hold them
+    counts = check_dense((target,), "counts")[0].to(torch.float64)
     return counts if mask is None else counted(counts, mask.any(dim, keepdim=True))
 
 
-@reads(counts=TRANSIENT, rate=TRANSIENT)
+@reads(input=TRANSIENT, target=TRANSIENT)
 def first_photon_nll(
-    counts: Transient,
-    rate: Transient,
+    input: Transient,
+    target: Transient,
     cycles: int,
     *,
     dead_bins: float | None = None,
@@ -65,51 +73,44 @@ def first_photon_nll(
 ) -> Tensor:
     """-log-likelihood of a synchronous SPAD's histogram: binomial in each bin given the cycles still armed.
 
-    -(n log(1 - exp(-r)) - r (armed - n)), r = rate + floor, convex in r, least at the Coates estimate. `counts`:
-    (..., C, T, H, W) of `cycles` cycles; `rate`: expected detections per cycle and bin of a detector that is never
-    dead; `dead_bins`: several detections per cycle (`SynchronousSPAD`). `floor` as in `poisson_nll`. Raises ShapeError;
-    UnitError for negative rates or more counts than cycles.
+    -(n log(1 - exp(-r)) - r (armed - n)), convex in r, least at the Coates estimate. `input`: r (..., C, T, H, W),
+    expected detections per cycle and bin of a detector that is never dead, from none to any number; `target`: n, the
+    histogram of `cycles` cycles, of the same shape; `dead_bins`: several detections per cycle (`SynchronousSPAD`).
+    Exact; `floor`, in the unit of r, as in `poisson_nll`. Flat beyond the width of a pulse: from farther away take
+    `multiscale_loss` of it (docs/losses.md). Raises as `poisson_nll`, and UnitError for more counts than cycles.
     """
-    options = Options(floor, dim, mask, reduction, constant)
-    return _first_photon(counts, rate, cycles, dead_bins, options, "first_photon_nll")
-
-
-@reads(input=TRANSIENT, target=TRANSIENT)
-def first_photon_loss(
-    input: Transient,
-    target: Transient,
-    cycles: int,
-    *,
-    dead_bins: float | None = None,
-    floor: Tensor | float | None = None,
-    dim: int | None = None,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
-) -> Tensor:
-    """`first_photon_nll(target, input, cycles)`: a model's rates per cycle and bin against a histogram of counts.
-
-    Flat beyond the width of a pulse: from farther away take `multiscale_loss` of it (docs/losses.md).
-    """
-    options = Options(floor, dim, mask, reduction)
-    return _first_photon(target, input, cycles, dead_bins, options, "first_photon_loss")
-
-
-def _first_photon(
-    given: object, model: object, cycles: int, dead_bins: float | None, options: Options, where: str
-) -> Tensor:
-    check_reduction(options.reduction, where)
-    (measured, _), rate = check_dense((given, model), where), check_counts(given, model, where)[1]
+    where = "first_photon_nll"
+    check_reduction(reduction, where)
+    rate = check_prediction(input, target, where)[0]
     number = check_whole("cycles", cycles, where, UnitError)
     dead = None if dead_bins is None else _check_dead_time(dead_bins, where)
-    dim = bins_dim(rate, options.dim, where)
-    mask = check_mask(options.mask, rate, where)
+    dim = bins_dim(rate, dim, where)
+    mask = check_mask(mask, rate, where)
     rate = counted(rate, mask, 1.0)
     check_rates(rate, where)
-    measured = _exact(measured, mask, dim)
-    check_constant(measured, options.constant, where)
-    n, r = (as_columns(x, dim) for x in (measured, floored(rate, measured / number, options, mask, where)))
-    value = -first_photon_log_prob(n, r, number, dead, constant=options.constant, where=where).reshape(rate.shape)
-    return _reduce(value, options.reduction, where, mask)
+    measured = _exact(target, mask, dim)
+    check_constant(measured, constant, where)
+    n, r = as_columns(measured, dim), as_columns(floored(rate, floor, where), dim).to(torch.float64)
+    level = dark_level(n, floor, number)
+    dark = None if level is None else _dark(n, r, level)
+    near = r if level is None or dark is None else torch.where(dark, level, r)
+    value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
+    if level is not None and dark is not None:
+        # the tangent: what does not fire is linear in the rate anyway
+        least = torch.where(dark, level, 1.0)
+        quiet = (exposed_cycles(n, number, dead) - n).clamp_min(0)
+        value = value + torch.where(dark, (quiet - n / torch.expm1(least)) * (r - least), 0.0)
+    return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
+
+
+def _dark(n: Tensor, r: Tensor, level: Tensor) -> Tensor | None:
+    """Counts where rates are below the level; None without any, as a rule."""
+    below = r < level
+    found = below & (n != 0) if bool(below.any()) else below
+    return found if bool(found.any()) else None
+
+
+first_photon_loss = first_photon_nll
 
 
 def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
@@ -134,10 +135,10 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
     return periods - window - edges
 
 
-@reads(counts=TRANSIENT, rate=TRANSIENT)
+@reads(input=TRANSIENT, target=TRANSIENT)
 def free_running_nll(
-    counts: Transient,
-    rate: Transient,
+    input: Transient,
+    target: Transient,
     periods: int,
     dead_bins: float,
     *,
@@ -148,20 +149,21 @@ def free_running_nll(
 ) -> Tensor:
     """-log-likelihood of a free-running SPAD's histogram with non-paralyzable dead time, up to a constant.
 
-    That of photons while the detector is armed, which the histogram alone tells (`armed_periods`): r armed - n log(r).
+    That of photons while the detector is armed, which the histogram alone tells (`armed_periods`): r armed - n log(r),
+    r = `input`, photons per period and bin, n = `target`, the counts of `periods` periods.
     Exact but for the periods at both ends of the exposure and the places of detections inside a bin: the error of the
     best rate, r = n/armed, is second order in the counts of a bin per period. Its least is where Rapp et al. and Gupta
     et al. (see `sensing.free_running`) put it. Arguments as in `first_photon_nll`.
     """
     where = "free_running_nll"
     check_reduction(reduction, where)
-    (measured, _), rate = check_dense((counts, rate), where), check_counts(counts, rate, where)[1]
+    rate = check_prediction(input, target, where)[0]
     periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
     dim = bins_dim(rate, dim, where)
     mask = check_mask(mask, rate, where)
     rate = counted(rate, mask, 1.0)
     check_rates(rate, where)
-    n = as_columns(_exact(measured, mask, dim), dim)
+    n = as_columns(_exact(target, mask, dim), dim)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the places inside a bin leave an uncertainty of about the square root of the counts
     if bool((armed < -(2 + 6 * n.sum(_TIME, keepdim=True).clamp_min(0).sqrt())).any()):
@@ -169,68 +171,32 @@ def free_running_nll(
             f"{where}: expected counts that fit into {periods} periods with dead time {dead_bins:g} bins, "
             "got more. Check periods and dead time."
         )
-    rate = floored(rate, n.reshape(rate.shape) / periods, Options(floor, dim, mask, reduction), mask, where)
-    r = as_columns(rate, dim).to(torch.float64)
-    hit = n != 0
-    value = r * armed.clamp_min(0) - torch.where(hit, n * torch.where(hit, r, torch.ones_like(r)).log(), 0.0)
+    r = as_columns(floored(rate, floor, where), dim).to(torch.float64)
+    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, periods))
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
 
 
-class _FirstPhoton(nn.Module):
+class FirstPhotonNLL(nn.Module):
+    """`first_photon_nll(input, target, cycles)` with its options held."""
+
     def __init__(
-        self, cycles: int, dead_bins: float | None, floor: float | None, dim: int | None, reduction: Reduction
+        self,
+        cycles: int,
+        dead_bins: float | None = None,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        where = type(self).__name__
+        where = "FirstPhotonNLL"
         check_held(reduction, dim, where)
         check_option("floor", floor, where, zero=True)
         self.cycles = check_whole("cycles", cycles, where, UnitError)
         self.dead_bins = None if dead_bins is None else _check_dead_time(dead_bins, where)
         self.floor, self.dim, self.reduction = floor, dim, reduction
 
-
-class FirstPhotonNLL(_FirstPhoton):
-    """`first_photon_nll(counts, rate, cycles)` with its options held."""
-
-    def __init__(
-        self,
-        cycles: int,
-        dead_bins: float | None = None,
-        floor: float | None = None,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        # here rather than in the base, whose name Python would give for an argument that is missing
-        super().__init__(cycles, dead_bins, floor, dim, reduction)
-
-    def forward(self, counts: Transient, rate: Transient, mask: Tensor | None = None) -> Tensor:
-        return first_photon_nll(
-            counts,
-            rate,
-            self.cycles,
-            dead_bins=self.dead_bins,
-            floor=self.floor,
-            dim=self.dim,
-            mask=mask,
-            reduction=self.reduction,
-        )
-
-
-class FirstPhotonLoss(_FirstPhoton):
-    """`first_photon_loss(input, target, cycles)` with its options held."""
-
-    def __init__(
-        self,
-        cycles: int,
-        dead_bins: float | None = None,
-        floor: float | None = None,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__(cycles, dead_bins, floor, dim, reduction)
-
     def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
-        return first_photon_loss(
+        return first_photon_nll(
             input,
             target,
             self.cycles,
@@ -242,8 +208,11 @@ class FirstPhotonLoss(_FirstPhoton):
         )
 
 
+FirstPhotonLoss = FirstPhotonNLL
+
+
 class FreeRunningNLL(nn.Module):
-    """`free_running_nll(counts, rate, periods, dead_bins)` with its options held."""
+    """`free_running_nll(input, target, periods, dead_bins)` with its options held."""
 
     def __init__(
         self,
@@ -261,10 +230,10 @@ class FreeRunningNLL(nn.Module):
         self.dead_bins = _check_dead_time(dead_bins, where)
         self.floor, self.dim, self.reduction = floor, dim, reduction
 
-    def forward(self, counts: Transient, rate: Transient, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return free_running_nll(
-            counts,
-            rate,
+            input,
+            target,
             self.periods,
             self.dead_bins,
             floor=self.floor,

@@ -1,26 +1,28 @@
 """Negative log-likelihoods that match the noise of the sensors: Poisson and read noise, and what all of them share.
 
-All take rates or means (..., C, T, H, W) and measurements of the same shape, and are finite, with finite gradients, at
-zero counts, in empty bins and of a model without any light. Where the model says "impossible" (a count where the mean
-is 0) a floor keeps them so: `floor`, in the unit of the mean, is added to it (0 is the exact likelihood, which is
-infinite there). Counts below 0 (those of a normal surrogate) enter the same formulas,
-which are linear in them: the gradient stays unbiased. With `constant` there is no such formula, and they are an error.
-NaN in what counts, in counts or model, is NaN in the loss. Terms that do not depend on the mean are left out unless
-`constant`. Counts may be whole numbers, truth values of frames, or half precision; the loss is computed and returned in
-the precision of the more precise of the two, float32 at least. `dim`: where time is, which also says over what the
-average is (`layouts.py`). `mask`: truth values that broadcast to the tensors, True counts (`comparison.py`).
-`poisson_loss(input, target)` is the same with the model first, as torch and the other losses.
+All take a prediction, rates or means (..., C, T, H, W), and measurements of the same shape: `(input, target)`, as torch
+and the other losses. They are exact, and finite with finite gradients at zero counts, in empty bins and of a model
+without any light. Where the model says "impossible" (a count where the mean is 0) the logarithm goes on as its tangent,
+from a mean of 1e-9 of the counts of the bin on (`count_log`): convex, with a slope, and no fit notices, since as many
+bins as that hold less than one count in all. A `floor` is a choice: in the unit of the mean, it is added to it and
+biases what is as dark as it (0 is the plain formula, infinite there). Counts below 0 (those of a normal surrogate)
+enter the same formulas, which are linear in them: the gradient stays unbiased. With `constant` there is no such
+formula, and they are an error. NaN in what counts, in counts or model, is NaN in the loss. Terms that do not depend on
+the mean are left out unless `constant`. Counts may be whole numbers, truth values of frames, or half precision; the
+loss is computed and returned in the precision of the more precise of the two, float32 at least. `dim`: where time is
+(`layouts.py`). `mask`: truth values that broadcast to the tensors, True counts (`comparison.py`). A measurement in the
+place of the prediction is an error where it shows (`check_prediction`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+import warnings
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
@@ -31,13 +33,20 @@ from torchtransient.losses.comparison import (
     check_pair,
     check_reduction,
     counted,
+    holds,
     item_mean,
     working_dtype,
 )
 from torchtransient.losses.comparison import reduce as _reduce
-from torchtransient.losses.layouts import check_held, item_dims
+from torchtransient.losses.layouts import check_held, item_dims, time_dim
 from torchtransient.losses.results import LIGHT, Light, reads
 
+# Of the counts of a bin: the mean below which its logarithm is continued by the tangent. Bins of so small a mean hold
+# less than one count in a thousand million of them, more than a fit has, so that a fit of exact likelihoods is one of
+# these; and a slope of 1e9 has a square that single precision holds.
+LEAST_MEAN = 1e-9
+# Smaller records are examples made by hand, where whole numbers say nothing.
+_A_RECORD = 64
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
 _RELATIVE_FLOOR = 1e-3
 # Of the counts of an item: a model that is darker than that has the floor of one that is as bright. Small enough that
@@ -45,22 +54,38 @@ _RELATIVE_FLOOR = 1e-3
 _DARK = 0.1
 
 
-class Options(NamedTuple):
-    """What all likelihoods of counts take by name."""
+def check_prediction(input: object, target: object, where: str) -> tuple[Tensor, Tensor]:
+    """Both in their common dtype. Raises ShapeError, DeviceError; UnitError for other numbers.
 
-    floor: Tensor | float | None
-    dim: int | None
-    mask: Tensor | None
-    reduction: Reduction
-    constant: bool = False
-
-
-def check_counts(measured: object, model: object, where: str) -> tuple[Tensor, Tensor]:
-    """Both in their common dtype. Raises ShapeError, DeviceError; UnitError for other numbers and whole models."""
-    pair = check_pair(measured, model, where, names="counts and model")
-    if isinstance(model, Tensor) and not model.is_floating_point():
-        raise UnitError(f"{where}: expected a model of a floating dtype, got {model.dtype}. Use model.float().")
+    What tells that they are the wrong way round is an error: an integer prediction (UnitError), or a target with a
+    gradient and a prediction without (GradientError). Two records without gradients, of which the first one holds
+    counts and the second one does not, may have a reason, and are a warning.
+    """
+    pair = check_pair(input, target, where, names="prediction and counts")
+    if isinstance(input, Tensor) and not input.is_floating_point():
+        raise UnitError(
+            f"{where}: expected a prediction of a floating dtype first and counts second, got {input.dtype} first. "
+            "Take (input, target) in that order; a prediction of whole numbers as input.float()."
+        )
+    if isinstance(input, Tensor) and isinstance(target, Tensor) and not input.requires_grad:
+        if target.requires_grad:
+            raise GradientError(
+                f"{where}: expected the prediction first, got an input without and a target with a gradient. Take "
+                "(input, target) in that order, or target.detach()."
+            )
+        if _are_counts(input) and not _are_counts(target):
+            warnings.warn(
+                f"{where}: the first argument holds counts and the second one does not. The prediction comes first: "
+                "(input, target).",
+                TorchTransientWarning,
+                stacklevel=4,
+            )
     return pair
+
+
+def _are_counts(x: Tensor) -> bool:
+    """Whole numbers, not all alike, of a record, as far as it can be looked at."""
+    return x.numel() >= _A_RECORD and holds((x == x.round()) & (x.amin() != x.amax()))
 
 
 def check_rates(model: Tensor, where: str) -> None:
@@ -76,11 +101,28 @@ def check_constant(counts: Tensor, constant: bool, where: str) -> None:
         raise UnitError(f"{where}: expected counts >= 0 with constant=True, got negative ones. Leave the constant out.")
 
 
-def floored(model: Tensor, expected: Tensor, options: Options, mask: Tensor | None, where: str) -> Tensor:
-    """The model over its floor; `expected`: what was measured, in the unit of the model."""
-    if options.floor is None:
-        return model + _relative_floor(model, item_dims(model, options.dim, where, " or floor="), mask, expected)
-    return model + check_level("floor", options.floor, model, where, zero=True)
+def floored(model: Tensor, floor: Tensor | float | None, where: str) -> Tensor:
+    """The model over the floor that was given."""
+    return model if floor is None else model + check_level("floor", floor, model, where, zero=True)
+
+
+def dark_level(counts: Tensor, floor: object, exposures: int = 1) -> Tensor | None:
+    """Of each bin, the mean per exposure below which a logarithm goes on as its tangent; None with a floor."""
+    if floor is not None:
+        return None
+    return (LEAST_MEAN / exposures * counts.detach().abs()).clamp_min(torch.finfo(counts.dtype).tiny)
+
+
+def count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
+    """`counts log(mean)`; 0 without counts; where the mean is below `least`, the tangent of the logarithm there."""
+    hit = counts != 0
+    dark = None if least is None else hit & (mean < least)
+    if dark is None or least is None or not bool(dark.any()):
+        # where on the input: xlogy(0, 0) has a NaN gradient
+        return torch.where(hit, counts * torch.where(hit, mean, 1.0).log(), 0.0)
+    level = torch.where(dark, least, 1.0)
+    near = torch.where(hit & ~dark, mean, level)
+    return torch.where(hit, counts * (near.log() + torch.where(dark, mean / level - 1, 0.0)), 0.0)
 
 
 def relative_floor(
@@ -123,10 +165,10 @@ def _relative_floor(
     return (share * item).clamp_min(torch.finfo(model.dtype).tiny)
 
 
-@reads(counts=LIGHT, mean=LIGHT)
+@reads(input=LIGHT, target=LIGHT)
 def poisson_nll(
-    counts: Light,
-    mean: Light,
+    input: Light,
+    target: Light,
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
@@ -134,55 +176,39 @@ def poisson_nll(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """-log of the Poisson probability of `counts`: m - n log m (+ log n! with `constant`), m = mean + floor.
+    """-log of the Poisson probability of counts: m - n log m (+ log n! with `constant`), m = input, n = target.
 
-    `floor` None: 1e-3 of the average of each item (`relative_floor`, of a dark one by its counts), which biases empty
-    bins by as much; 0: the exact likelihood, infinite where a count meets a mean of 0. Empty bins have value m and
-    gradient 1 even at m = 0. A mean that is a noisy render biases a fit, by many times the noise of the counts
-    (docs/noisy_renders.md). Raises ShapeError for different shapes, UnitError for negative means.
+    `input`: mean counts of a model, any shape; `target`: counts, of the same shape. Exact: a bin without counts has
+    value m and gradient 1, at m = 0 too; a count in a bin of mean 0 costs about 20 nats and pulls with a slope of 1e9.
+    `floor`: m = input + floor instead, which biases bins as dark as it; 0: infinite where a count meets a mean of 0.
+    `relative_floor` makes one of the model. `dim` is looked at only: nothing here goes along time.
+    An input that is a noisy render biases a fit, by many times the noise of the counts (docs/noisy_renders.md): its
+    logarithm turns noise into an error. Raises ShapeError for different shapes, UnitError for negative means,
+    GradientError for a prediction in the place of the counts.
     """
-    return _poisson(counts, mean, Options(floor, dim, mask, reduction, constant), "poisson_nll")
-
-
-def _poisson(given: object, model: object, options: Options, where: str) -> Tensor:
-    check_held(options.reduction, options.dim, where)
-    counts, mean = check_counts(given, model, where)
-    mask = check_mask(options.mask, mean, where)
+    where = "poisson_nll"
+    check_held(reduction, dim, where)
+    mean, counts = check_prediction(input, target, where)
+    if dim is not None:
+        time_dim(mean, dim, where)
+    mask = check_mask(mask, mean, where)
     counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
     check_rates(mean, where)
-    check_constant(counts, options.constant, where)
-    m = floored(mean, counts, options, mask, where)
-    hit = counts != 0
-    # where on the input: xlogy(0, 0) has a NaN gradient
-    log_mean = torch.where(hit, m, torch.ones_like(m)).log()
-    value = m - torch.where(hit, counts * log_mean, torch.zeros_like(m))
-    if options.constant:
+    check_constant(counts, constant, where)
+    m = floored(mean, floor, where)
+    value = m - count_log(counts, m, dark_level(counts, floor))
+    if constant:
         value = value + torch.lgamma(counts + 1)
-    return _reduce(value, options.reduction, where, mask)
+    return _reduce(value, reduction, where, mask)
+
+
+poisson_loss = poisson_nll
 
 
 @reads(input=LIGHT, target=LIGHT)
-def poisson_loss(
+def read_noise_nll(
     input: Light,
     target: Light,
-    *,
-    floor: Tensor | float | None = None,
-    dim: int | None = None,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
-) -> Tensor:
-    """`poisson_nll(target, input)`: a model's mean counts (..., C, T, Y, X) against counts.
-
-    Biased where the mean is a Monte Carlo render, whose noise its logarithm turns into an error of the fit: take
-    squares over a variance that is no function of the render, or many samples at the end (docs/noisy_renders.md).
-    """
-    return _poisson(target, input, Options(floor, dim, mask, reduction), "poisson_loss")
-
-
-@reads(measured=LIGHT, mean=LIGHT)
-def read_noise_nll(
-    measured: Light,
-    mean: Light,
     read_noise: Tensor | float,
     *,
     shot_noise: bool = True,
@@ -192,14 +218,16 @@ def read_noise_nll(
 ) -> Tensor:
     """-log-likelihood of a normal distribution: read noise, and the normal approximation of shot noise.
 
-    (y - m)^2 / (2 v) + log(v)/2 (+ log(2 pi)/2 with `constant`), v = read_noise^2 + max(m, 0) with `shot_noise`, in
-    electrons. `read_noise` > 0, a number or a tensor that broadcasts; differentiable in it and in `mean`.
+    (y - m)^2 / (2 v) + log(v)/2 (+ log(2 pi)/2 with `constant`), v = read_noise^2 + max(m, 0) with `shot_noise`, m the
+    `input`, a mean, and y the `target`, a measurement, in electrons. `read_noise` > 0, a number or a tensor that
+    broadcasts; differentiable in it and in `input`. No floor: the read noise is the least width. Raises as
+    `poisson_nll`, but takes means below zero.
     """
     where = "read_noise_nll"
     check_reduction(reduction, where)
     check_flag("shot_noise", shot_noise, where)
     check_flag("constant", constant, where)
-    measured, mean = check_counts(measured, mean, where)
+    mean, measured = check_prediction(input, target, where)
     mask = check_mask(mask, mean, where)
     measured, mean = counted(measured, mask), counted(mean, mask)
     # without it an empty pixel has no width
@@ -212,7 +240,7 @@ def read_noise_nll(
 
 
 class PoissonNLL(nn.Module):
-    """`poisson_nll(counts, mean)` with its options held."""
+    """`poisson_nll(input, target)` with its options held."""
 
     def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
         super().__init__()
@@ -220,25 +248,15 @@ class PoissonNLL(nn.Module):
         check_option("floor", floor, "PoissonNLL", zero=True)
         self.floor, self.dim, self.reduction = floor, dim, reduction
 
-    def forward(self, counts: Light, mean: Light, mask: Tensor | None = None) -> Tensor:
-        return poisson_nll(counts, mean, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
-
-
-class PoissonLoss(nn.Module):
-    """`poisson_loss(input, target)` with its options held."""
-
-    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_held(reduction, dim, "PoissonLoss")
-        check_option("floor", floor, "PoissonLoss", zero=True)
-        self.floor, self.dim, self.reduction = floor, dim, reduction
-
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
-        return poisson_loss(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
+        return poisson_nll(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
+
+
+PoissonLoss = PoissonNLL
 
 
 class ReadNoiseNLL(nn.Module):
-    """`read_noise_nll(measured, mean, read_noise)` with its options held."""
+    """`read_noise_nll(input, target, read_noise)` with its options held."""
 
     def __init__(self, read_noise: float, shot_noise: bool = True, reduction: Reduction = "mean") -> None:
         super().__init__()
@@ -247,7 +265,7 @@ class ReadNoiseNLL(nn.Module):
         check_option("read_noise", read_noise, "ReadNoiseNLL", needed=True, square=True)
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
 
-    def forward(self, measured: Light, mean: Light, mask: Tensor | None = None) -> Tensor:
+    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return read_noise_nll(
-            measured, mean, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
+            input, target, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
         )

@@ -57,7 +57,7 @@ def multiscale_loss(
     """Mean over `scales` of `compare` of two transients (..., C, T, Y, X) in bins that many times as wide.
 
     `compare`: a loss (input, target, mask=, reduction=) of this room that has a value for each bin, such as
-    `root_loss` or `functools.partial(first_photon_loss, cycles=n)`. It is called with tensors (..., C, bins, places,
+    `root_loss` or `functools.partial(first_photon_nll, cycles=n)`. It is called with tensors (..., C, bins, places,
     1), its `dim` being set. A `floor` or a `background` that the partial holds is that of a bin of the record, a number
     or a tensor that broadcasts to it, and is added up as bins are. Coarse bins are sums; those at both ends of the
     record, which reach beyond it, hold what is there. A scale's value is the sum over its bins, averaged over the

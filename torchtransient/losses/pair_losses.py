@@ -62,8 +62,7 @@ def check_compare(compare: object, where: str, reduction: Reduction | None) -> d
     if first in _MEASUREMENT_FIRST or second in _NO_MEASUREMENT:
         raise ShapeError(
             f"{where}: expected compare to take the model first and the measurement second, (input, target), got "
-            f"{title}, which takes {first} first and {second} second. Take poisson_loss or first_photon_loss, or turn "
-            "it round in a function."
+            f"{title}, which takes {first} first and {second} second. Turn it round in a function."
         )
     return dict(signature.parameters)
 

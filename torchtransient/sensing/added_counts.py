@@ -36,6 +36,8 @@ class AddedCounts(RandomSensor):
     are theirs. Their variance is off by the probability of the effect (by 1 % at 1 %).
     """
 
+    takes, gives = ("counts",), "counts"
+
     def extra(self, x: Tensor) -> Tensor:
         """Mean of the counts added, in the shape of `x`."""
         raise NotImplementedError(f"{type(self).__name__} has to define extra(x).")

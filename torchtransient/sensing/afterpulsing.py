@@ -3,43 +3,41 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
+from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
-from torchtransient.sensing.time_convolution import filter_rows
+from torchtransient.sensing.time_convolution import check_choice, filter_rows
+
+CountedFrom = Literal["dead_time", "avalanche"]
 
 _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
+_MOST = 0.5  # afterpulses of a detection
 
 
 def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: float, period_bins: int) -> Tensor:
     """Share of afterpulses k bins after their detection, folded into one period: (period_bins,) float64, sum 1.
 
-    The delay is the dead time plus an exponential time of mean `tau_s` (differentiable); a detection lies in the middle
-    of its bin. Bins are integrated exactly, and so are all later periods.
+    The delay is the dead time plus an exponential time of mean `tau_s` (differentiable); detections are spread evenly
+    over their bins. Bins are integrated exactly, and so are all later periods.
     """
     tau = torch.as_tensor(tau_s, dtype=torch.float64) / bin_width_s
-    dead = dead_time_s / bin_width_s
-    start = math.floor(dead + 0.5)
-    # edges of the bins start, start + 1, ..., counted from the end of the dead time; the first begins before it
-    edges = (torch.arange(period_bins + 1, dtype=torch.float64, device=tau.device) + start - 0.5 - dead).clamp_min(0)
-    survive = torch.exp(-edges / tau)
-    shares = survive[:-1] - survive[1:]
-    # bins a whole number of periods later have exp(-period/tau) of it each; the first bin is cut by the dead time only
-    # once, so later rounds are those of an uncut bin
-    later = torch.exp(-(edges[1:] - 1 + period_bins) / tau) - torch.exp(-(edges[1:] + period_bins) / tau)
-    folded = shares + later / -torch.expm1(-period_bins / tau)
-    return folded.roll(start % period_bins)
+    return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
 
 
+@in_single
 def add_afterpulses(
     counts: Tensor,
     probability: Tensor | float,
@@ -49,8 +47,9 @@ def add_afterpulses(
 ) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
-    `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel`; the window is the first T bins of
-    a period of P. Afterpulses outside the window are lost. With P = T sums grow by 1/(1 - probability) exactly.
+    `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel` (or `Afterpulsing.kernel`, which
+    has the probability in it); the window is the first T bins of a period of P. Afterpulses outside the window are
+    lost. With P = T sums grow by 1/(1 - probability) exactly.
     Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
     """
     check_transient(counts, "add_afterpulses")
@@ -78,11 +77,20 @@ def _check_period(period: int, bins: int) -> None:
 
 
 class Afterpulsing(AddedCounts):
-    """Every detection triggers another with `probability`, dead time plus an exponential time of mean `tau_s` later.
+    """Every detection triggers others later: with `probability`, one dead time plus a random time after it.
+
+    `probability` and `tau_s`: numbers, or one each of several exponentials (carriers of several traps; probabilities
+    add up); mean delays `tau_s` are counted from the end of the dead time on, since exponentials have no memory.
+    `delays`: another law instead, `PowerLawDelays` or `MeasuredDelays`, cut off at the dead time. Probabilities are
+    those of afterpulses after the dead time, as data sheets give them; with `counted_from` "avalanche" those of all
+    carriers, of which those that are set free during the dead time are not seen.
 
     Works on counts, behind the SPAD. The histogram is taken round the laser period (`period_s`, by default the window):
-    afterpulses of one cycle fall into later ones. Dead time is not applied to the afterpulses themselves, nor are they
-    kept from one another: fine while `probability` is small. `learnable`: `logit_probability`, `log_tau_s`.
+    afterpulses of one cycle fall into later ones, constant light stays constant. Dead time is not applied to the
+    afterpulses themselves, nor do they keep photons from being seen: right in dim light (`AfterpulsingSPAD` for the
+    rest). `learnable`: `logit_probability`, `log_tau_s`, as long as there are exponentials.
+
+    Raises UnitError for probabilities whose sum is not in (0, 0.5], ShapeError where they and `tau_s` differ in number.
     """
 
     logit_probability: Tensor
@@ -90,10 +98,12 @@ class Afterpulsing(AddedCounts):
 
     def __init__(
         self,
-        probability: float,
-        tau_s: float,
-        dead_time_s: float,
+        probability: float | Sequence[float],
+        tau_s: float | Sequence[float] | None = None,
+        dead_time_s: float | None = None,
         *,
+        delays: AfterpulseDelays | None = None,
+        counted_from: CountedFrom = "dead_time",
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
         period_s: float | None = None,
@@ -102,17 +112,45 @@ class Afterpulsing(AddedCounts):
     ) -> None:
         super().__init__(grad)
         where = "Afterpulsing"
-        p = check_number(probability, "probability", where, high=0.5, open_low=True)
-        tau = check_seconds(tau_s, "tau_s", where, open_low=True)
+        if dead_time_s is None or (tau_s is None) == (delays is None):
+            raise UnitError(f"{where}: expected dead_time_s (0 for none), and either tau_s or delays, got others.")
+        if delays is not None and not isinstance(delays, AfterpulseDelays):
+            raise UnitError(f"{where}: expected delays to be PowerLawDelays or MeasuredDelays, got {delays!r}.")
+        check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
+        self.period_s: float | None = None
         self.period_bins: int | None = None
+        self.window_is_period = period_s is None
         if period_s is not None:
-            self.period_bins = round(check_seconds(period_s, "period_s", where, open_low=True) / self.bin_width_s)
+            self.period_s = check_seconds(period_s, "period_s", where, open_low=True, high=1.0)
+            self.period_bins = round(self.period_s / self.bin_width_s)
             _check_period(self.period_bins, 1)
-        numbers = {"logit_probability": math.log(p / (1 - p)), "log_tau_s": math.log(tau)}
-        for name, value in numbers.items():
-            tensor = torch.tensor(value, dtype=torch.float64)
+        self.delays, self.counted_from = delays, counted_from
+        self._keep(probability, [] if tau_s is None else tau_s, learnable)
+        if delays is not None:  # says what is wrong with a law and a dead time that do not go together
+            delays.shares(self.dead_time_s, self.bin_width_s, 0, 1)
+            self._seen()
+
+    def _keep(self, probability: float | Sequence[float], tau_s: float | Sequence[float], learnable: bool) -> None:
+        where = "Afterpulsing"
+        several = isinstance(probability, Sequence) and not isinstance(probability, str)
+        shares = list(probability) if isinstance(probability, Sequence) else [probability]
+        p = [check_number(v, "probability", where, high=_MOST, open_low=True) for v in shares]
+        if not p or sum(p) > _MOST:
+            raise UnitError(f"{where}: expected a sum of probability in (0, {_MOST:g}], got {probability!r}.")
+        numbers = {"logit_probability": [math.log(v / (1 - v)) for v in p]}
+        if self.delays is None:
+            times = list(tau_s) if isinstance(tau_s, Sequence) else [tau_s]
+            numbers["log_tau_s"] = [math.log(check_seconds(v, "tau_s", where, open_low=True)) for v in times]
+            if len(times) != len(p):
+                raise ShapeError(f"{where}: expected as many tau_s as probability, got {len(times)} and {len(p)}.")
+        elif several:
+            raise ShapeError(f"{where}: expected one probability of delays, got {len(p)}.")
+        for name, values in numbers.items():
+            tensor = torch.tensor(values, dtype=torch.float64)
+            tensor = tensor if several else tensor[0].clone()
             if learnable:
                 self.register_parameter(name, nn.Parameter(tensor))
             else:
@@ -120,35 +158,74 @@ class Afterpulsing(AddedCounts):
 
     @property
     def probability(self) -> Tensor:
-        """Afterpulses of a detection, float64."""
+        """Afterpulses of a detection, as given: () or one of each exponential, float64."""
         return self.logit_probability.double().sigmoid()
 
     @property
     def tau_s(self) -> Tensor:
-        """Mean delay beyond the dead time, in seconds, float64."""
+        """Mean delays beyond the dead time, in seconds, float64. UnitError where another law stands for them."""
+        if self.delays is not None:
+            raise UnitError(f"Afterpulsing.tau_s: expected exponentials, but the delays are {self.delays!r}.")
         return self.log_tau_s.double().exp()
+
+    def _seen(self) -> Tensor:
+        """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
+        p = self.probability.reshape(-1)
+        if self.counted_from == "dead_time":
+            return p
+        if self.delays is not None:
+            return p * self.delays.seen(self.dead_time_s)
+        return p * torch.exp(-self.dead_time_s / self.tau_s.reshape(-1))
 
     def _period_bins(self, x: Tensor) -> int:
         return self.period_bins or x.shape[TIME]
 
+    def kernel(self, period_bins: int) -> Tensor:
+        """Afterpulses of one detection k bins after it, folded into one period: (period_bins,) float64."""
+        if self.delays is not None:
+            return self._seen() * self.delays.kernel(self.dead_time_s, self.bin_width_s, period_bins)
+        tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
+        return self._seen() @ exponential_kernel(tau, dead, period_bins)
+
+    def first_kernel(self, bins: int) -> Tensor:
+        """Those among them that come less than `bins` bins later, without later rounds: (bins,) float64."""
+        if self.delays is not None:
+            return self._seen() * self.delays.shares(self.dead_time_s, self.bin_width_s, 0, bins)
+        tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
+        return self._seen() @ exponential_shares(tau, dead, 0, bins)
+
+    @in_single
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
-        kernel = afterpulse_kernel(self.tau_s, self.dead_time_s, self.bin_width_s, self._period_bins(x))
-        return add_afterpulses(x, self.probability, kernel, only_added=True)
+        return add_afterpulses(x, 1.0, self.kernel(self._period_bins(x)), only_added=True)
 
     def share(self) -> float:
-        p = float(self.probability)
+        p = float(self._seen().detach().sum())
         return p / (1 - p)
+
+    def _draw_delays(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """In bins after the detection, in the shape, dtype and device of `like` (N,)."""
+        if self.delays is not None:
+            delays = self.delays.draw(like.numel(), self.dead_time_s, generator) / self.bin_width_s
+            return delays.to(like)
+        tau, dead = (self.tau_s.detach() / self.bin_width_s).reshape(-1), self.dead_time_s / self.bin_width_s
+        delay = torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator).neg_().log1p_()
+        if tau.numel() == 1:
+            return delay.mul_(-float(tau)).add_(dead)
+        parts = self._seen().detach()
+        edges = (parts / parts.sum()).cumsum(0)[:-1].to(like)
+        u = torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator)
+        which = torch.bucketize(u, edges, right=True)
+        return delay.mul_(-tau.to(like)[which]).add_(dead)
 
     def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
         check_transient(counts, "Afterpulsing")
-        p, tau = float(self.probability), float(self.tau_s / self.bin_width_s)
-        # an event lies in the middle of its bin
-        after = 0.5 + self.dead_time_s / self.bin_width_s
+        p = float(self._seen().detach().sum())
         period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
         _check_period(period, bins)
+        longest = self.delays.end_s() if self.delays is not None else 20 * float(self.tau_s.max()) + self.dead_time_s
         # bins are told apart to 1e-3 of a bin, and delays have as many steps
-        real = torch.float32 if max(period, after, 20 * tau) < _FINE else torch.float64
+        real = torch.float32 if max(period, longest / self.bin_width_s) < _FINE else torch.float64
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
             """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
@@ -161,8 +238,9 @@ class Afterpulsing(AddedCounts):
                 origin = place.sub_(start * pixels).repeat_interleave(number)
                 time = start.to(real).repeat_interleave(number)
                 while time.numel():
-                    delay = torch.rand(time.shape, dtype=real, device=time.device, generator=own).neg_().log1p_()
-                    time = delay.mul_(-tau).add_(after).floor_().add_(time)
+                    # somewhere in its bin, with the same chance everywhere
+                    inside = torch.rand(time.shape, dtype=real, device=time.device, generator=own)
+                    time = self._draw_delays(time, own).add_(inside).floor_().add_(time)
                     time.sub_((time * (1 / period)).floor_().mul_(period))
                     # where the quotient was rounded
                     time.sub_(period * (time >= period)).add_(period * (time < 0))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchtransient.floating import in_single
 from torchtransient.sensing.draws import WHOLE_FLOAT32, check_rates
 from torchtransient.sensing.layout import TIME, check_count, check_transient
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.sensor import RandomSensor
 
 
+@in_single
 def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     """Photons per frame from the number of frames that saw any: -log(1 - counts/frames), any shape.
 
@@ -26,6 +28,8 @@ class BinaryFrames(RandomSensor):
     Every bin along T is a gate or moment of its own, exposed `frames` times, so that bins are independent binomials
     with probability 1 - exp(-mean). All four policies. Source: Fossum et al., Sensors 16 (2016).
     """
+
+    takes, gives = ("electrons",), "counts"
 
     def __init__(self, frames: int, *, grad: GradPolicy = "expected") -> None:
         super().__init__(grad)

@@ -9,14 +9,20 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.sensing.agreement import check_axis as check_axis
+from torchtransient.sensing.agreement import check_stages, check_window
+from torchtransient.sensing.chain_order import check_order
+from torchtransient.sensing.first_photon_moves import (
+    moved_first_photons,
+    moved_probabilities,
+    moving_together,
+    multinomial_log_prob,
+)
 from torchtransient.sensing.itof import ItofCorrelation
-from torchtransient.sensing.layout import not_a_transient
+from torchtransient.sensing.layout import TIME, not_a_transient
 from torchtransient.sensing.policies import GradPolicy, check_policy
 from torchtransient.sensing.sensor import RandomSensor, Sensor
-
-# Two axes are the same when their bins agree to a millionth of a bin over the whole length.
-_SAME_BIN = 1e-6
 
 
 class Compose(Sensor):
@@ -29,7 +35,12 @@ class Compose(Sensor):
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
     order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
-    results. Raises ShapeError for no stage or something that is no module, UnitError for axes that disagree.
+    results. A first-photon detector and the `DetectionJitter` and `TDC` behind it are drawn at once, under one policy:
+    the same distribution, in less time. Raises ShapeError for no stage or something that is no module, UnitError where
+    one stage is not made for what those before it give: other bins, another number of cycles, another laser period,
+    or another quantity, as the rates of one cycle where the counts of all are meant (see `agreement`); and for an
+    order in which constant light starves at the ends of the window: light's own shape, then `PhotonBudget`, the
+    detector, and what acts on detections.
     """
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
@@ -39,7 +50,9 @@ class Compose(Sensor):
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if not len(stages) or wrong:
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
+        check_order(stages, "Compose")
         self.stages = nn.ModuleList(stages)
+        check_stages(self)
         if grad is not None:
             self.set_grad(grad)
 
@@ -57,7 +70,18 @@ class Compose(Sensor):
 
     def forward(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """The measurement, every random stage under its own policy and with the same generator in turn."""
-        return self._run(x, lambda stage, y: stage(y, generator=generator) if isinstance(stage, Sensor) else stage(y))
+
+        def measure(stage: nn.Module, y: Tensor) -> Any:
+            return stage(y, generator=generator) if isinstance(stage, Sensor) else stage(y)
+
+        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
+            found = moving_together(stages, policy=True)
+            if found is None:
+                return y, 0
+            spad, moves = found
+            return moved_first_photons(spad, moves, y, generator, spad.grad), 1 + len(moves)
+
+        return self._run(x, measure, at_once)
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """One draw of every random stage, whatever its policy, without gradient."""
@@ -67,18 +91,61 @@ class Compose(Sensor):
                 return stage.sample(y, generator)
             return stage.expected(y) if isinstance(stage, Sensor) else stage(y)
 
-        with torch.no_grad():
-            return self._run(x, draw)
+        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
+            found = moving_together(stages, policy=False)
+            if found is None:
+                return y, 0
+            spad, moves = found
+            return moved_first_photons(spad, moves, y, generator), 1 + len(moves)
 
-    def _run(self, x: Any, step: Callable[[nn.Module, Tensor], Any]) -> Tensor:
+        with torch.no_grad():
+            return self._run(x, draw, at_once)
+
+    def log_prob(self, measurement: Tensor, x: Any) -> Tensor:
+        """Log-probability of a measurement, time summed: (..., C, H, W), differentiable in `x` and the parameters.
+
+        For chains in which one detector draws, behind stages that do not: the `log_prob` of the last stage, or the
+        multinomial of a `SynchronousSPAD` of one detection per cycle and the `DetectionJitter` and `TDC` behind it.
+        GradientError for other chains: draws of several stages have no closed form.
+        """
+        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
+        stages = list(self.stages)[used:]
+        while stages:
+            last, found = stages[0], moving_together(stages, policy=False)
+            if found is not None and len(found[1]) == len(stages) - 1:
+                spad, moves = found
+                return multinomial_log_prob(measurement, moved_probabilities(spad, moves, y), spad.cycles)
+            if len(stages) == 1 and isinstance(last, (RandomSensor, Compose)):
+                return last.log_prob(measurement, y)
+            if any(isinstance(module, RandomSensor) for module in last.modules()):
+                break
+            y = last.expected(y) if isinstance(last, Sensor) else last(y)
+            stages = stages[1:]
+        raise GradientError(
+            f"Compose: expected one detector that draws, at the end of the chain or with nothing but DetectionJitter "
+            f"and TDC behind it, got {[type(s).__name__ for s in self.stages]}. log_prob is not supported for it."
+        )
+
+    def _run(
+        self,
+        x: Any,
+        step: Callable[[nn.Module, Tensor], Any],
+        at_once: Callable[[list[nn.Module], Tensor], tuple[Tensor, int]] | None = None,
+    ) -> Tensor:
+        """`step` for one stage after another; `at_once` takes several where it can, and says how many."""
         stages = list(self.stages)
         if isinstance(x, Tensor):
             y = x
         else:
             y, used = self._opened(x)
             stages = stages[used:]
-        for stage in stages:
-            y = step(stage, y)
+        if y.ndim >= 4:
+            check_window(self, y.shape[TIME])
+        while stages:
+            y, used = at_once(stages, y) if at_once is not None else (y, 0)
+            if not used:
+                y, used = step(stages[0], y), 1
+            stages = stages[used:]
         return y
 
     def _opened(self, output: Any) -> tuple[Tensor, int]:
@@ -114,24 +181,3 @@ class Compose(Sensor):
         if not isinstance(axis, TimeAxis):
             raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
         check_axis(self, axis)
-
-
-def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
-    """UnitError when a sensor, or one that is part of it, was made for other bins than those of ``axis``."""
-    for name, module in sensor.named_modules():
-        if not isinstance(module, Sensor):
-            continue  # a measured response has bins of its own
-        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
-        if isinstance(own, TimeAxis):
-            slack = _SAME_BIN * axis.bin_width_opl
-            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
-            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
-        elif isinstance(width_s, float):
-            own, same = width_s, abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
-        else:
-            continue
-        if not same:
-            raise UnitError(
-                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {own}), got {axis}. Make "
-                "the sensor with the renderer's axis."
-            )

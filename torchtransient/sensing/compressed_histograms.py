@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import TIME, check_count, check_transient, without_autocast
+from torchtransient.floating import in_single
+from torchtransient.sensing.layout import TIME, check_count, check_transient, product
 from torchtransient.sensing.sensor import Sensor
 
 
+@in_single
 def equi_depth_edges(counts: Tensor, depth: int) -> Tensor:
     """Positions, in bins, between which every pixel has equal shares of its counts: (..., C, depth - 1, H, W).
 
@@ -70,9 +72,9 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     return table / lengths
 
 
-@without_autocast
 def _coded_sums(x: Tensor, matrix: Tensor) -> Tensor:
-    return torch.einsum("kt,...thw->...khw", matrix, x)
+    sums = product(matrix, x.flatten(-2))
+    return sums.reshape(*sums.shape[:-1], *x.shape[-2:])
 
 
 class CodedHistogram(Sensor):
@@ -97,6 +99,7 @@ class CodedHistogram(Sensor):
         else:
             self.register_buffer("codes", values)
 
+    @in_single
     def _apply_matrix(self, matrix: Tensor, x: Tensor, name: str) -> Tensor:
         check_transient(x, f"CodedHistogram.{name}")
         if x.shape[TIME] != matrix.shape[1]:

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import check_number, check_transient
@@ -20,6 +21,7 @@ _VALUES = 1 << 16  # of a 16 bit number
 _CELLS = 1 << 12  # of the table that they are looked up in: small enough to make for every call
 
 
+@in_single
 def add_crosstalk(
     counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
 ) -> Tensor:
@@ -78,6 +80,7 @@ class Crosstalk(AddedCounts):
         p = self.probability
         return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
 
+    @in_single
     def extra(self, x: Tensor) -> Tensor:
         return add_crosstalk(x, *self._probabilities(), only_added=True)
 

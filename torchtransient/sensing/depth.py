@@ -18,11 +18,13 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import TIME, check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
 
 
+@in_single
 def log_matched_filter(
     histogram: Tensor,
     kernel: Tensor,
@@ -53,6 +55,7 @@ def log_matched_filter(
     return convolve_time(histogram, weights.flip(0), -(first + kernel.numel() - 1), boundary=boundary)
 
 
+@in_single
 def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
     """Position of the largest entry, (..., C, H, W); with ``refine`` the top of the parabola through it and its
     neighbours, within half a bin of it.
@@ -82,6 +85,7 @@ def _parabola(scores: Tensor, index: Tensor) -> Tensor:
     return torch.where(usable, offset, 0.0).clamp(-0.5, 0.5)
 
 
+@in_single
 def centre_of_mass(
     histogram: Tensor, *, background: Tensor | float = 0.0, half_width_bins: int | None = None
 ) -> Tensor:
@@ -90,9 +94,16 @@ def centre_of_mass(
     ``background``: counts per bin, a number or (..., C, H, W) (`background_per_bin`), subtracted before; a background
     left in pulls the result to the middle of the window. ``half_width_bins``: only bins within that distance of the
     largest one count. Differentiable in histogram and background. Where nothing is left: the middle of the window
-    (or of the largest bin), derivative zero. Negative differences count as they are, which keeps the mean unbiased.
+    (or of the largest bin), derivative zero.
+
+    Negative differences count as they are, which keeps the mean unbiased, as long as their sum S is more than its noise
+    N, ``N^2 = sum excess^2``; entries that are all positive always have that much. A sum of less does not say where
+    light is: the result goes to the middle as ``S^2 / N^2``, its derivative stays bounded, and it never leaves the
+    window (or the bins that count). Half precision is summed in float32.
     """
     check_transient(histogram, "centre_of_mass")
+    dtype = histogram.dtype
+    histogram = histogram if dtype.itemsize > 2 else histogram.float()
     excess = histogram - _per_pixel(background, histogram, "centre_of_mass", "background")
     bins = _positions(histogram)
     if half_width_bins is None:
@@ -101,16 +112,26 @@ def centre_of_mass(
         check_count(half_width_bins, "half_width_bins", "centre_of_mass", low=0)
         reference = histogram.detach().argmax(TIME, keepdim=True).to(histogram.dtype) + 0.5
         excess = torch.where((bins - reference).abs() <= half_width_bins + 0.25, excess, 0.0)
+    # Shares of the largest entry, whose squares do not overflow.
+    largest = excess.detach().abs().amax(TIME, keepdim=True)
+    excess = excess / torch.where(largest > 0, largest, 1.0)
     total = excess.sum(TIME, keepdim=True)
-    weight = histogram.detach().abs().sum(TIME, keepdim=True)
+    weight = (histogram.detach().abs() / torch.where(largest > 0, largest, 1.0)).sum(TIME, keepdim=True)
     # "not below" lets NaN through
     there = ~(total <= torch.finfo(histogram.dtype).eps * weight)
     # Around the reference, so that float32 does not cancel far from the start of the axis.
     moment = (excess * (bins - reference)).sum(TIME, keepdim=True)
-    shift = torch.where(there, moment, 0.0) / torch.where(there, total, 1.0)
-    return (reference + shift).squeeze(TIME)
+    noise = excess.square().sum(TIME, keepdim=True)
+    # The sum of positive entries is never below its noise but by rounding.
+    weak = there & (total.square() < noise * (1 - 64 * torch.finfo(histogram.dtype).eps))
+    over = torch.where(weak, noise / torch.where(weak, total, 1.0), torch.where(there, total, 1.0))
+    position = reference + torch.where(there, moment, 0.0) / over
+    reach = 0.5 * bins.numel() if half_width_bins is None else half_width_bins + 0.5
+    first, last = (reference - reach).clamp(min=0.0), (reference + reach).clamp(max=float(bins.numel()))
+    return torch.minimum(torch.maximum(position, first), last).squeeze(TIME).to(dtype)
 
 
+@in_single
 def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     """``sum_k softmax(scores / temperature)_k (k + 1/2)``, (..., C, H, W): a smooth stand-in for the largest entry.
 
@@ -119,10 +140,12 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
     that the posterior is narrower than half a bin, it snaps to the middle of a bin. Differentiable everywhere.
     """
     check_transient(scores, "soft_argmax")
+    dtype = scores.dtype
+    scores = scores if dtype.itemsize > 2 else scores.float()
     scale = check_number(temperature, "temperature", "soft_argmax", open_low=True)
     weights = torch.softmax(scores / scale, dim=TIME)
     middle = scores.shape[TIME] / 2
-    return (weights * (_positions(scores) - middle)).sum(TIME) + middle
+    return ((weights * (_positions(scores) - middle)).sum(TIME) + middle).to(dtype)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,31 +158,37 @@ class Returns(TensorRecord):
     valid: Tensor
 
 
+@in_single
 def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
     """Where a histogram first reaches the threshold: `Returns` with R = 1.
 
     ``threshold``: counts, a number or (..., C, H, W). The crossing lies on the straight line between the middles of
     the bins before and at it, and is differentiable in histogram and threshold; in the very first bin it is its
     middle. Earlier than the peak by a share of the pulse: a leading-edge discriminator has the same walk error.
+    An entry of zero or less is no return, whatever the threshold: a share of the largest entry is 0 in an empty pixel.
     """
     check_transient(histogram, "first_return")
     level = _per_pixel(threshold, histogram, "first_return", "threshold")
-    reached = ~(histogram.detach() < level.detach())  # NaN counts as reached, and is then what is found
+    # NaN counts as reached, and is then what is found
+    reached = ~((histogram.detach() < level.detach()) | (histogram.detach() <= 0))
     valid = reached.any(TIME, keepdim=True)
     index = reached.to(torch.uint8).argmax(TIME, keepdim=True)
     here, before = histogram.gather(TIME, index), histogram.gather(TIME, (index - 1).clamp(min=0))
     inside = valid & (index > 0)
-    # `before` is below the level and `here` is not, so that the step between them is positive.
+    # `before` is below the level, or no light, and `here` is not, so that the step between them is positive.
     share = torch.where(inside, level - before, 0.0) / torch.where(inside, here - before, 1.0)
-    position = torch.where(inside, index - 0.5 + share, index.to(histogram.dtype) + 0.5)
+    share = share.clamp(0, 1)  # of a level below zero
+    position = torch.where(inside, index - 0.5 + share, index + 0.5).to(histogram.dtype)
     return Returns(torch.where(valid, position, 0.0), torch.where(valid, here, 0.0), valid)
 
 
+@in_single
 def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_separation_bins: int = 1) -> Returns:
     """Up to ``max_returns`` (R) local maxima of at least ``threshold``, the strongest ones, in order of time.
 
     Maxima closer than ``min_separation_bins`` to a stronger one are left out. Positions are refined by a parabola and
     strengths are the entries themselves; both are differentiable there. Takes histograms, filtered ones, or scores.
+    A pixel of equal entries, an empty one too, has no maximum, whatever the threshold.
     Memory and time grow as R.
     """
     me = "multi_return"
@@ -172,7 +201,8 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     low = torch.full_like(values.select(TIME, 0).unsqueeze(TIME), -math.inf)
     before = torch.cat([low, values.narrow(TIME, 0, values.shape[TIME] - 1)], TIME)
     after = torch.cat([values.narrow(TIME, 1, values.shape[TIME] - 1), low], TIME)
-    left = torch.where((values >= before) & (values > after) & (values >= threshold), values, -math.inf)
+    above = (values >= threshold) & (values > values.amin(TIME, keepdim=True))
+    left = torch.where((values >= before) & (values > after) & above, values, -math.inf)
     bins = torch.arange(values.shape[TIME], device=values.device).reshape(-1, 1, 1)
     found = []
     for _ in range(max_returns):
@@ -195,6 +225,7 @@ def background_per_bin(histogram: Tensor) -> Tensor:
     return check_transient(histogram, "background_per_bin").detach().median(TIME).values
 
 
+@in_single
 def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     """Metres one way for positions in bins: half the optical path ``start_opl + position bin_width_opl``.
 
@@ -205,6 +236,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
+@in_single
 def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     """Points (..., H, W, 3) in the frame of the camera for distances (..., H, W) along the rays of its pixels, metres.
 
@@ -229,15 +261,20 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     return points.reshape(*distance_m.shape, 3)
 
 
+@in_single
 def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
     """Cramer-Rao bound of the distance from one normal pulse without background: ``c sigma / (2 sqrt(N))`` in metres.
 
-    ``detections``: expected signal detections, any shape; infinite at zero.
+    ``detections``: expected signal detections, any shape; infinite at zero. The bins count as narrow beside the pulse;
+    `crlb` knows bins, background, pile-up and other responses, and is this in its limit. Raises UnitError.
     """
     from torchtransient.sensing.response_shapes import FWHM_PER_SIGMA
     from torchtransient.units import SPEED_OF_LIGHT
 
-    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1.0)
+    if not isinstance(detections, Tensor) or bool((detections.detach() < 0).any()):
+        got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
+        raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
+    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
 
 

@@ -2,7 +2,9 @@
 
 A stage is a dictionary with a ``kind`` (a name in `KINDS`) and the arguments of that class or function; arguments may
 be stages themselves (a response, a code). The strings ``"@axis"`` and ``"@num_bins"`` stand for the axis that the
-sensor is built for. Only kinds in the list are ever called, so that a file from elsewhere runs no code of its own.
+sensor is built for, ``"@cycles"`` and ``"@period_s"`` for the laser cycles and the laser period of the chain's
+`PhotonBudget`, so that one change reaches all stages that have to agree. Only kinds in the list are ever called, so
+that a file from elsewhere runs no code of its own.
 
     device = tt.sensing.device("kinect_v2_like")
     sensor = device.sensor(axis, grad="gaussian")          # a Compose, behind a TransientRenderer with that axis
@@ -25,11 +27,15 @@ from torch import nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError, TorchTransientError
 from torchtransient.quantities import shown
+from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
+from torchtransient.sensing.coincidence import CoincidencePixel
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
 from torchtransient.sensing.crosstalk import Crosstalk
+from torchtransient.sensing.detection_jitter import DetectionJitter
 from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.gated import GatedIntegration
@@ -43,7 +49,12 @@ from torchtransient.sensing.impulse_response import (
 )
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
+from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
+from torchtransient.sensing.layout import check_number
+from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.pixel_groups import PixelGroups
+from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.shot_noise import ShotNoise
@@ -67,11 +78,14 @@ KINDS: Mapping[str, Callable[..., Any]] = {
     **{
         made.__name__: made
         for made in (
-            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, EquiDepthHistogram,
-            FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse, ItofCorrelation,
-            LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics, PolarizationMosaic, ShotNoise,
-            StreakCamera, SweepJitter, SynchronousSPAD, TDC, TailedResponse, UniformResponse,
+            Afterpulsing, Analysers, BinaryFrames, CodedHistogram, ComposedResponse, Crosstalk, DetectionJitter,
+            EquiDepthHistogram, FourierCode, FreeRunningSPAD, GatedIntegration, GaussianResponse, ImpulseResponse,
+            ItofCalibration, ItofCorrelation, LensBlur, MeasuredResponse, Optics, PhotonBudget, PixelElectronics,
+            PolarizationMosaic, ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC,
+            TailedResponse, TapDifference, TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
+            AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
+            PowerLawDelays, ZoneSum,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,
@@ -119,20 +133,27 @@ class Device:
         """The chain of modules for transients on ``axis`` (by default `axis()`, from t = 0), under one policy."""
         if axis is None and self.bin_width_s is not None:
             axis = self.axis()
-        stages = [build_stage(s, axis) for s in self.stages]
+        budget = next((s for s in self.stages if s["kind"] == "PhotonBudget"), None)
+        stages = [build_stage(s, axis, budget) for s in self.stages]
         wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
         if wrong:
             raise StorageError(f"Device '{self.name}': expected stages that are modules, got {', '.join(wrong)}.")
         return Compose(stages, grad=grad)
 
     def changed(self, stage: int | str, **arguments: Any) -> Device:
-        """The same device with other arguments of one stage: its number, or its kind where that is there once."""
-        kinds = [s["kind"] for s in self.stages]
-        if isinstance(stage, str) and kinds.count(stage) != 1:
-            raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got the stages {kinds}.")
-        number = kinds.index(stage) if isinstance(stage, str) else stage
+        """The same device with other arguments of one stage: its number, or its kind where that is there once.
+
+        A kind may be that of a part, the `SynchronousSPAD` of a `MacroPixel` for instance.
+        """
         stages = [copy.deepcopy(s) for s in self.stages]
-        stages[number].update(arguments)
+        if isinstance(stage, str):
+            parts = [part for part in _parts(stages) if part["kind"] == stage]
+            if len(parts) != 1:
+                kinds = [part["kind"] for part in _parts(stages)]
+                raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
+            parts[0].update(arguments)
+        else:
+            stages[stage].update(arguments)
         return Device(self.name, self.description, self.sources, tuple(stages), self.bin_width_s, self.num_bins)
 
     def to_dict(self) -> dict[str, Any]:
@@ -194,24 +215,21 @@ class Device:
             raise StorageError(f"Device.from_yaml: expected a YAML file or text: {error}.") from error
 
 
-def build_stage(spec: Any, axis: TimeAxis | None = None) -> Any:
+def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, Any] | None = None) -> Any:
     """The object that a stage stands for: a sensor, response, code, or the value itself where it is no dictionary.
 
-    Raises StorageError for an unknown kind, an argument that the kind does not take, or a placeholder without axis;
-    errors of the values themselves (UnitError, ShapeError) pass.
+    ``budget``: the stage of the `PhotonBudget` that ``"@cycles"`` and ``"@period_s"`` refer to. Raises StorageError for
+    an unknown kind, an argument that the kind does not take, or a placeholder for what is not there; errors of the
+    values themselves (UnitError, ShapeError) pass.
     """
     if isinstance(spec, str) and spec.startswith("@"):
-        if spec not in ("@axis", "@num_bins"):
-            raise StorageError(f"build_stage: expected '@axis' or '@num_bins', got {spec!r}.")
-        if axis is None:
-            raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
-        return axis if spec == "@axis" else axis.num_bins
+        return _placeholder(spec, axis, budget)
     if isinstance(spec, (list, tuple)):
-        return [build_stage(s, axis) for s in spec]
+        return [build_stage(s, axis, budget) for s in spec]
     if not isinstance(spec, dict) or "kind" not in spec:
         return spec
     _check_spec(spec, "build_stage")
-    arguments = {k: build_stage(v, axis) for k, v in spec.items() if k != "kind"}
+    arguments = {k: build_stage(v, axis, budget) for k, v in spec.items() if k != "kind"}
     try:
         return KINDS[spec["kind"]](**arguments)
     except TorchTransientError:
@@ -220,6 +238,22 @@ def build_stage(spec: Any, axis: TimeAxis | None = None) -> Any:
         raise StorageError(
             f"build_stage: expected arguments of {spec['kind']}, got {sorted(arguments)}: {error}."
         ) from error
+
+
+def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Any:
+    if name in ("@axis", "@num_bins"):
+        if axis is None:
+            raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
+        return axis if name == "@axis" else axis.num_bins
+    if name not in ("@cycles", "@period_s"):
+        raise StorageError(f"build_stage: expected '@axis', '@num_bins', '@cycles' or '@period_s', got {name!r}.")
+    if budget is None:
+        raise StorageError(f"build_stage: expected a PhotonBudget in the chain for {name!r}. Give the number itself.")
+    rate_hz = check_number(budget.get("repetition_rate_hz", 0.0), "repetition_rate_hz", "PhotonBudget", open_low=True)
+    if name == "@period_s":
+        return 1 / rate_hz
+    exposure_s = budget.get("exposure_s")
+    return budget.get("cycles") if exposure_s is None else round(exposure_s * rate_hz)
 
 
 def _check_spec(spec: Any, where: str) -> None:
@@ -232,6 +266,16 @@ def _check_spec(spec: Any, where: str) -> None:
             raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
         if isinstance(value, dict) and "kind" in value:
             _check_spec(value, where)
+
+
+def _parts(spec: Any) -> list[dict[str, Any]]:
+    """Every dictionary with a kind in a stage, or in a list of them: the stage, and what it is made of."""
+    if isinstance(spec, (list, tuple)):
+        return [part for entry in spec for part in _parts(entry)]
+    if not isinstance(spec, dict):
+        return []
+    own = [spec] if "kind" in spec else []
+    return own + [part for value in spec.values() for part in _parts(value)]
 
 
 def _text(source: str | Path, mark: str) -> str:

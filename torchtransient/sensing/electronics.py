@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import check_count, check_number, check_transient
 from torchtransient.sensing.policies import (
     VARIANCE_FLOOR,
@@ -27,7 +28,7 @@ from torchtransient.sensing.policies import (
     standard_normal,
     straight_through,
 )
-from torchtransient.sensing.sensor import RandomSensor
+from torchtransient.sensing.sensor import Quantity, RandomSensor
 from torchtransient.sensing.shot_noise import poisson, poisson_log_prob
 
 BOLTZMANN_J_PER_K = 1.380649e-23  # exact (SI)
@@ -96,6 +97,9 @@ class PixelElectronics(RandomSensor):
     Poisson draw. All see the full chain's noise. UnitError for numbers out of range, ShapeError for a bad map.
     """
 
+    takes: tuple[Quantity, ...] = ("electrons",)
+    gives = "counts"
+
     gain_map: Tensor | None
     offset_map_e: Tensor | None
 
@@ -118,6 +122,7 @@ class PixelElectronics(RandomSensor):
         super().__init__(grad)
         me = "PixelElectronics"
         self.shot_noise = bool(shot_noise)
+        self.takes = ("electrons",) if self.shot_noise else ()
         self.full_well_e = None if full_well_e is None else check_number(full_well_e, "full_well_e", me, open_low=True)
         self.read_noise_e = check_number(read_noise_e, "read_noise_e", me)
         self.ktc_noise_e = check_number(ktc_noise_e, "ktc_noise_e", me)
@@ -142,6 +147,7 @@ class PixelElectronics(RandomSensor):
         low = -self.black_level_dn * self.gain_e_per_dn
         return low, low + (2**self.bits - 1) * self.gain_e_per_dn
 
+    @in_single
     def collected(self, x: Tensor) -> Tensor:
         """Mean electrons before saturation: with the gain map and the dark electrons. UnitError for negative light."""
         check_transient(x, type(self).__name__)

@@ -18,12 +18,21 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.dead_time_cycle import check_dead_bins, whole_and_part
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
 from torchtransient.sensing.free_running_ring import train_counts
 from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state
-from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_seconds, check_tensor, check_transient
+from torchtransient.sensing.layout import (
+    TIME,
+    bin_width_of,
+    bins_of_period,
+    check_count,
+    check_seconds,
+    check_tensor,
+    check_transient,
+)
 from torchtransient.sensing.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.time_convolution import check_choice
@@ -31,6 +40,7 @@ from torchtransient.sensing.time_convolution import check_choice
 DeadTime = Literal["non_paralyzable", "paralyzable"]
 
 
+@in_single
 def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non_paralyzable") -> Tensor:
     """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
@@ -55,6 +65,7 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     return FreeRunningState(image(rows.detected), image(rows.armed), image(rows.late), rows.whole)
 
 
+@in_single
 def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin of a free-running detector in its stationary state.
 
@@ -85,6 +96,7 @@ def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
     return torch.exp(-low) * torch.where(small, 1 - width / 2 + width**2 / 6, -torch.expm1(-safe) / safe)
 
 
+@in_single
 def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin when every photon, counted or not, starts the dead time anew.
 
@@ -121,7 +133,8 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
 class FreeRunningSPAD(RandomSensor):
     """Histogram (..., C, T, H, W) over laser phase, in counts, of a SPAD that runs free for `cycles` laser periods.
 
-    The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period.
+    The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period,
+    which `period_s` looks at: UnitError for an axis of another length, ShapeError for light with another T.
     `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
     "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
 
@@ -139,6 +152,8 @@ class FreeRunningSPAD(RandomSensor):
     hundred.
     """
 
+    takes, gives, window_is_period = ("rate",), "counts", True
+
     log_dead_time_s: Tensor
 
     def __init__(
@@ -148,6 +163,7 @@ class FreeRunningSPAD(RandomSensor):
         *,
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
+        period_s: float | None = None,
         kind: DeadTime = "non_paralyzable",
         learnable: bool = False,
         grad: GradPolicy = "expected",
@@ -157,6 +173,9 @@ class FreeRunningSPAD(RandomSensor):
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
+        if period_s is not None:
+            self.num_bins = bins_of_period(period_s, self.bin_width_s, self.num_bins, "FreeRunningSPAD")
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)
         if kind == "non_paralyzable":
             self._check_dead_time(dead)
@@ -175,6 +194,7 @@ class FreeRunningSPAD(RandomSensor):
     def _dead_bins(self) -> Tensor:
         return self.dead_time_s / self.bin_width_s
 
+    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per period and bin."""
         if self.kind == "paralyzable":

@@ -10,7 +10,6 @@ Laurenzis et al., "Time-of-flight range gating" (2007).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -20,7 +19,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.itof import correlate
 from torchtransient.sensing.layout import check_number, check_seconds, check_time_axis
-from torchtransient.sensing.response_shapes import normal_cdf
+from torchtransient.sensing.response_shapes import normal_integral
 from torchtransient.sensing.sensor import Sensor
 
 # A normal cumulative edge takes this many standard deviations from 10 % to 90 %.
@@ -58,8 +57,7 @@ def gate_profiles(
 
 def _edge_integral(time_s: Tensor, middle_s: Tensor, sigma_s: float) -> Tensor:
     """Integral of ``Phi((t - middle) / sigma)`` up to each time, seconds."""
-    u = (time_s - middle_s) / sigma_s
-    return sigma_s * (u * normal_cdf(u) + torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi))
+    return sigma_s * normal_integral((time_s - middle_s) / sigma_s)
 
 
 class GatedIntegration(Sensor):
@@ -70,6 +68,8 @@ class GatedIntegration(Sensor):
     ``learnable``: delays and widths are parameters, `delay_ps` and `log_width_s`. Shot noise, intensifier
     and read noise follow in `PixelElectronics`.
     """
+
+    takes, gives = ("electrons", "counts"), "electrons"
 
     delay_ps: Tensor
     log_width_s: Tensor
@@ -88,12 +88,13 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
-        delays = [check_number(d, "delays_s", me, low=-1.0, high=1.0) for d in delays_s]
+        delays = [check_seconds(d, "delays_s", me, signed=True) for d in delays_s]
         given = list(widths_s) if isinstance(widths_s, Sequence) else [widths_s] * len(delays)
         widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]
         if not delays or len(widths) != len(delays):
             raise ShapeError(f"{me}: expected one width or one per delay, got {len(delays)} and {len(widths)}.")
         self.axis = check_time_axis(axis, me)
+        self.num_bins = self.axis.num_bins
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
         window_s = axis.num_bins * axis.bin_width_s
@@ -124,6 +125,14 @@ class GatedIntegration(Sensor):
             fall_s=self.fall_s,
             leakage=self.leakage,
         )
+
+    def outside(self) -> Tensor:
+        """(G,) float64: share of each gate's open time that lies outside the window, leakage left out."""
+        with torch.no_grad():
+            widths = self.log_width_s.double().exp()
+            delays = self.delay_ps.double() * 1e-12
+            inside = gate_profiles(delays, widths, self.axis, rise_s=self.rise_s, fall_s=self.fall_s)
+            return 1 - inside.sum(1) * self.axis.bin_width_s / widths
 
     def expected(self, x: Tensor) -> Tensor:
         return correlate(x, self.profiles()) * self.electrons_per_unit

@@ -8,7 +8,8 @@ with H the photoelectrons of the whole exposure per bin, f the modulation freque
 code the phasor ``P(f) = sum H exp(-2 pi i f t)`` holds all that the taps can see, whatever the paths that the light
 took: multi-path interference needs no model of its own. Other codes need P at the multiples of f.
 
-Several frequencies follow each other along the tap dimension, frequency-major: (..., C, F N, H, W).
+Several frequencies follow each other along the tap dimension, frequency-major: (..., C, F N, H, W). Pixels of two taps
+are codes of 2 N taps, and what a camera adds to the phase is an `ItofCalibration`: see `itof_pixels.py`.
 
 Sources: Lange & Seitz (2001); Lin et al., "Fourier analysis on transient imaging with a multifrequency
 time-of-flight camera" (CVPR 2014); Gutierrez-Barragan et al. (2019).
@@ -18,23 +19,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
+from torchtransient.quantities import real_array
 from torchtransient.sensing.itof_codes import CorrelationCode
-from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, without_autocast
+from torchtransient.sensing.itof_pixels import ItofCalibration, in_direction
+from torchtransient.sensing.layout import check_number, check_time_axis, check_transient, product
 from torchtransient.sensing.sensor import Sensor
 
 WithinBin = Literal["uniform", "center"]
+# One number, a sequence, an array or a tensor of them.
+Frequencies = float | Sequence[float] | Tensor | NDArray[Any]
+
+_TURN = 2 * math.pi
+_LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 
-def check_frequencies(frequencies_hz: float | Sequence[float], where: str) -> tuple[float, ...]:
+def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
     """Modulation frequencies in hertz as a tuple; UnitError unless there are some, between 1 kHz and 1 THz."""
-    given = frequencies_hz if isinstance(frequencies_hz, Sequence) else (frequencies_hz,)
+    array = real_array(frequencies_hz)
+    given: Sequence[Any] = [frequencies_hz]  # what is no row of numbers is told by the check of its entries
+    if array is not None and array.ndim <= 1:
+        given = array.reshape(-1).tolist()
+    elif isinstance(frequencies_hz, Sequence) and not isinstance(frequencies_hz, str):
+        given = frequencies_hz
     values = tuple(check_number(f, "frequencies_hz", where, low=1e3, high=1e12) for f in given)
     if not values:
         raise UnitError(f"{where}: expected at least one modulation frequency in hertz, got none.")
@@ -43,36 +58,70 @@ def check_frequencies(frequencies_hz: float | Sequence[float], where: str) -> tu
 
 def tap_weights(
     code: CorrelationCode,
-    frequencies_hz: float | Sequence[float],
+    frequencies_hz: Frequencies,
     axis: TimeAxis,
     contrast: float = 1.0,
     within_bin: WithinBin = "uniform",
+    calibration: ItofCalibration | None = None,
 ) -> Tensor:
     """(F N, T) float64 on the CPU: what share of the light of every bin goes to every tap.
 
     ``within_bin``: "uniform" spreads the light of a bin evenly over it (the mean of the code over the bin, exact for
     light that is nowhere special); "center" puts it in the middle. ``contrast``: demodulation contrast in [0, 1],
-    0.5 to 0.9 in cameras. The shares of the taps sum to one where the code's shifted copies sum to zero (sine, and
-    square with half duty and an even N or any N of its sine part), so that light is conserved.
+    0.5 to 0.9 in cameras. The shares of the taps sum to one where the code's shifted copies sum to zero (sine, square
+    with half duty and an even N or any N of its sine part, every `TwoTapCode`), so that light is conserved.
+    ``calibration``: phase offset and direction; maps of pixels are for `ItofCorrelation`.
+
+    Raises UnitError, and ShapeError for a code of two taps that is no `TwoTapCode`.
     """
     me = "tap_weights"
-    check_number(contrast, "contrast", me, high=1.0)
-    if not isinstance(code, CorrelationCode):
-        raise UnitError(f"{me}: expected a code such as sine_code(4), got {code!r}.")
-    edges_s = check_time_axis(axis, me).edges_s
+    code, phases = _checked(code, frequencies_hz, axis, contrast, within_bin, calibration, me)
+    if phases.shape[1:] != (1, 1):
+        raise UnitError(f"{me}: expected a calibration without maps of pixels, whose weights ItofCorrelation makes.")
     rows = []
-    for f in check_frequencies(frequencies_hz, me):
+    for f, phase in zip(check_frequencies(frequencies_hz, me), phases.flatten().tolist(), strict=True):
         if within_bin == "uniform":
-            shape = code.bin_means(edges_s * f)
-        elif within_bin == "center":
-            shape = code.evaluate(axis.centers_s * f)
+            shape = code.bin_means(axis.edges_s * f + phase / _TURN)
         else:
-            raise UnitError(f"{me}: expected within_bin 'uniform' or 'center', got {within_bin!r}.")
+            shape = code.evaluate(axis.centers_s * f + phase / _TURN)
         rows.append((1 + contrast * shape) / code.num_taps)
     return torch.cat(rows)
 
 
-@without_autocast
+def _checked(
+    code: CorrelationCode,
+    frequencies_hz: Frequencies,
+    axis: TimeAxis,
+    contrast: float,
+    within_bin: str,
+    calibration: ItofCalibration | None,
+    me: str,
+) -> tuple[CorrelationCode, Tensor]:
+    """The code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
+    check_number(contrast, "contrast", me, high=1.0)
+    check_time_axis(axis, me)
+    if within_bin not in ("uniform", "center"):
+        raise UnitError(f"{me}: expected within_bin 'uniform' or 'center', got {within_bin!r}.")
+    if calibration is not None and not isinstance(calibration, ItofCalibration):
+        raise UnitError(f"{me}: expected calibration to be an ItofCalibration, got {calibration!r}.")
+    known = calibration or ItofCalibration()
+    code = in_direction(check_code(code, me), known.direction)
+    return code, known.phases_rad(check_frequencies(frequencies_hz, me))
+
+
+def check_code(code: object, where: str) -> CorrelationCode:
+    """`code` when it tells phase, amplitude and offset apart. Raises UnitError, ShapeError for two taps."""
+    if not isinstance(code, CorrelationCode):
+        raise UnitError(f"{where}: expected a code such as sine_code(4), got {code!r}.")
+    if code.num_taps < 3:
+        raise ShapeError(
+            f"{where}: expected three taps or more, from which phase, amplitude and offset can be told apart, got "
+            f"{code.num_taps}. Two phase steps suffice for pixels of two taps: TwoTapCode(code)."
+        )
+    return code
+
+
+@in_single
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
     """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
 
@@ -84,20 +133,20 @@ def correlate(transient: Tensor, weights: Tensor) -> Tensor:
             f"correlate: expected weights (M, {transient.shape[-3]}) for the transient {tuple(transient.shape)}, got "
             f"{tuple(weights.shape)}. Make them from the transient's own time axis."
         )
-    taps = weights.to(transient) @ transient.flatten(-2)
+    taps = product(weights.to(transient), transient.flatten(-2))
     return taps.reshape(*taps.shape[:-1], *transient.shape[-2:])
 
 
-@without_autocast
 def taps_from_phasor(
     phasor: Tensor,
     phasor_axis: FrequencyAxis,
     code: CorrelationCode,
-    frequencies_hz: float | Sequence[float],
+    frequencies_hz: Frequencies,
     *,
     steady: Tensor | None = None,
     harmonics: Sequence[int] | None = None,
     contrast: float = 1.0,
+    calibration: ItofCalibration | None = None,
 ) -> Tensor:
     """Taps (..., C, F N, H, W) straight from a phasor image (..., C, K, H, W), no histogram in between.
 
@@ -105,7 +154,7 @@ def taps_from_phasor(
     H, W) instead) and every harmonic of every modulation frequency, to a relative 1e-6; negative ones do as well.
     ``harmonics``: those of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
     that has infinitely many, refuses. What is left out is lost: a square code kept to the harmonic h misses wiggles
-    of about ``1 / h^2`` rad.
+    of about ``1 / h^2`` rad. ``calibration``: with maps of pixels too, (H, W) those of the phasor.
 
     Raises ShapeError for a phasor that does not fit its axis, UnitError for a missing frequency.
     """
@@ -116,23 +165,50 @@ def taps_from_phasor(
             f"{tuple(phasor.shape)}."
         )
     check_number(contrast, "contrast", me, high=1.0)
+    known = calibration or ItofCalibration()
+    code, values = in_direction(check_code(code, me), known.direction), check_frequencies(frequencies_hz, me)
+    phases = _fitting(known.phases_rad(values), phasor, me)
     kept = code.harmonics if harmonics is None else tuple(sorted({int(h) for h in harmonics} - {0}))
     if kept is None or any(h < 1 for h in kept):
         raise UnitError(
             f"{me}: expected harmonics=(1, ...), positive, for a code of infinitely many, got {harmonics!r}."
         )
     total = _component(phasor, phasor_axis, 0.0, me).real if steady is None else steady.to(phasor.real.dtype)
-    offset = code.coefficients([0]).real.squeeze(1)
-    factors = 2 * contrast * code.coefficients(kept)
     taps = []
-    for f in check_frequencies(frequencies_hz, me):
-        parts = torch.stack([_component(phasor, phasor_axis, h * f, me) for h in kept], dim=-3)
+    for f, phase in zip(values, phases, strict=True):
         # exp(+i) of the code against exp(-i) of the phasor: the conjugate of one of them.
-        mixed = (factors.to(parts) @ parts.conj().flatten(-2)).real
-        mixed = mixed.reshape(*mixed.shape[:-1], *parts.shape[-2:])
-        base = (1 + contrast * offset).to(total).reshape(-1, 1, 1) * total.unsqueeze(-3)
-        taps.append((base + mixed) / code.num_taps)
+        found = [(h, _component(phasor, phasor_axis, h * f, me)) for h in kept]
+        parts = [(h, part.real, -part.imag) for h, part in found]
+        taps.append(_mixed(total, parts, code, contrast, phase))
     return torch.cat(taps, dim=-3)
+
+
+def _mixed(
+    total: Tensor,
+    parts: Sequence[tuple[int, Tensor, Tensor]],
+    code: CorrelationCode,
+    contrast: float,
+    phase: Tensor,
+) -> Tensor:
+    """Taps (..., N, H, W) of all light (..., H, W) and its sums with cos and sin of ``2 pi h f t``, at phases (H, W).
+
+    No products of matrices, which autocast would round.
+    """
+    offset = code.coefficients([0]).real.reshape(-1, 1, 1)
+    taps = (1 + contrast * offset).to(total) * total.unsqueeze(-3)
+    for h, cosine, sine in parts:
+        size, angle = code.coefficients([h]).reshape(-1, 1, 1), h * phase.detach().double()
+        factor = 2 * contrast * size.to(angle.device) * torch.complex(angle.cos(), angle.sin())
+        taps = taps + factor.real.to(total) * cosine.unsqueeze(-3) - factor.imag.to(total) * sine.unsqueeze(-3)
+    return taps / code.num_taps
+
+
+def _fitting(phases: Tensor, x: Tensor, where: str) -> Tensor:
+    """Phases (F, H, W) for the pixels of ``x``. Raises ShapeError for a map of other pixels."""
+    size = tuple(phases.shape[-2:])
+    if size != (1, 1) and size != tuple(x.shape[-2:]):
+        raise ShapeError(f"{where}: expected light of {size} pixels, as the calibration's, got {tuple(x.shape)}.")
+    return phases
 
 
 def _component(phasor: Tensor, axis: FrequencyAxis, frequency_hz: float, where: str) -> Tensor:
@@ -158,22 +234,31 @@ class ItofCorrelation(Sensor):
 
     ``code``, ``frequencies_hz`` (F of them), ``axis`` (of the transient), ``contrast`` and ``within_bin`` as in
     `tap_weights`; ``background_e`` electrons of unmodulated light per exposure, shared equally by the taps;
-    ``electrons_per_unit`` scales a radiance to electrons. Linear but for the background, hence exact in the mean.
-    Noise, saturation and converter follow in `PixelElectronics`; phase and depth in `itof_depth.py`.
+    ``electrons_per_unit`` scales a radiance to electrons; ``calibration``: phase offsets, direction of the steps, maps
+    of pixels. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
+    `PixelElectronics`, the difference of two taps in `TapDifference`; phase and depth in `read_itof`.
+
+    A map of pixels costs one pass over the transient for each harmonic of a sine code; a code with corners needs
+    weights of N T numbers for every pixel, made anew in every call. Errors as `tap_weights`; ShapeError for light of
+    other pixels than those of the map.
     """
 
+    takes, gives = ("electrons", "counts"), "electrons"
+
     weights: Tensor
+    phases_rad: Tensor | None
 
     def __init__(
         self,
         code: CorrelationCode,
-        frequencies_hz: float | Sequence[float],
+        frequencies_hz: Frequencies,
         axis: TimeAxis,
         *,
         contrast: float = 1.0,
         background_e: float = 0.0,
         electrons_per_unit: float = 1.0,
         within_bin: WithinBin = "uniform",
+        calibration: ItofCalibration | None = None,
     ) -> None:
         super().__init__()
         me = type(self).__name__
@@ -184,13 +269,43 @@ class ItofCorrelation(Sensor):
         self.background_e = check_number(background_e, "background_e", me)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
         self.within_bin: WithinBin = within_bin
-        weights = tap_weights(code, self.frequencies_hz, axis, self.contrast, within_bin)
+        self.calibration = calibration
+        self._turned, phases = _checked(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration, me)
+        mapped = calibration is not None and calibration.has_map
+        if not mapped:
+            weights = tap_weights(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration)
+        elif self._turned.harmonics is not None:
+            weights = _harmonic_rows(self._turned.harmonics, self.frequencies_hz, axis, within_bin)
+        else:
+            weights = torch.zeros(0, axis.num_bins, dtype=torch.float64)
         self.register_buffer("weights", weights)
+        self.register_buffer("phases_rad", phases if mapped else None)
+        self.num_bins = axis.num_bins
 
     def expected(self, x: Tensor) -> Tensor:
         # Scaled on the small side: taps are fewer than bins.
-        taps = correlate(x, self.weights) * self.electrons_per_unit
-        return taps + self.background_e / self.code.num_taps
+        taps = correlate(x, self.weights) if self.phases_rad is None else self._of_pixels(x, self.phases_rad)
+        return taps * self.electrons_per_unit + self.background_e / self.code.num_taps
+
+    def _of_pixels(self, x: Tensor, phases: Tensor) -> Tensor:
+        """Taps of pixels whose phases differ."""
+        check_transient(x, type(self).__name__)
+        if x.shape[-3] != self.axis.num_bins:
+            raise ShapeError(f"ItofCorrelation: expected {self.axis.num_bins} bins, got {tuple(x.shape)}.")
+        _fitting(phases, x, "ItofCorrelation")
+        code, harmonics = self._turned, self._turned.harmonics
+        if harmonics is None:
+            given = zip(self.frequencies_hz, phases, strict=True)
+            found = [_by_pixel(x, code, f, self.axis, self.contrast, self.within_bin, p) for f, p in given]
+            return torch.cat(found, dim=-3)
+        sums = torch.split(correlate(x, self.weights), 2 * len(harmonics), dim=-3)
+        total = x.sum(-3)
+        taps = []
+        for group, phase in zip(sums, phases, strict=True):
+            rows = group.unbind(-3)
+            parts = [(h, rows[2 * i], rows[2 * i + 1]) for i, h in enumerate(harmonics)]
+            taps.append(_mixed(total, parts, code, self.contrast, phase))
+        return torch.cat(taps, dim=-3)
 
     def expected_from_phasor(
         self,
@@ -208,9 +323,50 @@ class ItofCorrelation(Sensor):
             steady=steady,
             harmonics=harmonics,
             contrast=self.contrast,
+            calibration=self.calibration,
         )
         return taps * self.electrons_per_unit + self.background_e / self.code.num_taps
 
     def extra_repr(self) -> str:
         megahertz = ", ".join(f"{f / 1e6:g}" for f in self.frequencies_hz)
         return f"taps={self.code.num_taps}, frequencies_MHz=({megahertz}), contrast={self.contrast:g}"
+
+
+def _harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis, within_bin: str) -> Tensor:
+    """(F x 2 harmonics, T) float64: cosine and sine of every harmonic of every frequency."""
+    rows = []
+    for f in frequencies:
+        for h in harmonics:
+            # The mean of a cosine over a bin is its value in the middle times sinc.
+            turns = h * f * axis.centers_s
+            keep = torch.sinc(h * f * axis.edges_s.diff()) if within_bin == "uniform" else torch.ones_like(turns)
+            rows += [keep * torch.cos(_TURN * turns), keep * torch.sin(_TURN * turns)]
+    return torch.stack(rows)
+
+
+def _by_pixel(
+    x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, contrast: float, within_bin: str, phase: Tensor
+) -> Tensor:
+    """Taps (..., N, H, W) of light (..., T, H, W), each pixel with weights of its own, at phases (H, W)."""
+    light, bins = x.flatten(-2), axis.num_bins
+    turns = (phase.detach().to("cpu", torch.float64) / _TURN % 1.0).flatten()
+    turns = turns.expand(light.shape[-1]) if turns.numel() == 1 else turns
+    places = axis.edges_s * f if within_bin == "uniform" else axis.centers_s * f
+    apart = math.ceil(float(places[-1] - places[0])) + 2.0
+    rows = math.prod(light.shape[:-2]) * code.num_taps * bins
+    size = max(_LARGEST // max(rows, 1), 1)
+    taps = []
+    for begin in range(0, light.shape[-1], size):
+        here = turns[begin : begin + size]
+        if within_bin == "uniform":
+            # Codes are periodic: whole turns between the pixels make one ascending row of all their edges.
+            edges = places + (here + apart * torch.arange(len(here), dtype=torch.float64))[:, None]
+            means = torch.nn.functional.pad(code.bin_means(edges.flatten()), (0, 1))
+            shape = means.reshape(code.num_taps, len(here), bins + 1)[..., :bins]
+        else:
+            shape = code.evaluate(places + here[:, None])
+        weights = ((1 + contrast * shape) / code.num_taps).movedim(1, -1).to(x)
+        # No product of matrices, which autocast would round.
+        taps.append((light[..., None, :, begin : begin + size] * weights).sum(-2))
+    together = torch.cat(taps, dim=-1) if taps else light.new_zeros(*light.shape[:-2], code.num_taps, 0)
+    return together.reshape(*together.shape[:-1], *x.shape[-2:])

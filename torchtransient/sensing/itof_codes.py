@@ -27,7 +27,8 @@ class CorrelationCode(ABC):
     """One weight in [-1, 1] per tap as a function of the phase in turns. Tensors are float64 on the CPU.
 
     ``num_taps``: N. ``shifts``: (N,) float64 turns when all taps are one function moved along, else None; only then
-    does the phase follow from the taps by a Fourier sum (`itof_depth.tap_phasor`).
+    does the phase follow from the taps by a Fourier sum (`itof_depth.tap_phasor`). A code of two taps cannot tell
+    phase, amplitude and offset apart: it is for pixels with two taps, see `itof_pixels.TwoTapCode`.
     """
 
     num_taps: int
@@ -54,9 +55,9 @@ class CorrelationCode(ABC):
 class FourierCode(CorrelationCode):
     """``sum_h amplitude_h cos(2 pi h (x - n / N) + phase_h)``: a sine with the harmonics that a real camera adds.
 
-    ``harmonics_of_one_tap``: harmonic -> (amplitude, phase in radians). Raises UnitError when the weights could leave
-    [-1, 1] (the amplitudes sum to more than one) or a harmonic is not a positive whole number, ShapeError for less
-    than three taps, from which phase, amplitude and offset cannot be told apart.
+    Two taps are a quarter of a turn apart instead of a half (`phase_steps`). ``harmonics_of_one_tap``: harmonic ->
+    (amplitude, phase in radians). Raises UnitError when the weights could leave [-1, 1] (the amplitudes sum to more
+    than one) or a harmonic is not a positive whole number, ShapeError for less than two taps.
     """
 
     def __init__(self, num_taps: int, harmonics_of_one_tap: Mapping[int, tuple[float, float]]) -> None:
@@ -67,7 +68,7 @@ class FourierCode(CorrelationCode):
         total = sum(abs(a) for a, _ in self.parts.values())
         if not total <= 1 + 1e-9:
             raise UnitError(f"FourierCode: expected amplitudes that sum to at most 1, got {total}. Divide them by it.")
-        self.shifts = torch.arange(num_taps, dtype=torch.float64) / num_taps
+        self.shifts = phase_steps(num_taps)
 
     def evaluate(self, turns: Tensor) -> Tensor:
         x = turns - _along_first(self.shifts, turns)
@@ -169,12 +170,13 @@ class PiecewiseLinearCode(CorrelationCode):
 
 
 def sine_code(num_taps: int = 4) -> FourierCode:
-    """Sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``. Errors as `FourierCode`."""
+    """Sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``; two taps, and errors, as `FourierCode`."""
     return FourierCode(num_taps, {1: (1.0, 0.0)})
 
 
 def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0.5) -> PiecewiseLinearCode:
-    """Rectangular light of ``light_duty`` turns against rectangular gates of ``gate_duty``, tap n moved by n / N.
+    """Rectangular light of ``light_duty`` turns against rectangular gates of ``gate_duty``, tap n moved by n / N (two
+    taps by a quarter of a turn).
 
     With both at one half the weight is a triangle wave, whose odd harmonics fall as ``1 / h^2``. The gates are placed
     so that tap 0 weighs phase zero highest, as in `sine_code`. Raises UnitError for duties outside (0, 1).
@@ -183,7 +185,7 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
         if not 0 < duty < 1:
             raise UnitError(f"square_code: expected {name} between 0 and 1 turn, got {duty!r}.")
     start = (light_duty - gate_duty) / 2
-    shifts = torch.arange(_check_taps(num_taps), dtype=torch.float64) / num_taps
+    shifts = phase_steps(num_taps)
     gates = [[((float(s) + start), (float(s) + start + gate_duty))] for s in shifts]
     return binary_code(light_duty, gates, shifts)
 
@@ -264,9 +266,15 @@ def _pad_knots(knots: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tenso
     return knots, values
 
 
+def phase_steps(num_taps: int) -> Tensor:
+    """(N,) float64 turns: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice."""
+    steps = torch.arange(_check_taps(num_taps), dtype=torch.float64)
+    return steps / (num_taps if num_taps > 2 else 4)
+
+
 def _check_taps(num_taps: int) -> int:
-    if isinstance(num_taps, bool) or not isinstance(num_taps, int) or num_taps < 3:
-        raise ShapeError(f"CorrelationCode: expected at least 3 taps, got {num_taps!r}.")
+    if isinstance(num_taps, bool) or not isinstance(num_taps, int) or num_taps < 2:
+        raise ShapeError(f"CorrelationCode: expected at least 2 taps, got {num_taps!r}.")
     return num_taps
 
 

@@ -1,8 +1,9 @@
-"""From the taps of an indirect time-of-flight camera to phase, amplitude, depth and confidence.
+"""From the taps of an indirect time-of-flight camera to phase, amplitude and depth.
 
 With taps ``I_n = (B + A cos(phi - 2 pi n / N)) / N`` the sum ``(2 / N) sum_n I_n exp(2 pi i n / N)`` is the *tap
-phasor* ``(A / N) exp(i phi)`` (its phase is minus that of a phasor image, whose exponent is negative). Depth is half
-the way there and back: ``d = c phi / (4 pi f)``, unique up to ``c / (2 f)``.
+phasor* ``(A / N) exp(i phi)`` (its phase is minus that of a phasor image, whose exponent is negative). The differences
+of pixels with two taps (`itof_pixels.py`) have the same one. Depth is half the way there and back:
+``d = c phi / (4 pi f)``, unique up to ``c / (2 f)``. What a camera reports, with its noise, is in `itof_reading.py`.
 
 Gradients: a phase jumps by a turn at the end of its range, so that a loss on it (or on depth) pulls pixels near the
 jump the long way round. `phasor_loss` compares phasors and has no jump; `wrapped_difference` gives the short way. A
@@ -10,62 +11,116 @@ pixel without modulated light has phase and derivative zero.
 
 Sources: Lange & Seitz (2001); Payne, Dorrington & Cree, "Illumination waveform optimization for time-of-flight range
 imaging cameras" (SPIE 2011); Jongenelen et al., "Analysis of errors in ToF range imaging with dual-frequency
-modulation" (IEEE TIM 2011); Gupta et al. (ACM TOG 2018) for the decoding of general codes.
+modulation" (IEEE TIM 2011).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.itof import check_frequencies
-from torchtransient.sensing.itof_codes import CorrelationCode
-from torchtransient.sensing.layout import check_number, without_autocast
-from torchtransient.tensor_record import TensorRecord
+from torchtransient.quantities import shown
+from torchtransient.sensing.itof import Frequencies, check_frequencies
+from torchtransient.sensing.itof_codes import phase_steps
+from torchtransient.sensing.layout import check_count, product
 from torchtransient.units import SPEED_OF_LIGHT
+
+Readout = Literal["single", "two_tap", "differential"]
+Frames = Tensor | NDArray[Any]
 
 _TURN = 2 * math.pi
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ItofReading(TensorRecord):
-    """``phase`` (..., C, F, H, W) radians in [0, 2 pi); ``amplitude`` and ``offset`` in electrons per tap and
-    ``confidence`` = amplitude / offset, all (..., C, F, H, W); ``depth_m`` (..., C, H, W) metres from the camera."""
+def tap_phasor(taps: Frames, num_taps: int, readout: Readout = "single") -> Tensor:
+    """(..., C, F, H, W) complex: ``(2 / N) sum_n X_n exp(2 pi i n / N)`` of frames as `steps_of` takes them.
 
-    phase: Tensor
-    amplitude: Tensor
-    offset: Tensor
-    confidence: Tensor
-    depth_m: Tensor
-
-
-@without_autocast
-def tap_phasor(taps: Tensor, num_taps: int) -> Tensor:
-    """(..., C, F, H, W) complex: ``(2 / N) sum_n taps_n exp(2 pi i n / N)`` of taps (..., C, F N, H, W).
-
-    Taps at equal shifts of one function (sine, square). Harmonics ``m N +- 1`` of it alias into the result (wiggling).
-    Half precision becomes complex64. Raises ShapeError when the tap dimension is no multiple of ``num_taps``.
+    Steps of one function at equal shifts (sine, square); two steps are a quarter of a turn apart. Equal light gives
+    equal results in every readout. Harmonics ``m N +- 1`` alias into the result (wiggling; four steps for two).
+    Half precision becomes complex64. Errors as `steps_of`.
     """
-    split = _split(taps, num_taps, "tap_phasor")
-    if split.dtype in (torch.float16, torch.bfloat16):
-        split = split.float()  # bfloat16 has no complex numbers
-    # The mean has no part in the sum; without it, equal taps give exactly zero and float32 keeps its digits.
-    split = split - split.mean(-3, keepdim=True)
-    angles = _TURN * torch.arange(num_taps, dtype=torch.float64) / num_taps
-    weight = (2 / num_taps) * torch.exp(1j * angles)
-    real = torch.einsum("...fnhw,n->...fhw", split, weight.real.to(split))
-    imag = torch.einsum("...fnhw,n->...fhw", split, weight.imag.to(split))
+    steps = steps_of(taps, num_taps, readout, "tap_phasor")
+    if num_taps > 2:
+        # The mean has no part in the sum; without it, equal taps give exactly zero and float32 keeps its digits.
+        steps = steps - steps.mean(-3, keepdim=True)
+    angles = _TURN * phase_steps(num_taps)
+    weights = (2 / num_taps) * torch.stack([angles.cos(), angles.sin()])
+    both = product(weights.to(steps), steps.flatten(-2))
+    real, imag = both.reshape(*both.shape[:-1], *steps.shape[-2:]).unbind(-3)
     return torch.complex(real, imag)
 
 
-def offset_of(taps: Tensor, num_taps: int) -> Tensor:
-    """(..., C, F, H, W): mean of the taps, a pixel's unmodulated level. Errors as `tap_phasor`."""
-    return _split(taps, num_taps, "offset_of").mean(-3)
+def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tensor:
+    """(..., C, F, H, W): a pixel's level without modulation, the mean of its taps, or of ``A + B`` of two.
+
+    Half precision becomes float32. Errors as `steps_of`, and UnitError for differences, in which it has cancelled.
+    """
+    if readout == "differential":
+        raise UnitError("offset_of: expected frames of taps, got differences, in which the offset has cancelled.")
+    if readout == "two_tap":
+        return sums_of(taps, num_taps, "offset_of").mean(-3)
+    return steps_of(taps, num_taps, readout, "offset_of").mean(-3)
+
+
+def steps_of(taps: Frames, num_taps: int, readout: Readout, where: str) -> Tensor:
+    """(..., C, F, N, H, W): what each of the N = ``num_taps`` phase steps has measured, in float32 or better.
+
+    ``readout``: "single", frames (..., C, F N, H, W) of taps or of exposures of one tap, N >= 3; "two_tap", frames
+    (..., C, F 2N, H, W) of A and B in turn, N >= 2, whose difference it is; "differential", frames (..., C, F N, H, W)
+    of such differences. Raw frames of whole numbers are taken, as tensors or arrays; a black level has to be off
+    "single" frames only if their offset is to mean light. Raises ShapeError for another number of frames, UnitError
+    for numbers that are none of frames.
+    """
+    split = _split(taps, num_taps, readout, where)
+    return split[..., 0, :, :] - split[..., 1, :, :] if readout == "two_tap" else split[..., 0, :, :]
+
+
+def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
+    """(..., C, F, N, H, W): ``A + B`` of frames of two taps. Errors as `steps_of`."""
+    split = _split(taps, num_taps, "two_tap", where)
+    return split[..., 0, :, :] + split[..., 1, :, :]
+
+
+def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
+    """(..., C, F, N, taps of a pixel, H, W)."""
+    if readout not in get_args(Readout):
+        raise UnitError(f"{where}: expected readout to be one of {', '.join(get_args(Readout))}, got {readout!r}.")
+    frames = _precise(as_frames(taps, where), where)
+    each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
+    count = check_count(num_taps, "num_taps", where)
+    known = count >= least and frames.ndim >= 4 and frames.shape[-3] > 0 and frames.shape[-3] % (count * each) == 0
+    if not known:
+        frames_of = f"F x {each} x N" if each > 1 else "F x N"
+        raise ShapeError(
+            f"{where}: expected {readout} frames (..., C, {frames_of}, H, W) with N = {num_taps} >= {least} phase "
+            f"steps, got {tuple(frames.shape)}."
+        )
+    frequencies = frames.shape[-3] // (count * each)
+    return frames.reshape(*frames.shape[:-3], frequencies, count, each, *frames.shape[-2:])
+
+
+def as_frames(taps: Frames, where: str) -> Tensor:
+    """A tensor as it is, an array as one. UnitError for what holds no numbers."""
+    try:
+        return taps if isinstance(taps, Tensor) else torch.from_numpy(np.ascontiguousarray(taps))
+    except TypeError as error:
+        raise UnitError(f"{where}: expected frames as a tensor or an array of numbers, got {shown(taps)}.") from error
+
+
+def _precise(frames: Tensor, where: str) -> Tensor:
+    """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
+    if frames.is_complex() or frames.dtype == torch.bool:
+        raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
+    if not frames.is_floating_point():
+        # float32 holds every 16-bit number and the sum of two.
+        return frames.to(torch.float32 if frames.dtype.itemsize <= 2 else torch.float64)
+    return frames.float() if frames.dtype in (torch.float16, torch.bfloat16) else frames
 
 
 def phase_of(phasor: Tensor) -> Tensor:
@@ -76,7 +131,8 @@ def phase_of(phasor: Tensor) -> Tensor:
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
     scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
-    wrapped = angle + torch.where(angle.detach() < 0, _TURN, 0.0)
+    # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
+    wrapped = angle + _TURN * (angle.detach() < 0).to(angle)
     # The sum of a tiny negative angle and a turn rounds to the turn itself.
     return torch.where(wrapped.detach() >= _TURN, wrapped - _TURN, wrapped)
 
@@ -97,7 +153,7 @@ def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
 
 
-def unambiguous_range_m(frequencies_hz: float | Sequence[float]) -> float:
+def unambiguous_range_m(frequencies_hz: Frequencies) -> float:
     """``c / (2 gcd)``: the depth after which all phases repeat. UnitError for frequencies that are not whole hertz."""
     values = check_frequencies(frequencies_hz, "unambiguous_range_m")
     if any(f != int(f) for f in values):
@@ -125,20 +181,17 @@ def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) ->
     return loss if weight is None else loss * weight
 
 
-def phase_noise_rad(amplitude: Tensor, offset: Tensor, num_taps: int, read_noise_e: float = 0.0) -> Tensor:
-    """Standard deviation of the phase from amplitude and offset per tap, in electrons, shot and read noise.
-
-    ``sqrt(2 (offset + read^2) / N) / amplitude``, which is ``sqrt(2 B) / A`` of the totals without read noise: first
-    order in the noise, right for deviations below about 0.2 rad. Infinite at amplitude zero. With three taps the
-    variance also swings with the phase, ``(2 B - A cos 3 phi) / A^2``; this is its root mean square.
-    """
-    check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
-    return (2 * (offset + read_noise_e**2) / num_taps).sqrt() / amplitude
+def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | None = None) -> list[float]:
+    """How much the depth of each frequency counts in that of all, by least squares: ``w f^2`` over their sum."""
+    given = [1.0] * len(frequencies_hz) if weights is None else weights
+    # A phase of frequency f measures depth with the weight w / period^2.
+    parts = [w * f**2 for w, f in zip(given, frequencies_hz, strict=True)]
+    return [part / sum(parts) for part in parts]
 
 
 def unwrap_depth(
     phase: Tensor,
-    frequencies_hz: Sequence[float],
+    frequencies_hz: Frequencies,
     *,
     max_depth_m: float | None = None,
     min_depth_m: float = 0.0,
@@ -167,9 +220,7 @@ def unwrap_depth(
 
     turns = phase / _TURN
     periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn
-    # A phase of frequency f measures depth with the weight w / period^2.
-    share = [w / p**2 for w, p in zip(weight, periods, strict=True)]
-    share = [s / sum(share) for s in share]
+    share = shares_of_depth(values, weight)
     reference = min(range(len(values)), key=lambda i: periods[i])
     best, whole = _search(turns.detach(), periods, share, weight, reference, (float(min_depth_m), longest))
     del best
@@ -207,89 +258,3 @@ def _search(
         best = torch.where(better, residual, best)
         whole = torch.where(better.unsqueeze(-3), candidate, whole)
     return best, whole
-
-
-@without_autocast
-def decode_code(taps: Tensor, code: CorrelationCode, num_phases: int = 1024) -> Tensor:
-    """Phase (..., C, F, H, W) in radians of taps of *any* code, by the closest shape of the N taps.
-
-    The taps without their mean and at length one are compared with the code at ``num_phases`` phases (zero-mean
-    normalised cross-correlation, Gupta et al. 2018); the best of them, detached, is refined by one Gauss-Newton step
-    on the code's slope, which carries the gradient. Needs no model of amplitude or background. A dark or flat pixel
-    has phase zero. Raises ShapeError when the tap dimension is no multiple of the code's taps.
-    """
-    split = _split(taps, code.num_taps, "decode_code").movedim(-3, -1)
-    centred = split - split.mean(-1, keepdim=True)
-    length = torch.linalg.vector_norm(centred, dim=-1, keepdim=True)
-    there = ~(length <= 1e-6 * split.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(split.dtype).tiny))
-    unit = torch.where(there, centred, 0.0) / torch.where(there, length, 1.0)
-    x = torch.arange(num_phases, dtype=torch.float64) / num_phases
-    table = _unit_shapes(code, x).to(unit)
-    best = _best_match(unit.detach(), table)
-    step = 0.5 / num_phases
-    slope = ((_unit_shapes(code, x + step) - _unit_shapes(code, x - step)) / (2 * step)).to(unit)
-    here, direction = table[best], slope[best]
-    # Along the curve of shapes, the distance to the measured one in units of the curve's speed.
-    speed = direction.square().sum(-1).clamp_min(1e-12)
-    shift = ((unit - here) * direction).sum(-1) / speed
-    turns = x.to(unit)[best] + shift.clamp(-2 / num_phases, 2 / num_phases)
-    phase = (turns - torch.floor(turns.detach())) * _TURN
-    return torch.where(there.squeeze(-1), phase, 0.0)
-
-
-def _unit_shapes(code: CorrelationCode, turns: Tensor) -> Tensor:
-    """(P, N): the taps of a code at the given phases without their mean and at length one."""
-    shape = code.evaluate(turns).T
-    shape = shape - shape.mean(-1, keepdim=True)
-    unit: Tensor = shape / torch.linalg.vector_norm(shape, dim=-1, keepdim=True).clamp_min(1e-12)
-    return unit
-
-
-def _best_match(unit: Tensor, table: Tensor, chunk: int = 1 << 14) -> Tensor:
-    """Index of the row of ``table`` (P, N) with the largest product for each of (..., N); memory chunk x P."""
-    if unit.numel() == 0:
-        return torch.zeros(unit.shape[:-1], dtype=torch.int64, device=unit.device)
-    flat = unit.reshape(-1, unit.shape[-1])
-    found = [(flat[i : i + chunk] @ table.T).argmax(-1) for i in range(0, flat.shape[0], chunk)]
-    return torch.cat(found).reshape(unit.shape[:-1])
-
-
-def read_itof(
-    taps: Tensor,
-    frequencies_hz: float | Sequence[float],
-    num_taps: int,
-    *,
-    code: CorrelationCode | None = None,
-    max_depth_m: float | None = None,
-    min_depth_m: float = 0.0,
-) -> ItofReading:
-    """Everything a camera reports, from taps (..., C, F N, H, W). See `ItofReading` for shapes and units.
-
-    ``code``: decode by its shape (`decode_code`) instead of by the Fourier sum: needed for Hamiltonian and measured
-    codes, removes the wiggling of square ones. One frequency: depth within ``c / (2 f)``; several: unwrapped, with
-    weights by amplitude left out. Confidence is zero where there is no light.
-    """
-    values = check_frequencies(frequencies_hz, "read_itof")
-    if taps.shape[-3] != len(values) * num_taps:
-        raise ShapeError(
-            f"read_itof: expected taps (..., C, {len(values)} x {num_taps}, H, W), got {tuple(taps.shape)}."
-        )
-    phasor, offset = tap_phasor(taps, num_taps), offset_of(taps, num_taps)
-    phase = phase_of(phasor) if code is None else decode_code(taps, code)
-    amplitude = amplitude_of(phasor)
-    lit = ~(offset <= 0)
-    confidence = torch.where(lit, amplitude, 0.0) / torch.where(lit, offset, 1.0)
-    if len(values) == 1:
-        depth = depth_of_phase(phase, values[0]).squeeze(-3)
-    else:
-        depth = unwrap_depth(phase, values, max_depth_m=max_depth_m, min_depth_m=min_depth_m)
-    return ItofReading(phase, amplitude, offset, confidence, depth)
-
-
-def _split(taps: Tensor, num_taps: int, where: str) -> Tensor:
-    """(..., C, F, N, H, W) of taps (..., C, F N, H, W)."""
-    if taps.ndim < 4 or num_taps < 3 or taps.shape[-3] % num_taps or not taps.shape[-3]:
-        raise ShapeError(
-            f"{where}: expected taps (..., C, F x N, H, W) with N = {num_taps} >= 3, got {tuple(taps.shape)}."
-        )
-    return taps.reshape(*taps.shape[:-3], taps.shape[-3] // num_taps, num_taps, *taps.shape[-2:])

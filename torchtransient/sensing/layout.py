@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import WIDEST_BIN_S, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
 from torchtransient.quantities import as_number, shown
 
@@ -81,13 +82,28 @@ def check_count(value: float, name: str, where: str, *, low: int = 1) -> int:
 def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> float:
     """Bin width in seconds from a TimeAxis or a number; exactly one of them. UnitError otherwise.
 
-    A width of a second or more is refused: it is most likely given in nanoseconds, picoseconds or bins.
+    A width of a microsecond or more is refused: it is most likely given in nanoseconds, picoseconds or bins. An axis in
+    metres may be that wide.
     """
     if (axis is None) == (bin_width_s is None):
         raise UnitError(f"{where}: expected either axis= (a TimeAxis) or bin_width_s=, got both or neither.")
     if axis is not None:
         return check_time_axis(axis, where).bin_width_s
-    return check_seconds(bin_width_s if bin_width_s is not None else 0.0, "bin_width_s", where, open_low=True)
+    width = bin_width_s if bin_width_s is not None else 0.0
+    return check_seconds(width, "bin_width_s", where, open_low=True, high=WIDEST_BIN_S)
+
+
+def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, where: str) -> int:
+    """How many bins a laser period has. UnitError unless it is a whole number, and `num_bins` where that is given."""
+    bins = check_seconds(period_s, "period_s", where, open_low=True, high=1.0) / bin_width_s
+    # 1 in 1e6 for periods such as 1/rate that were rounded on the way
+    if round(bins) < 1 or abs(bins - round(bins)) > 1e-6 * bins or num_bins not in (None, round(bins)):
+        have = "a whole number of bins" if num_bins is None else f"the {num_bins} bins of the axis"
+        raise UnitError(
+            f"{where}: expected period_s to be {have} of {bin_width_s:g} s, got {period_s:g} s, {bins:g} of them. Take "
+            "an axis of one whole laser period."
+        )
+    return round(bins)
 
 
 def check_time_axis(axis: object, where: str) -> TimeAxis:
@@ -109,9 +125,18 @@ def check_generator(generator: object, where: str) -> None:
         )
 
 
-def check_seconds(value: float, name: str, where: str, *, open_low: bool = False) -> float:
-    """A duration in seconds, finite, not negative, below 1 s; UnitError otherwise (picoseconds given as seconds)."""
-    number = check_number(value, name, where, open_low=open_low)
-    if number >= 1.0:
-        raise UnitError(f"{where}: expected {name} in seconds, got {number!r} s. Picoseconds or bins? 50 ps is 50e-12.")
+def check_seconds(
+    value: float, name: str, where: str, *, open_low: bool = False, signed: bool = False, high: float = 1e-3
+) -> float:
+    """A duration in seconds, finite, not negative unless `signed`, below `high`; UnitError otherwise.
+
+    Widths, delays and dead times of detectors are far below the 1 ms that a picosecond is in nanoseconds; repetition
+    periods of lasers are not, and take `high` = 1 s.
+    """
+    number = check_number(value, name, where, low=-math.inf if signed else 0.0, open_low=open_low)
+    if abs(number) >= high:
+        raise UnitError(
+            f"{where}: expected {name} in seconds, below {high:g} s, got {number!r} s. Picoseconds, nanoseconds or "
+            "bins? 50 ps are 50e-12 s, 75 ns are 75e-9 s."
+        )
     return number

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import GradientError, ShapeError
+from torchtransient.floating import in_single
 from torchtransient.sensing.sensor import Sensor
 
 
+@in_single
 def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
     """``A^T y``: the transpose of a sensor's mean, exactly, for inputs of ``input_shape``; dtype and device of ``y``.
 

@@ -9,19 +9,25 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_tensor, check_transient
+from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
+from torchtransient.sensing.layout import TIME, bin_width_of, check_count, check_number, check_transient
+from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
+
+_DARKEST = 1e3  # f-number of a pinhole; millimetres over metres are a thousand times those of lenses
+_MOST_WATTS = 1e3  # on average, of a laser; nanojoules taken for joules are megawatts
+_LONGEST_S = 3600.0  # exposure of one histogram; megahertz taken for hertz make a million of it
 
 PLANCK_J_S = 6.626_070_15e-34  # exact by the definition of the kilogram (SI)
 
 
 def photon_energy_j(wavelength_m: float) -> float:
-    """Energy of one photon in joules: h c / wavelength. `wavelength_m` of 1 m or more (nanometres?) is refused."""
+    """Energy of one photon in joules: h c / wavelength. Refuses wavelengths that are none of light: 10 nm to 1 mm."""
     wavelength = check_number(wavelength_m, "wavelength_m", "photon_energy_j", open_low=True)
-    if wavelength >= 1e-2:
+    if not 1e-8 <= wavelength < 1e-3:
         raise UnitError(f"photon_energy_j: expected wavelength_m in metres, got {wavelength!r}. 532 nm is 532e-9.")
     return PLANCK_J_S * SPEED_OF_LIGHT / wavelength
 
@@ -44,7 +50,7 @@ class Optics:
         if (self.f_number is None) == (self.solid_angle_sr is None):
             raise UnitError("Optics: expected either f_number or solid_angle_sr, got both or neither.")
         if self.f_number is not None:
-            check_number(self.f_number, "f_number", "Optics", open_low=True)
+            check_number(self.f_number, "f_number", "Optics", low=0.1, high=_DARKEST)
         if self.solid_angle_sr is not None:
             check_number(self.solid_angle_sr, "solid_angle_sr", "Optics", high=2 * math.pi, open_low=True)
         # a pixel larger than 1 cm^2 is most likely given in square micrometres
@@ -58,6 +64,11 @@ class Optics:
         """The optics of a lens of this focal length and aperture."""
         focal = check_number(focal_length_m, "focal_length_m", "Optics", open_low=True)
         diameter = check_number(aperture_diameter_m, "aperture_diameter_m", "Optics", open_low=True)
+        if not 0.1 <= focal / diameter <= _DARKEST:
+            raise UnitError(
+                f"Optics: expected focal_length_m and aperture_diameter_m in one unit, metres, got {focal!r} and "
+                f"{diameter!r}, which is f/{focal / diameter:g}. 25 mm are 25e-3."
+            )
         return cls(focal / diameter, pixel_area_m2, transmission)
 
     @property
@@ -73,33 +84,65 @@ class Optics:
         return angle * self.pixel_area_m2 * self.transmission
 
 
+def ambient_photon_rate(
+    optics: Optics,
+    albedo: float | Tensor,
+    *,
+    spectral_irradiance_w_m2_nm: float,
+    filter_bandwidth_m: float,
+    wavelength_m: float,
+    illumination: float | Tensor = 1.0,
+) -> float | Tensor:
+    """Ambient photons per second on a pixel that sees a diffuse surface in the sun: for `PhotonBudget`.
+
+    rate = irradiance x bandwidth x illumination x albedo / pi x etendue / photon energy
+
+    `albedo`: a number or a map (H, W), (..., C, H, W), between 0 and 1; `spectral_irradiance_w_m2_nm`: of the sun on a
+    surface that faces it, W / (m^2 nm), constant over the filter of width `filter_bandwidth_m` (metres, 1 um and
+    less); `illumination`: cosine of the angle between sun and normal times the share of the sun that is not in shadow,
+    a number or a map, 0 to 1. Numbers give a number, maps a map of photons per second, differentiable in both.
+
+    A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; what the
+    sky adds belongs to the irradiance. Raises UnitError outside the ranges.
+    """
+    where = "ambient_photon_rate"
+    energy = photon_energy_j(wavelength_m)
+    irradiance = check_number(spectral_irradiance_w_m2_nm, "spectral_irradiance_w_m2_nm", where)
+    bandwidth = check_number(filter_bandwidth_m, "filter_bandwidth_m", where)
+    if bandwidth > 1e-6:
+        raise UnitError(f"{where}: expected filter_bandwidth_m in metres, got {bandwidth!r}. 10 nm is 10e-9.")
+    reflected = check_map(albedo, "albedo", where, high=1.0)
+    lit = check_map(illumination, "illumination", where, high=1.0)
+    return irradiance * bandwidth * 1e9 / math.pi * optics.etendue_m2_sr / energy * reflected * lit
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class BudgetReport(TensorRecord):
     """Where the detections of a pixel come from. Rates per laser cycle, before pile-up and dead time.
 
     `signal_per_cycle`: (..., C, H, W), detections of laser light; `ambient_per_cycle`, `dark_per_cycle`: the same for
-    the whole window; `cycles`; `exposure_s`.
+    the whole window, numbers, or maps where the budget has maps; `cycles`; `exposure_s`.
     """
 
     signal_per_cycle: Tensor
-    ambient_per_cycle: float
-    dark_per_cycle: float
+    ambient_per_cycle: float | Tensor
+    dark_per_cycle: float | Tensor
     cycles: int
     exposure_s: float
 
     @property
-    def background_per_cycle(self) -> float:
-        """Ambient light and dark counts together."""
+    def background_per_cycle(self) -> float | Tensor:
+        """Ambient light and dark counts together: a number, or a map."""
         return self.ambient_per_cycle + self.dark_per_cycle
 
     @property
     def signal_to_background(self) -> Tensor:
         """Ratio of signal and background detections; infinite without background."""
-        return (
-            self.signal_per_cycle / self.background_per_cycle
-            if self.background_per_cycle > 0
-            else torch.full_like(self.signal_per_cycle, math.inf)
-        )
+        signal = self.signal_per_cycle
+        background = torch.as_tensor(self.background_per_cycle, dtype=signal.dtype, device=signal.device)
+        some = background > 0
+        ratio = signal / torch.where(some, background, torch.ones_like(background))
+        return torch.where(some, ratio, torch.full_like(ratio, math.inf))
 
     @property
     def piles_up(self) -> Tensor:
@@ -114,15 +157,25 @@ class PhotonBudget(Sensor):
 
     The transient is rendered with an emitter of unit energy: W / (m^2 sr) per bin for a source of 1 W fired as one
     pulse of 1 J, so that times the pulse energy it is J / (m^2 sr). `ambient_rate_hz`: ambient photons on the pixel per
-    second, after the optics (detected: times the quantum efficiency); `dark_count_rate_hz`: per pixel, a number or a
-    map (H, W) for hot pixels. The background is spread evenly over the bins. `repetition_rate_hz` and either `cycles`
-    or `exposure_s` give the number of cycles.
+    second, after the optics (detected: times the quantum efficiency), see `ambient_photon_rate`;
+    `dark_count_rate_hz`: per pixel, see `hot_pixel_rates`. The background is spread evenly over the bins.
+    `repetition_rate_hz` and either `cycles` or `exposure_s` give the number of cycles.
 
-    Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period.
-    Not modelled: vignetting, angle dependence of the filter, speckle.
+    `quantum_efficiency` (the probability that a photon is detected), `ambient_rate_hz` and `dark_count_rate_hz` are
+    numbers or maps, (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other
+    maps are buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`).
+
+    Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period, for
+    more than 1 kW on average, for exposures of more than an hour or of less than one cycle, ShapeError for maps of
+    other images. Not modelled: angle dependence of the filter, speckle; vignetting is a map of the efficiency as far as
+    it acts on ambient and laser light alike.
     """
 
+    takes, gives = ("radiance",), "rate"
+
     dark_count_rate_hz: Tensor
+    ambient_rate_hz: float | Tensor
+    quantum_efficiency: float | Tensor
 
     def __init__(
         self,
@@ -133,8 +186,8 @@ class PhotonBudget(Sensor):
         repetition_rate_hz: float,
         cycles: int | None = None,
         exposure_s: float | None = None,
-        quantum_efficiency: float = 1.0,
-        ambient_rate_hz: float = 0.0,
+        quantum_efficiency: float | Tensor = 1.0,
+        ambient_rate_hz: float | Tensor = 0.0,
         dark_count_rate_hz: float | Tensor = 0.0,
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
@@ -147,20 +200,36 @@ class PhotonBudget(Sensor):
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)
         self.repetition_rate_hz = check_number(repetition_rate_hz, "repetition_rate_hz", where, open_low=True)
-        self.quantum_efficiency = check_number(quantum_efficiency, "quantum_efficiency", where, high=1.0)
-        self.ambient_rate_hz = check_number(ambient_rate_hz, "ambient_rate_hz", where)
-        dark = torch.as_tensor(dark_count_rate_hz, dtype=torch.float64)
-        if not bool(torch.isfinite(dark).all()) or bool((dark < 0).any()) or dark.ndim not in (0, 2):
-            raise UnitError(
-                f"{where}: expected dark_count_rate_hz >= 0, a number or (H, W), got {dark_count_rate_hz!r}."
-            )
-        self.register_buffer("dark_count_rate_hz", dark)
+        keep_map(self, "quantum_efficiency", check_map(quantum_efficiency, "quantum_efficiency", where, high=1.0))
+        keep_map(self, "ambient_rate_hz", check_map(ambient_rate_hz, "ambient_rate_hz", where))
+        dark = check_map(dark_count_rate_hz, "dark_count_rate_hz", where)
+        keep_map(self, "dark_count_rate_hz", dark if isinstance(dark, Tensor) else torch.tensor(dark).double())
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
+        self.num_bins = None if axis is None else axis.num_bins
         if (cycles is None) == (exposure_s is None):
             raise UnitError(f"{where}: expected either cycles or exposure_s, got both or neither.")
         if exposure_s is not None:
-            cycles = max(1, round(check_number(exposure_s, "exposure_s", where) * self.repetition_rate_hz))
+            cycles = self._cycles_of(check_number(exposure_s, "exposure_s", where))
         self.cycles = check_count(cycles or 0, "cycles", where)
+        if self.exposure_s > _LONGEST_S:
+            raise UnitError(
+                f"{where}: expected an exposure of at most {_LONGEST_S:g} s, got {self.exposure_s:g} s: {self.cycles} "
+                f"cycles at {self.repetition_rate_hz:g} Hz. 10 MHz are 10e6 Hz, 5 ms are 5e-3 s."
+            )
+        if self.pulse_energy_j * self.repetition_rate_hz > _MOST_WATTS:
+            raise UnitError(
+                f"{where}: expected a laser of at most {_MOST_WATTS:g} W on average, got {self.pulse_energy_j!r} J at "
+                f"{self.repetition_rate_hz:g} Hz, {self.pulse_energy_j * self.repetition_rate_hz:g} W. 1 nJ is 1e-9 J."
+            )
+
+    def _cycles_of(self, exposure_s: float) -> int:
+        """Laser cycles of an exposure, rounded. UnitError for less than one."""
+        if exposure_s * self.repetition_rate_hz < 1 - 1e-6:
+            raise UnitError(
+                f"PhotonBudget: expected exposure_s of at least one laser period, {1 / self.repetition_rate_hz:g} s, "
+                f"got {exposure_s!r} s. Is repetition_rate_hz ({self.repetition_rate_hz:g}) in hertz? 10 MHz are 10e6."
+            )
+        return round(exposure_s * self.repetition_rate_hz)
 
     @property
     def exposure_s(self) -> float:
@@ -168,11 +237,12 @@ class PhotonBudget(Sensor):
         return self.cycles / self.repetition_rate_hz
 
     @property
-    def detections_per_unit(self) -> float:
-        """Detections per cycle for a radiance of 1 in a bin."""
+    def detections_per_unit(self) -> float | Tensor:
+        """Detections per cycle for a radiance of 1 in a bin: a number, or a map where the efficiency is one."""
         photons = self.pulse_energy_j * self.optics.etendue_m2_sr / self.photon_energy_j
-        return photons * self.quantum_efficiency
+        return photons * wide(self.quantum_efficiency)
 
+    @in_single
     def signal(self, x: Tensor) -> Tensor:
         """Expected detections of laser light per cycle and bin, without background."""
         check_transient(x, "PhotonBudget")
@@ -183,26 +253,34 @@ class PhotonBudget(Sensor):
                 f"PhotonBudget: expected the window to fit into a laser period of {1 / self.repetition_rate_hz:g} s, "
                 f"got {window_s:g} s. Lower repetition_rate_hz or use fewer bins."
             )
-        return x * self.detections_per_unit
+        scale = over_time(self.detections_per_unit, x, "quantum_efficiency", "PhotonBudget")
+        return x * (scale.to(x.dtype) if isinstance(scale, Tensor) else scale)
 
+    def _background_hz(self, x: Tensor) -> tuple[float | Tensor, Tensor]:
+        """Ambient and dark detections per second, over the time of `x`, float64."""
+        where = "PhotonBudget"
+        ambient = over_time(wide(self.ambient_rate_hz), x, "ambient_rate_hz", where)
+        ambient = ambient * over_time(wide(self.quantum_efficiency), x, "quantum_efficiency", where)
+        dark = over_time(self.dark_count_rate_hz.double(), x, "dark_count_rate_hz", where)
+        return ambient, torch.as_tensor(dark)
+
+    @in_single
     def expected(self, x: Tensor) -> Tensor:
-        dark = self.dark_count_rate_hz
-        check_tensor(x, "PhotonBudget")
-        if any(have not in (1, wanted) for have, wanted in zip(dark.shape, x.shape[-2:], strict=False)):
-            raise ShapeError(
-                f"PhotonBudget: expected an image {tuple(dark.shape)} as in dark_count_rate_hz, got "
-                f"{tuple(x.shape[-2:])}. Make the map for this sensor."
-            )
-        background_hz = self.ambient_rate_hz * self.quantum_efficiency + self.dark_count_rate_hz.double()
-        return self.signal(x) + (background_hz * self.bin_width_s).to(x.dtype)
+        signal = self.signal(x)
+        ambient_hz, dark_hz = self._background_hz(x)
+        return signal + ((ambient_hz + dark_hz) * self.bin_width_s).to(x.dtype)
 
+    @in_single
     def report(self, x: Tensor) -> BudgetReport:
-        """Signal and background of every pixel (dark counts: the mean over pixels), for a transient of radiance."""
+        """Signal and background of every pixel, for a transient of radiance: maps where the budget has them."""
+        signal = self.signal(x).sum(TIME)
         window_s = x.shape[TIME] * self.bin_width_s
-        return BudgetReport(
-            signal_per_cycle=self.signal(x).sum(TIME),
-            ambient_per_cycle=self.ambient_rate_hz * self.quantum_efficiency * window_s,
-            dark_per_cycle=float(self.dark_count_rate_hz.double().mean()) * window_s,
-            cycles=self.cycles,
-            exposure_s=self.exposure_s,
-        )
+
+        def shown(rate_hz: float | Tensor) -> float | Tensor:
+            if not isinstance(rate_hz, Tensor):
+                return rate_hz * window_s
+            total = rate_hz * window_s
+            return total.squeeze(TIME) if total.ndim >= 3 else float(total)
+
+        ambient_hz, dark_hz = self._background_hz(x)
+        return BudgetReport(signal, shown(ambient_hz), shown(dark_hz), self.cycles, self.exposure_s)

@@ -21,7 +21,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.layout import check_number, check_tensor, without_autocast
+from torchtransient.floating import in_single
+from torchtransient.sensing.layout import check_number, check_tensor, product, without_autocast
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -57,15 +58,17 @@ def circular_analysers(extinction_ratio: float = math.inf, transmission: float =
     return factor * torch.stack([right + share * left, left + share * right])
 
 
+@in_single
 @without_autocast
 def analyse(stokes: Tensor, rows: Tensor) -> Tensor:
     """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
     _check_stokes(stokes, "analyse")
     if rows.ndim != 2 or rows.shape[1] != 4:
         raise ShapeError(f"analyse: expected rows (A, 4), got {tuple(rows.shape)}.")
-    return torch.einsum("as,...scthw->...acthw", rows.to(stokes), stokes)
+    return _by_rows(rows.to(stokes), stokes)
 
 
+@in_single
 @without_autocast
 def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
     """Least-squares Stokes vectors (..., 4, C, T, H, W) of measurements (..., A, C, T, H, W) behind analysers (A, 4).
@@ -80,7 +83,13 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
             f"{tuple(measurements.shape)} and {tuple(rows.shape)}."
         )
     inverse = torch.linalg.pinv(rows.double(), rtol=1e-9)
-    return torch.einsum("sa,...acthw->...scthw", inverse.to(measurements), measurements)
+    return _by_rows(inverse.to(measurements), measurements)
+
+
+def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
+    """(..., M, C, T, H, W): a matrix (M, K) times the components of (..., K, C, T, H, W)."""
+    mixed = product(matrix, x.flatten(TRANSIENT_DIM + 1))
+    return mixed.reshape(*mixed.shape[:-1], *x.shape[TRANSIENT_DIM + 1 :])
 
 
 # ------------------------------------------------------------------------------------------------------ physicality
@@ -171,9 +180,9 @@ class PolarizationMosaic(Sensor):
         return f"block={tuple(self.rows.shape[:2])}"
 
 
-@without_autocast
 def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
-    return torch.einsum("shw,...scthw->...cthw", weights, stokes)
+    # No product of matrices, which autocast would round.
+    return (weights[:, None, None] * stokes).sum(TRANSIENT_DIM)
 
 
 def mosaic_rows(
@@ -186,6 +195,7 @@ def mosaic_rows(
     return linear_analysers(flat, extinction_ratio, transmission).reshape(len(angles_deg), -1, 4)
 
 
+@in_single
 @without_autocast
 def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
     """(..., P Q, C, T, H, W) from raw light (..., C, T, H, W): every pixel of a block spread over the others.

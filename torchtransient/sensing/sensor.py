@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import GradientError
-from torchtransient.sensing.layout import check_generator
+from torchtransient.errors import GradientError, ShapeError
+from torchtransient.floating import in_single
+from torchtransient.sensing.layout import TIME, check_generator
 from torchtransient.sensing.policies import (
     GradPolicy,
     check_policy,
@@ -38,11 +40,57 @@ class PhysicalModule(nn.Module):
         return self
 
 
+# What stages hand on: W / (m^2 sr) per bin, detections per laser cycle and bin, the mean charge (or photons) of a whole
+# exposure, or what a detector has drawn.
+Quantity = Literal["radiance", "rate", "electrons", "counts"]
+
+# Where light enters a sensor, and the place of the light among the arguments.
+_ENTRANCES = {"expected": 0, "forward": 0, "sample": 0, "variance": 0, "gaussian": 0, "log_prob": 1}
+
+
+def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
+    """A method of a sensor that looks at the light before it takes it; see `Sensor`."""
+    careful = in_single(method)
+
+    @functools.wraps(method)
+    def enter(self: Sensor, *args: Any, **keywords: Any) -> Any:
+        self.check_bins(args[place] if len(args) > place else keywords.get("x"))
+        return careful(self, *args, **keywords)
+
+    return enter
+
+
 class Sensor(PhysicalModule):
     """Maps a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
 
     `forward` takes `generator` in every sensor, so that chains need not know which of their links are random.
+
+    `num_bins`: T of the axis that the sensor was made with, None for one that takes any. Light of another number of
+    bins is refused with ShapeError. Half precision is taken and measured in float32, the least in which counts are
+    counts; both hold for `expected`, `forward`, `sample`, `variance`, `gaussian` and `log_prob` of every subclass.
     """
+
+    num_bins: int | None = None
+    # What chains compare: what the sensor takes (anything, if it does not say) and gives (None: nobody knows), and
+    # whether it takes its bins for one whole laser period.
+    takes: tuple[Quantity, ...] = ()
+    gives: Quantity | Literal["the same"] | None = None
+    window_is_period: bool = False
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for name, place in _ENTRANCES.items():
+            if name in cls.__dict__:
+                setattr(cls, name, _entrance(cls.__dict__[name], place))
+
+    def check_bins(self, x: object) -> None:
+        """ShapeError for a tensor whose T is not that of the axis that the sensor was made with."""
+        if self.num_bins is None or not isinstance(x, Tensor) or x.ndim < 4 or x.shape[TIME] == self.num_bins:
+            return
+        raise ShapeError(
+            f"{type(self).__name__}: expected T = {self.num_bins} bins as in the axis (or period) it was made with, "
+            f"got {x.shape[TIME]} of {tuple(x.shape)}. Make it with the axis of the light; bin_width_s= takes any T."
+        )
 
     def expected(self, x: Tensor) -> Tensor:
         """The mean of the measurement, differentiable in `x` and in the parameters."""

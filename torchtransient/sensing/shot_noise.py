@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.layout import check_transient
 from torchtransient.sensing.sensor import RandomSensor
 
@@ -13,18 +14,17 @@ from torchtransient.sensing.sensor import RandomSensor
 _EXACT_FLOAT32 = 2.0**24
 
 
+@in_single
 def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Poisson counts with the given mean (any shape), without gradient; dtype and device are kept.
 
-    Half precision is drawn in float32 and float32 above 2^24 in float64, then rounded to the dtype of `mean`. Raises
+    Half precision gives float32. Float32 above 2^24 is drawn in float64, then rounded to the dtype of `mean`. Raises
     UnitError for negative or non-finite means: negative lobes of a filter have to be dealt with where they arise.
     """
     mean = mean.detach()
     low, high = torch.aminmax(mean) if mean.numel() else (mean.new_zeros(()), mean.new_zeros(()))
     if not bool(low >= 0) or not bool(torch.isfinite(high)):
         raise UnitError(f"poisson: expected finite means >= 0, got values from {float(low):g} to {float(high):g}.")
-    if mean.dtype in (torch.float16, torch.bfloat16):
-        return torch.poisson(mean.float(), generator=generator).to(mean.dtype)
     if mean.dtype == torch.float32 and float(high) > _EXACT_FLOAT32 / 2:
         return torch.poisson(mean.double(), generator=generator).to(mean.dtype)
     return torch.poisson(mean, generator=generator)
@@ -43,6 +43,8 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
 class ShotNoise(RandomSensor):
     """Poisson counts of a mean (..., C, T, H, W), in counts. Fano factor 1. All four gradient policies."""
+
+    takes, gives = ("electrons",), "counts"
 
     def expected(self, x: Tensor) -> Tensor:
         return check_transient(x, "ShotNoise")

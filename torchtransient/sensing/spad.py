@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.dead_time_cycle import check_dead_bins, detected_rows, double_detections
 from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
 from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
@@ -35,6 +36,7 @@ def _working(x: Tensor) -> Tensor:
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 
+@in_single
 def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
 
@@ -81,6 +83,7 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     return _image(detected_rows(_rows(rate), dead), rate)
 
 
+@in_single
 def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
     """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
 
@@ -105,6 +108,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     return CoatesEstimate((-torch.log1p(-share.clamp(0, highest))).to(counts.dtype), valid)
 
 
+@in_single
 def sample_detections(
     rate: Tensor, cycles: int, dead_bins: float | None = None, generator: torch.Generator | None = None
 ) -> Tensor:
@@ -156,6 +160,8 @@ class SynchronousSPAD(RandomSensor):
     their own, behind.
     """
 
+    takes, gives = ("rate",), "counts"
+
     gate: Tensor | None
 
     def __init__(
@@ -170,6 +176,10 @@ class SynchronousSPAD(RandomSensor):
     ) -> None:
         super().__init__(grad)
         self.cycles = check_count(cycles, "cycles", "SynchronousSPAD")
+        self.bin_width_s: float | None = None
+        if axis is not None or bin_width_s is not None:
+            self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
+        self.num_bins = None if axis is None else axis.num_bins
         self.dead_time_s = dead_time_s
         self.dead_bins: float | None = None
         if dead_time_s is not None:
@@ -193,6 +203,7 @@ class SynchronousSPAD(RandomSensor):
             raise ShapeError(f"SynchronousSPAD: expected T = {self.gate.shape[0]} as in gate, got {x.shape[TIME]}.")
         return x * self.gate.to(x.dtype).view(-1, 1, 1)
 
+    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per cycle and bin, after pile-up."""
         rate = self._gated(x)
@@ -256,6 +267,14 @@ class SynchronousSPAD(RandomSensor):
         return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
 
 
+def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
+    """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
+    if dead_bins is None:
+        return cycles - sum_before(counts)
+    return armed_time(counts, cycles, float(dead_bins)).exposed
+
+
+@in_single
 def first_photon_log_prob(
     counts: Tensor,
     rate: Tensor,

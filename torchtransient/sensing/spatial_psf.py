@@ -73,6 +73,8 @@ def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
 class SpatialPSF(Sensor):
     """A measured point spread function `psf` (h, w), odd sizes, values >= 0; normalised to 1. Source: `blur_image`."""
 
+    gives = "the same"
+
     psf: Tensor
 
     def __init__(self, psf: Tensor, border: Border = "reflect", *, learnable: bool = False) -> None:
@@ -102,6 +104,8 @@ class LensBlur(Sensor):
 
     The size of the kernel, 2 FWHM (4.7 standard deviations) to each side (or `size`), is fixed when the module is made.
     """
+
+    gives = "the same"
 
     log_fwhm_px: Tensor
 

@@ -11,10 +11,17 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import electronics, itof, itof_codes
 
 AXIS = TimeAxis(0.5, 0.2, 12)
+MAP_M = 0.2 * torch.arange(6.0).reshape(2, 3)
 
 
 def itof_correlation():
     return itof.ItofCorrelation(itof_codes.square_code(4), (20e6, 60e6), AXIS, contrast=0.8)
+
+
+def two_tap_camera():
+    """Pixels of two taps whose phases differ, by a code with corners."""
+    known = sensing.ItofCalibration(0.3, -1, 0.1 * torch.arange(6.0).reshape(2, 3))
+    return itof.ItofCorrelation(sensing.TwoTapCode(itof_codes.square_code(2)), (20e6, 60e6), AXIS, calibration=known)
 
 
 def pixel_electronics(grad="expected"):
@@ -59,6 +66,19 @@ ENTRIES: list[Entry] = [
             (lambda: itof_correlation()(torch.ones(3)), ShapeError),
             (lambda: itof.ItofCorrelation(itof_codes.sine_code(4), 20.0, AXIS), UnitError),
         ),
+    ),
+    Entry("ItofCorrelation-two-tap", two_tap_camera, conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1)),
+    Entry(
+        "ItofCorrelation-map",
+        lambda: itof.ItofCorrelation(
+            itof_codes.sine_code(3), (20e6, 60e6), AXIS, calibration=sensing.ItofCalibration(depth_map_m=MAP_M)
+        ),
+        conserves=lambda y: y.sum() / (2 if y.shape[-3] == 6 else 1),
+    ),
+    Entry(
+        "TapDifference",
+        sensing.TapDifference,
+        errors=((lambda: sensing.TapDifference()(torch.ones(1, 7, 1, 1)), ShapeError),),
     ),
     Entry(
         "PixelElectronics",

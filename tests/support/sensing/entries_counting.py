@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import torch
 
-from support.sensing.contract import Entry
+from support.sensing.contract import Entry, counts_like
 from torchtransient import sensing
 from torchtransient.errors import GradientError, ShapeError, UnitError
 
 PS = 1e-12
-ALL = (torch.bfloat16, torch.float32, torch.float64)
 
 
 def impulse(response, **keywords):
     return lambda: sensing.ImpulseResponse(response(), bin_width_s=20 * PS, **keywords)
+
+
+def jitter(response, **keywords):
+    return lambda **k: sensing.DetectionJitter(response(), bin_width_s=20 * PS, **keywords, **k)
+
+
+def whole_counts(shape, seed=0):
+    return torch.poisson(30 * counts_like(shape, seed), generator=torch.Generator().manual_seed(seed))
 
 
 def tails():
@@ -32,7 +39,7 @@ def composed():
 
 
 ENTRIES = [
-    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True)), dtypes=ALL),
+    Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True))),
     Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
     Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
     Entry(
@@ -51,7 +58,6 @@ ENTRIES = [
         lambda: sensing.LensBlur(0.8, "circular", size=3, learnable=True),
         shape=(2, 1, 3, 4, 5),
         conserves=lambda y: y.sum((-1, -2)),
-        dtypes=ALL,
     ),
     Entry(
         "SpatialPSF", lambda: sensing.SpatialPSF(torch.arange(9.0).view(3, 3), learnable=True), shape=(2, 1, 3, 4, 5)
@@ -67,9 +73,8 @@ ENTRIES = [
             ambient_rate_hz=1e6,
             bin_width_s=20 * PS,
         ),
-        dtypes=ALL,
     ),
-    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), dtypes=ALL, random=True),
+    Entry("SynchronousSPAD", lambda **k: sensing.SynchronousSPAD(500, **k), random=True),
     Entry(
         "SynchronousSPAD-gate",
         lambda **k: sensing.SynchronousSPAD(500, gate=torch.linspace(0, 1, 12), **k),
@@ -114,12 +119,40 @@ ENTRIES = [
     ),
     Entry(
         "TDC",
-        lambda: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0))),
+        lambda **k: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0)), **k),
+        input=whole_counts,
         conserves=lambda y: y.sum(-3),
-        dtypes=ALL,
+        random=True,
+        # none of its numbers is learnt: nothing for a score of its own
+        policies=("expected", "gaussian", "straight_through"),
     ),
-    Entry("TDC-dither", lambda: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3)),
-    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True, dtypes=ALL),
+    Entry(
+        "TDC-dither",
+        lambda **k: sensing.TDC(torch.ones(12), dither=True, sliding_scale=3, offset_bins=0.3, **k),
+        input=whole_counts,
+        conserves=lambda y: y.sum(-3),
+        random=True,
+        policies=("expected", "gaussian", "straight_through"),
+        errors=(
+            (lambda: sensing.TDC(torch.ones(4), acts_on="light"), ShapeError),
+            (lambda: sensing.TDC(torch.ones(4), boundary="open"), ShapeError),
+        ),
+    ),
+    Entry("TDC-rates", lambda: sensing.TDC(torch.ones(12), dither=True, acts_on="rates", boundary="zero")),
+    Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True),
+    Entry("DetectionJitter-zero", jitter(measured, boundary="zero"), input=whole_counts, random=True),
+    Entry(
+        "DetectionJitter-composed",
+        jitter(composed, within_bin="center"),
+        input=whole_counts,
+        random=True,
+        errors=(
+            (lambda: sensing.DetectionJitter(torch.ones(3), bin_width_s=20 * PS), ShapeError),
+            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20 * PS, boundary="open"), ShapeError),
+            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20.0), UnitError),
+        ),
+    ),
+    Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True),
     Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
     Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
     Entry(

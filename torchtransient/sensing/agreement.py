@@ -1,0 +1,245 @@
+"""Whether stages in a row are made for one another: bins, laser cycles and period, what is given and what taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from torch import nn
+
+from torchtransient.axes import TimeAxis
+from torchtransient.errors import UnitError
+from torchtransient.sensing.sensor import Quantity, Sensor
+
+# Two axes are the same when their bins agree to a millionth of a bin over the whole length.
+_SAME_BIN = 1e-6
+# Periods written as 1/rate or as a number of bins were rounded on the way.
+_SAME_PERIOD = 1e-6
+
+_WORDS: dict[Quantity, str] = {
+    "radiance": "radiance",
+    "rate": "detections per laser cycle and bin",
+    "electrons": "mean electrons, or photons, of a whole exposure",
+    "counts": "counts that a detector has drawn",
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A sensor in a chain, with the words that name it in messages."""
+
+    name: str
+    sensor: Sensor
+
+    def __str__(self) -> str:
+        return f"stage '{self.name}' ({type(self.sensor).__name__})"
+
+
+@dataclass(frozen=True)
+class _Light:
+    """What is known of the light between two stages, and which stage it is from."""
+
+    quantity: Quantity | None = None
+    giver: Stage | None = None
+    cycles: int = 1  # of the exposure that a rate per cycle belongs to
+    bins: Stage | None = None
+
+
+def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
+    """The sensors of a chain in their order, those of nested chains too; None for modules of another kind."""
+
+    def walk(module: nn.Module, prefix: str) -> Iterator[Stage | None]:
+        for name, child in module.named_children():
+            inner = getattr(child, "stages", child)
+            if isinstance(inner, (nn.ModuleList, nn.Sequential)):
+                yield from walk(inner, f"{prefix}{name}.")
+            else:
+                yield Stage(f"{prefix}{name}", child) if isinstance(child, Sensor) else None
+
+    yield from walk(getattr(chain, "stages", chain), "")
+
+
+def check_stages(chain: nn.Module) -> None:
+    """UnitError for stages of which one is not made for what those before it give.
+
+    Compared are bins, `cycles`, laser periods and quantities. What a module of another kind does to the light is not
+    known, nor what a sensor does that has no `gives`: behind these, bins and quantities are compared anew.
+    """
+    light = _Light()
+    stages = list(stages_of(chain))
+    for stage in stages:
+        if stage is None:
+            light = _Light()
+            continue
+        _check_quantity(light, stage)
+        light = _after(stage, _same_bins(light, stage))
+    _check_cycles(_parts_of(chain))
+    check_window(chain, None)
+
+
+def _parts_of(chain: nn.Module) -> list[Stage]:
+    """Every sensor of a chain, those that other sensors are made of too."""
+    parts = ((name.replace("stages.", ""), part) for name, part in chain.named_modules() if part is not chain)
+    return [Stage(name, part) for name, part in parts if isinstance(part, Sensor)]
+
+
+# ------------------------------------------------------------------------------------------------------------- bins
+
+
+def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
+    """UnitError when a sensor, or one that is part of it, was made for other bins than those of ``axis``."""
+    for name, module in sensor.named_modules():
+        if not isinstance(module, Sensor):
+            continue  # a measured response has bins of its own
+        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
+        slack = _SAME_BIN * axis.bin_width_opl
+        same, made_for = module.num_bins in (None, axis.num_bins), f"{module.num_bins} bins"
+        if isinstance(own, TimeAxis):
+            made_for = str(own)
+            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
+            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
+        elif isinstance(width_s, float):
+            made_for = f"bins of {width_s:g} s" if module.num_bins is None else f"{made_for} of {width_s:g} s"
+            same = same and abs(width_s - axis.bin_width_s) * axis.num_bins <= _SAME_BIN * axis.bin_width_s
+        if not same:
+            raise UnitError(
+                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {made_for}), got {axis}. "
+                "Make the sensor with the renderer's axis."
+            )
+
+
+def _same_bins(light: _Light, stage: Stage) -> _Light:
+    """The light with the stage that its bins are known from. UnitError for a stage that was made for others."""
+    own, before = _bins(stage), light.bins
+    if own is None or before is None:
+        return light if own is None else replace(light, bins=stage)
+    width, number = own
+    known = _bins(before)
+    if known is not None:
+        most = max(number or 1, known[1] or 1)
+        same = None in (number, known[1]) or number == known[1]
+        if not same or abs(width - known[0]) * most > _SAME_BIN * width:
+            raise UnitError(
+                f"Compose: expected one time axis for all stages, got {_shown(known)} in {before} and {_shown(own)} in "
+                f"{stage}. Make both with the axis of the light."
+            )
+    return replace(light, bins=stage) if number is not None else light
+
+
+def _bins(stage: Stage) -> tuple[float, int | None] | None:
+    """(width in seconds, number or None) of the bins that a sensor was made for; None when it takes any."""
+    axis, width = getattr(stage.sensor, "axis", None), getattr(stage.sensor, "bin_width_s", None)
+    if isinstance(axis, TimeAxis):
+        return axis.bin_width_s, axis.num_bins
+    return (width, stage.sensor.num_bins) if isinstance(width, float) else None
+
+
+def _shown(bins: tuple[float, int | None]) -> str:
+    return f"bins of {bins[0]:g} s" if bins[1] is None else f"{bins[1]} bins of {bins[0]:g} s"
+
+
+# ------------------------------------------------------------------------------------------------------- quantities
+
+
+def _check_quantity(light: _Light, stage: Stage) -> None:
+    """UnitError for a stage that takes other light than the stages before it give."""
+    takes, given = stage.sensor.takes, light.quantity
+    if not takes or given is None or given in takes:
+        return
+    per_cycle = given == "rate" and "electrons" in takes
+    # of one cycle, or made into those of all of them
+    if per_cycle and (light.cycles == 1 or getattr(stage.sensor, "electrons_per_unit", 1.0) != 1.0):
+        return
+    wanted = " or ".join(_WORDS[t] for t in takes)
+    raise UnitError(
+        f"Compose: expected {wanted} for {stage}, got {_WORDS[given]} of {light.giver}. {_what_to_do(light, takes)}"
+    )
+
+
+def _what_to_do(light: _Light, takes: tuple[Quantity, ...]) -> str:
+    if light.quantity == "rate" and "electrons" in takes:
+        return (
+            f"They are those of one of {light.cycles} cycles. Count them with SynchronousSPAD({light.cycles}), give "
+            f"electrons_per_unit={light.cycles} where the stage has it, or make the budget with cycles=1 and the "
+            "energy of them all."
+        )
+    if light.quantity == "rate" and "counts" in takes:
+        return "Put the detector between them: SynchronousSPAD, FreeRunningSPAD or BinaryFrames."
+    if "radiance" in takes:
+        return "PhotonBudget takes what a renderer gives; leave out what has made detections of it before."
+    if light.quantity == "counts":
+        return "Light is counted once: leave one of them out, or say PixelElectronics(shot_noise=False)."
+    return "Electrons of an exposure are no rates per cycle: leave one of the two out."
+
+
+def _after(stage: Stage, light: _Light) -> _Light:
+    gives = stage.sensor.gives
+    if gives == "the same":
+        return light
+    if gives is None:
+        return _Light()
+    cycles = getattr(stage.sensor, "cycles", 1)
+    # taps and gates stand where bins were
+    bins = None if gives == "electrons" else light.bins
+    return _Light(gives, stage, cycles if isinstance(cycles, int) else 1, bins)
+
+
+# ----------------------------------------------------------------------------------------------- cycles and periods
+
+
+def _check_cycles(stages: list[Stage]) -> None:
+    """UnitError for stages that count different numbers of laser cycles."""
+    counting = [(s, s.sensor.cycles) for s in stages if isinstance(getattr(s.sensor, "cycles", None), int)]
+    for stage, cycles in counting[1:]:
+        first, wanted = counting[0]
+        if cycles != wanted:
+            raise UnitError(
+                f"Compose: expected one number of cycles in all stages, got {wanted} in {first} and {cycles} in "
+                f"{stage}. Give the detector budget.cycles; change both in a Device."
+            )
+
+
+def check_window(chain: nn.Module, num_bins: int | None) -> None:
+    """UnitError where bins and the laser period of a `PhotonBudget` in the chain do not go together.
+
+    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; a
+    `SynchronousSPAD` with a dead time has to be armed again when the next cycle begins. ``num_bins``: of the light,
+    None while there is none, which leaves out stages that were made with a width alone.
+    """
+    stages = _parts_of(chain)
+    for budget in stages:
+        rate_hz = getattr(budget.sensor, "repetition_rate_hz", None)
+        if isinstance(rate_hz, float):
+            for stage in stages:
+                _check_period(budget, 1 / rate_hz, stage, num_bins)
+
+
+def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
+    own = getattr(stage.sensor, "period_s", None)
+    if isinstance(own, float):
+        if not math.isclose(own, period_s, rel_tol=_SAME_PERIOD):
+            raise UnitError(
+                f"Compose: expected the laser period of {budget}, {period_s:g} s, in {stage}, got {own:g} s. Give it "
+                "period_s=1 / repetition_rate_hz."
+            )
+        return
+    bins = _bins(stage)
+    number = None if bins is None else bins[1] or num_bins
+    if bins is None or number is None:
+        return
+    window_s = number * bins[0]
+    if stage.sensor.window_is_period and not math.isclose(window_s, period_s, rel_tol=_SAME_PERIOD):
+        raise UnitError(
+            f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
+            f"bins of {bins[0]:g} s, {window_s:g} s. Take an axis of the whole period; Afterpulsing takes period_s= "
+            "as well."
+        )
+    dead_s = getattr(stage.sensor, "dead_time_s", None)
+    rearms = stage.sensor.takes == ("rate",) and isinstance(dead_s, float)
+    if rearms and window_s + float(dead_s or 0.0) > period_s * (1 + _SAME_PERIOD):
+        raise UnitError(
+            f"Compose: expected {stage} to be armed again before the next cycle of {budget}, {period_s:g} s later, got "
+            f"a window of {window_s:g} s and a dead time of {dead_s:g} s. A detector that goes on into the next cycle "
+            "is a FreeRunningSPAD on an axis of the whole period; or lower repetition_rate_hz."
+        )

@@ -1,0 +1,88 @@
+"""The order of a chain: what may stand before what, and the errors that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from torch import nn
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.detection_jitter import DetectionJitter
+from torchtransient.sensing.gated import GatedIntegration
+from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.photon_budget import PhotonBudget
+from torchtransient.sensing.pixel_groups import PixelGroups
+from torchtransient.sensing.pixel_skew import DetectionSkew
+from torchtransient.sensing.sensor import Sensor
+from torchtransient.sensing.tdc import TDC
+
+_MOVES = (DetectionJitter, DetectionSkew)
+# share of a gate outside the window that starves no image by more than the rounding of a count
+_OUTSIDE = 1e-6
+
+
+def flattened(stages: Iterable[nn.Module]) -> Iterator[nn.Module]:
+    """The stages of a chain and of the chains in it, in order."""
+    for stage in stages:
+        inner = stage if isinstance(stage, nn.Sequential) else getattr(stage, "stages", None)
+        if isinstance(inner, (nn.Sequential, nn.ModuleList)):
+            yield from flattened(inner)
+        else:
+            yield stage
+
+
+def has_background(budget: PhotonBudget) -> bool:
+    """Whether a budget adds ambient light or dark counts."""
+    ambient = torch.as_tensor(budget.ambient_rate_hz) * torch.as_tensor(budget.quantum_efficiency)
+    return bool((ambient > 0).any()) or bool((torch.as_tensor(budget.dark_count_rate_hz) > 0).any())
+
+
+def _detects(stage: nn.Module) -> bool:
+    """Whether a stage makes counts of light."""
+    return isinstance(stage, Sensor) and stage.gives == "counts" and bool({"rate", "electrons"} & set(stage.takes))
+
+
+def check_order(stages: Iterable[nn.Module], where: str) -> None:
+    """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
+    background, behind = False, None
+    # of pixels of several kinds the first stands for all
+    found = [stage.sensors[0] if isinstance(stage, PixelGroups) else stage for stage in flattened(stages)]
+    for number, stage in enumerate(found):
+        name = type(stage).__name__
+        if background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
+            raise UnitError(
+                f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
+                "ambient light and dark counts would starve at the ends of the window. Put an ImpulseResponse in "
+                "front of the budget (the shape of the light), or use boundary='periodic'."
+            )
+        if background and isinstance(stage, GatedIntegration):
+            _check_gates(stage, where)
+        if behind is not None and isinstance(stage, ImpulseResponse):
+            raise UnitError(
+                f"{where}: expected no ImpulseResponse behind {behind}: it would average counts. Use DetectionJitter, "
+                "which moves every detection, or put the response in front of the detector."
+            )
+        on_detections = isinstance(stage, _MOVES) or (isinstance(stage, TDC) and stage.acts_on == "detections")
+        later = next((type(s).__name__ for s in found[number + 1 :] if _detects(s)), None)
+        if on_detections and later is not None:
+            raise UnitError(
+                f"{where}: expected {name} behind the detector, got it in front of {later}. It acts on detections. "
+                + ("Say acts_on='rates'" if isinstance(stage, TDC) else "Take an ImpulseResponse or a PixelSkew")
+                + " for light."
+            )
+        if isinstance(stage, PhotonBudget):
+            background = background or has_background(stage)
+        elif _detects(stage) and "rate" in getattr(stage, "takes", ()):
+            behind = name
+
+
+def _check_gates(stage: GatedIntegration, where: str) -> None:
+    missed = stage.outside()
+    worst = int(missed.argmax())
+    if float(missed[worst]) > _OUTSIDE:
+        raise UnitError(
+            f"{where}: expected gates inside the window of {stage.axis} behind a background, got gate {worst} with "
+            f"{float(missed[worst]):.2g} of its time outside, where the ambient light is not known. Move the gate or "
+            "lengthen the axis."
+        )

@@ -1,0 +1,251 @@
+"""Counts that move in time: the linear map of their means, and draws in which every detection moves by itself.
+
+A move is a table of shares: of the counts of bin t, a share goes `lag` bins later. Whole counts are split over the lags
+by a tree of binomials, which is the multinomial distribution exactly. Rare lags part first and are followed for the few
+entries that reach them; the others part in halves of nearly equal weight, which `halve` draws fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchtransient.sensing.added_counts import is_whole
+from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces
+from torchtransient.sensing.layout import TIME, check_transient
+from torchtransient.sensing.policies import record_score, standard_normal, straight_through
+from torchtransient.sensing.sensor import RandomSensor
+from torchtransient.sensing.thinning import halve, thin
+from torchtransient.sensing.time_convolution import Boundary
+
+_BLOCK = 1 << 18  # entries at a time, so that temporaries stay in the cache
+_RARE = 0.05  # share of a branch below which single events are sought instead of tossing coins for all
+_FEW = 0.25  # share of occupied entries below which these alone are followed
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Shares of the counts of a bin that go `first + l` bins later: (L,) for all bins, or (L, T) for each.
+
+    They sum to 1 over L, or to less: the rest is lost. `boundary`: what happens to counts that leave the window.
+    """
+
+    first: int
+    shares: Tensor
+    boundary: Boundary
+
+    def of_lag(self, index: int, like: Tensor) -> Tensor:
+        """The share of one lag, for entries (..., T, H, W)."""
+        share = self.shares[index].to(like)
+        return share.view(-1, 1, 1) if share.ndim else share
+
+    def mean(self, x: Tensor) -> Tensor:
+        """The mean of moved counts, linear in `x` (..., T, H, W)."""
+        total = torch.zeros_like(x)
+        for index in range(self.shares.shape[0]):
+            total = total + shifted(x * self.of_lag(index, x), self.first + index, self.boundary)
+        return total
+
+    def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Normal noise with the covariance of moved counts `x` that are known themselves. One draw for each lag.
+
+        Counts of a bin that go elsewhere are missing where they would have gone: n (diag p - p p^T) for each bin.
+        """
+        variance = x.clamp_min(0)
+        root = (variance + 1e-4).sqrt() - 1e-2
+        total, drawn = torch.zeros_like(x), torch.zeros_like(x)
+        for index in range(self.shares.shape[0]):
+            part = root * self.of_lag(index, x).clamp_min(0).add(1e-30).sqrt() * standard_normal(x, generator)
+            drawn = drawn + part
+            total = total + shifted(part, self.first + index, self.boundary)
+        if float(self.shares.detach().sum(0).amin()) < 1 - 1e-6:
+            rest = (1 - self.shares.sum(0)).clamp_min(1e-30).to(x)
+            drawn = drawn + root * (rest.view(-1, 1, 1) if rest.ndim else rest).sqrt() * standard_normal(x, generator)
+        return total - self.mean(drawn)
+
+
+def shifted(x: Tensor, lag: int, boundary: Boundary) -> Tensor:
+    """`x` (..., T, H, W) with every entry `lag` bins later."""
+    if boundary == "periodic":
+        return x.roll(lag, TIME)
+    bins = x.shape[TIME]
+    if abs(lag) >= bins:
+        return torch.zeros_like(x)
+    kept = x.narrow(TIME, max(-lag, 0), bins - abs(lag))
+    gap = torch.zeros_like(x.narrow(TIME, 0, abs(lag)))
+    return torch.cat([gap, kept] if lag >= 0 else [kept, gap], TIME)
+
+
+def move_counts(
+    counts: Tensor, moves: Moves, generator: torch.Generator | None = None, *, tally: bool = False
+) -> tuple[Tensor, Tensor | None]:
+    """Whole `counts` (..., T, H, W) >= 0, float32 or float64, each detection moved by itself. No gradient.
+
+    `tally`: also how many took each lag, (L, ..., H, W). Exact for any counts that the dtype holds.
+    """
+    given = counts.detach()
+    bins, shape = given.shape[TIME], given.shape
+    data = given.reshape(-1, bins, shape[-2] * shape[-1])
+    tallies: Tensor | None = None
+    if tally:
+        tallies = data.new_zeros(moves.shares.shape[0], data.shape[0], data.shape[2])
+        moved = _Tree(moves, data, tallies).run(generator)
+        tallies = tallies.view(-1, *shape[:TIME], *shape[-2:])
+    else:
+        columns = data.movedim(2, 0)
+        parts = by_pieces(lambda piece, _, own: _by_blocks(piece.movedim(0, 2), moves, own), columns, generator)
+        moved = torch.cat(parts, 2) if len(parts) > 1 else parts[0]
+    return moved.reshape(shape), tallies
+
+
+def _by_blocks(data: Tensor, moves: Moves, generator: torch.Generator | None) -> Tensor:
+    width = max(1, _BLOCK // max(data.shape[0] * data.shape[1], 1))
+    if data.shape[2] <= width:
+        return _Tree(moves, data.contiguous(), None).run(generator)
+    pieces = torch.split(data, width, 2)
+    return torch.cat([_Tree(moves, p.contiguous(), None).run(generator) for p in pieces], 2)
+
+
+class _Tree:
+    """Splits counts (N, T, P) over lags, adding them up where they go."""
+
+    def __init__(self, moves: Moves, data: Tensor, tallies: Tensor | None) -> None:
+        self.moves, self.data, self.tallies = moves, data, tallies
+        self.shares = moves.shares.detach().double().to(data.device)
+        rest = (1 - self.shares.sum(0, keepdim=True)).clamp_min(0)
+        if float(rest.max()) > 1e-12:
+            self.shares = torch.cat([self.shares, rest])  # those that are lost
+        self.weights = (self.shares if self.shares.ndim == 1 else self.shares.mean(1)).tolist()
+        self.total = torch.zeros_like(data)
+
+    def run(self, generator: torch.Generator | None) -> Tensor:
+        if self.data.numel():
+            self._node(list(range(len(self.weights))), None, self.data, generator)
+        return self.total
+
+    def _node(self, lags: list[int], place: Tensor | None, counts: Tensor, generator: torch.Generator | None) -> None:
+        """`counts` go to these lags; `place`: which entries they are, None for all."""
+        if len(lags) == 1:
+            self._leaf(lags[0], place, counts)
+            return
+        small, large = self._split(lags)
+        few, whole = (self.shares[list(part)].sum(0) for part in (small, lags))
+        share = (few / whole.clamp_min(1e-300)).clamp(0, 1)
+        if float(share.max()) < _RARE:
+            events = thin(counts, self._of_entries(share, place, counts), generator)
+            rest = counts.clone()
+            rest.view(-1)[events.place] -= events.number
+            few_place = events.place if place is None else place[events.place]
+            parts = [(small, few_place, events.number), (large, place, rest)]
+        else:
+            taken = halve(counts, self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts), generator)
+            parts = [(small, place, taken), (large, place, counts - taken)]
+        for part, where, number in parts:
+            occupied = int(torch.count_nonzero(number))
+            if occupied < _FEW * number.numel():
+                kept = number.view(-1).nonzero().squeeze(-1)
+                where = kept if where is None else where[kept]
+                number = number.view(-1)[kept]
+            if occupied:
+                self._node(part, where, number, generator)
+
+    def _split(self, lags: list[int]) -> tuple[list[int], list[int]]:
+        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get."""
+        order = sorted(lags, key=self.weights.__getitem__)
+        whole, total, rare = sum(self.weights[i] for i in lags), 0.0, 0
+        while rare < len(order) - 1 and total + self.weights[order[rare]] < _RARE * whole:
+            total += self.weights[order[rare]]
+            rare += 1
+        if rare:
+            return order[:rare], order[rare:]
+        halves: tuple[list[int], list[int]] = ([], [])
+        sums = [0.0, 0.0]
+        for i in reversed(order):
+            side = int(sums[1] < sums[0])
+            halves[side].append(i)
+            sums[side] += self.weights[i]
+        return halves
+
+    def _of_entries(self, share: Tensor, place: Tensor | None, counts: Tensor) -> Tensor:
+        """A share of bins as one of entries."""
+        if share.ndim == 0:
+            return share
+        if place is None:
+            return share.view(-1, 1).expand(self.data.shape)
+        return share[place.div(self.data.shape[2], rounding_mode="floor") % self.data.shape[1]]
+
+    def _leaf(self, index: int, place: Tensor | None, counts: Tensor) -> None:
+        if index >= self.moves.shares.shape[0]:
+            return
+        _, bins, pixels = self.data.shape
+        lag = self.moves.first + index
+        if place is None:
+            if self.moves.boundary == "periodic":
+                lag %= bins
+                self.total[:, lag:] += counts[:, : bins - lag]
+                self.total[:, :lag] += counts[:, bins - lag :]
+            elif abs(lag) < bins:
+                self.total[:, max(lag, 0) : bins + min(lag, 0)] += counts[:, max(-lag, 0) : bins - max(lag, 0)]
+            if self.tallies is not None:
+                self.tallies[index] += counts.sum(1)
+            return
+        row, pixel = place.div(pixels, rounding_mode="floor"), place % pixels
+        item, time = row.div(bins, rounding_mode="floor"), row % bins
+        later = time + lag
+        inside = later % bins
+        counts_inside = counts * (inside == later) if self.moves.boundary == "zero" else counts
+        self.total.view(-1).index_add_(0, (item * bins + inside) * pixels + pixel, counts_inside)
+        if self.tallies is not None:
+            self.tallies[index].view(-1).index_add_(0, item * pixels + pixel, counts)
+
+
+class MovedCounts(RandomSensor):
+    """A sensor that moves detections in time. All four policies.
+
+    Whole counts move one by one. What is not whole, the means of another stage, stays a mean under every policy but
+    "gaussian", which takes its input for a normal surrogate of counts. Under "score" the probabilities are those of
+    the moves; the counts given pass with the gradient of the mean, as under "straight_through".
+    """
+
+    def moves(self, x: Tensor) -> Moves:
+        """Where the counts of `x` go; differentiable in the parameters."""
+        raise NotImplementedError(f"{type(self).__name__} has to define moves(x).")
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.expected(x) + self.moves(x).noise(x, generator)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            return self._drawn(x, generator, tally=False)[0]
+
+    def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
+        given = check_transient(x, type(self).__name__).detach()
+        counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+        if not is_whole(counts):
+            return self.expected(given), None
+        if counts.dtype == torch.float32 and counts.numel() and float(counts.amax()) > WHOLE_FLOAT32 / 2:
+            counts = counts.double()
+        moved, tallies = move_counts(counts, self.moves(x), generator, tally=tally)
+        return moved.to(x.dtype), tallies
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score":
+            return super().forward(x, generator)
+        with torch.no_grad():
+            moved, tallies = self._drawn(x, generator, tally=True)
+        if tallies is None:
+            return self.expected(x)
+        if not torch.is_grad_enabled():
+            return moved
+        moves, counted = self.moves(x), tallies
+
+        def log_prob() -> Tensor:
+            shares = moves.shares.clamp_min(torch.finfo(torch.float64).tiny).log()
+            return (counted.double() * shares.view(-1, *[1] * (counted.ndim - 1))).sum(0)
+
+        if moves.shares.requires_grad:
+            record_score(log_prob, type(self).__name__)
+        fixed = Moves(moves.first, moves.shares.detach(), moves.boundary)
+        return straight_through(moved, fixed.mean(x)) if x.requires_grad else moved

@@ -1,0 +1,76 @@
+"""Numbers of pixels: one for all, or a map that broadcasts to (..., C, H, W); and chains whose pixels differ."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import holds
+from torchtransient.quantities import shown
+from torchtransient.sensing.layout import check_number
+
+
+def check_map(
+    value: object, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
+) -> float | Tensor:
+    """A number in [low, high] as a float, or a tensor of them as it is, with its gradient; floating, else float64.
+
+    A map is (), (H, W) or (..., C, H, W). UnitError outside the range and for NaN, ShapeError for one dimension, which
+    could be rows as well as channels.
+    """
+    if not isinstance(value, Tensor):
+        return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
+    if value.is_complex() or value.dtype == torch.bool:
+        raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
+    if value.ndim == 1:
+        raise ShapeError(
+            f"{where}: expected {name} to be a number, (H, W) or (..., C, H, W), got {tuple(value.shape)}. Channels "
+            "are (C, 1, 1), rows (H, 1)."
+        )
+    numbers = value if value.is_floating_point() else value.double()
+    plain = numbers.detach()
+    inside = (plain > low if open_low else plain >= low) & (plain <= high) & torch.isfinite(plain)
+    if not holds(inside):
+        left = "(" if open_low else "["
+        raise UnitError(f"{where}: expected every {name} in {left}{low:g}, {high:g}], got {shown(plain)}.")
+    return numbers
+
+
+def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
+    """A number as an attribute, an `nn.Parameter` as a parameter (learnt), another tensor as a buffer in float64."""
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    elif isinstance(value, Tensor):
+        module.register_buffer(name, value.detach().double())
+    else:
+        setattr(module, name, value)
+
+
+def wide(value: float | Tensor) -> float | Tensor:
+    """In float64."""
+    return value.double() if isinstance(value, Tensor) else value
+
+
+def pixels_of(value: float | Tensor, x: Tensor, name: str, where: str) -> float | Tensor:
+    """A map broadcast to the pixels (..., C, H, W) of a transient `x`: checked, and as it is. Raises ShapeError."""
+    if not isinstance(value, Tensor):
+        return value
+    pixels = (*x.shape[:-3], *x.shape[-2:])
+    trailing = zip(reversed(value.shape), reversed(pixels), strict=False)
+    if value.ndim > len(pixels) or any(have not in (1, wanted) for have, wanted in trailing):
+        image = "an image" if value.ndim <= 2 else "pixels (..., C, H, W)"
+        got = pixels[-2:] if value.ndim <= 2 else pixels
+        raise ShapeError(
+            f"{where}: expected {image} {tuple(value.shape)} as in {name}, got {tuple(got)}. Make the map for this "
+            "sensor."
+        )
+    return value
+
+
+def over_time(value: float | Tensor, x: Tensor, name: str, where: str) -> float | Tensor:
+    """A map with a time dimension of one, to be multiplied with `x` (..., C, T, H, W). Raises ShapeError."""
+    pixels = pixels_of(value, x, name, where)
+    return pixels.unsqueeze(-3) if isinstance(pixels, Tensor) and pixels.ndim >= 2 else pixels
