@@ -91,7 +91,7 @@ def first_photon_nll(
     measured = _exact(target, mask, dim)
     check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    level = dark_level(n, floor, number)
+    level = dark_level(n, floor, input, number)
     dark = None if level is None else _dark(n, r, level)
     near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
@@ -172,7 +172,7 @@ def free_running_nll(
             "got more. Check periods and dead time."
         )
     r = as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, periods))
+    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, input, periods))
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
 
 
