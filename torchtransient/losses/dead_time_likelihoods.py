@@ -16,6 +16,7 @@ from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_flag,
     check_mask,
     check_number,
     check_option,
@@ -186,14 +187,17 @@ class FirstPhotonNLL(nn.Module):
         floor: float | None = None,
         dim: int | None = None,
         reduction: Reduction = "mean",
+        *,
+        constant: bool = False,
     ) -> None:
         super().__init__()
         where = "FirstPhotonNLL"
         check_held(reduction, dim, where)
         check_option("floor", floor, where, zero=True)
+        check_flag("constant", constant, where)
         self.cycles = check_whole("cycles", cycles, where, UnitError)
         self.dead_bins = None if dead_bins is None else _check_dead_time(dead_bins, where)
-        self.floor, self.dim, self.reduction = floor, dim, reduction
+        self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant
 
     def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
@@ -202,6 +206,7 @@ class FirstPhotonNLL(nn.Module):
             self.cycles,
             dead_bins=self.dead_bins,
             floor=self.floor,
+            constant=self.constant,
             dim=self.dim,
             mask=mask,
             reduction=self.reduction,

@@ -247,14 +247,30 @@ def read_noise_nll(
 class PoissonNLL(nn.Module):
     """`poisson_nll(input, target)` with its options held."""
 
-    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
+        *,
+        constant: bool = False,
+    ) -> None:
         super().__init__()
         check_held(reduction, dim, "PoissonNLL")
         check_option("floor", floor, "PoissonNLL", zero=True)
-        self.floor, self.dim, self.reduction = floor, dim, reduction
+        check_flag("constant", constant, "PoissonNLL")
+        self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
-        return poisson_nll(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
+        return poisson_nll(
+            input,
+            target,
+            floor=self.floor,
+            constant=self.constant,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
+        )
 
 
 PoissonLoss = PoissonNLL
@@ -263,14 +279,29 @@ PoissonLoss = PoissonNLL
 class ReadNoiseNLL(nn.Module):
     """`read_noise_nll(input, target, read_noise)` with its options held."""
 
-    def __init__(self, read_noise: float, shot_noise: bool = True, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        read_noise: float,
+        shot_noise: bool = True,
+        reduction: Reduction = "mean",
+        *,
+        constant: bool = True,
+    ) -> None:
         super().__init__()
         check_held(reduction, None, "ReadNoiseNLL")
         check_flag("shot_noise", shot_noise, "ReadNoiseNLL")
+        check_flag("constant", constant, "ReadNoiseNLL")
         check_option("read_noise", read_noise, "ReadNoiseNLL", needed=True, square=True)
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
+        self.constant = constant
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return read_noise_nll(
-            input, target, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
+            input,
+            target,
+            self.read_noise,
+            shot_noise=self.shot_noise,
+            constant=self.constant,
+            mask=mask,
+            reduction=self.reduction,
         )
