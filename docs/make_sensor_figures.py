@@ -267,8 +267,8 @@ def itof_pixels() -> None:
         label = f"{readout}, {ambient:g} e of background"
         panels[0].loglog(levels, 1000 * metres * theory, colour, label=label)
         panels[0].loglog(levels, 1000 * metres * torch.tensor(drawn), colour + "o", markersize=3)
-    panels[0].set(title="four steps, 60.6 MHz", xlabel="electrons of light", ylabel="deviation of depth in mm")
-    panels[0].set_ylim(0.3, 800)
+    panels[0].set(title="four steps, 60.6 MHz", xlabel="electrons of light", ylim=(0.3, 800))
+    panels[0].set_ylabel("deviation of depth in mm")
     panels[0].legend(fontsize=7, loc="lower left")
     distance, light = ball()
     rows = torch.linspace(-1, 1, 96, dtype=torch.float64)
