@@ -215,6 +215,19 @@ def test_events_of_measured_delays(total):
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("probability", [0.1, 0.3])
+@pytest.mark.parametrize("mode, dead", [("several", 12.3), ("free", 12.3), ("free", 55.7)])
+def test_frequent_afterpulses_of_short_delays(mode, dead, probability):
+    """What the page says of the worst: a third of the probability, in total variation, where most come right after."""
+    parts = exponentials(dead, (probability, 5.0))
+    laws = [Afterpulse(probability, exponential_delays(5.0, after=dead))]
+    for total in (1.0, 10.0) if mode == "several" else (1.0, 10.0, 100.0):
+        for kind in ("constant", "pulse"):
+            found = agreement(mode, dead, total, kind, parts, laws, runs=600)
+            assert found.total_variation < probability / 3 + 1.5 * found.noise
+
+
 @pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
 @pytest.mark.parametrize("dead", [12.3, 55.7])
 def test_constant_light_stays_constant(dead, total):
