@@ -197,7 +197,9 @@ def test_events(mode, dead, total):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
 @pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize("mode, dead", [("first", 12.3), ("free", 12.3), ("free", 55.7)])
+@pytest.mark.parametrize(
+    "mode, dead", [("first", 12.3), ("several", 1.3), ("several", 12.3), ("free", 12.3), ("free", 55.7)]
+)
 def test_events_everywhere(mode, dead, total, kind):
     found = [agreement(mode, dead, total, kind, *two(dead), seed=s) for s in range(3)]
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
