@@ -106,10 +106,10 @@ def test_cycles_of_all_stages_agree():
         with pytest.raises(UnitError, match=r"1000 in stage '0' \(PhotonBudget\) and 99 in stage '1.*budget\.cycles"):
             sensing.Compose([budget(1000), spad])
     assert sensing.Compose([budget(1000), sensing.SynchronousSPAD(1000)])(torch.ones(1, 128, 1, 1)).shape[1] == 128
-    changed = sensing.device("vl53l8_like").changed("PhotonBudget", cycles=1000)
+    changed = sensing.device("vl53l8_like").changed("SynchronousSPAD", cycles=1000)
     with pytest.raises(UnitError, match="one number of cycles"):
         changed.sensor()
-    assert changed.changed("SynchronousSPAD", cycles=1000).sensor()
+    assert changed.changed("PhotonBudget", cycles=1000).sensor()
 
 
 def test_a_free_running_window_is_one_period():
