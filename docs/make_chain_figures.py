@@ -28,6 +28,7 @@ CAPTIONS = {
     "PhotonBudget": "detections per cycle;\nambient and dark counts",
     "SynchronousSPAD": "counts; the first photon\nblocks those behind it",
     "FreeRunningSPAD": "counts; dead times run\non into the next period",
+    "MacroPixel": "counts of 100 SPADs;\neach dead after its own",
     "BinaryFrames": "counts; a frame says\nwhether any photon came",
     "GatedIntegration": "photons behind each gate",
     "DetectionJitter": "every detection moves",
@@ -48,7 +49,10 @@ OWN_CAPTIONS = {
     ],
 }  # fmt: skip
 # detections of laser light per cycle, or what else the device takes
-LEVELS = {"kinect_v2_like": 1.0, "streak_2ps_like": 20_000.0, "spad512s_like": 0.02}
+LEVELS = {
+    "kinect_v2_like": 1.0, "streak_2ps_like": 20_000.0, "spad512s_like": 0.02, "vl53l8_like": 40.0,
+    "tmf882x_like": 40.0,
+}  # fmt: skip
 
 
 def arrivals(bins: int) -> Tensor:
@@ -114,8 +118,10 @@ def given(stage: Sensor, mean: Tensor) -> Tensor | None:
     """What a stage was given, in the units of what it gives; None where these have other bins."""
     if isinstance(stage, sensing.PhotonBudget):
         return stage.signal(mean)
-    if isinstance(stage, (sensing.SynchronousSPAD, sensing.FreeRunningSPAD, sensing.BinaryFrames)):
-        return mean * getattr(stage, "cycles", getattr(stage, "frames", 1))
+    if isinstance(stage, sensing.BinaryFrames):
+        return mean * stage.frames
+    if stage.takes == ("rate",):
+        return mean * next(part.cycles for part in stage.modules() if isinstance(part, sensing.SynchronousSPAD))
     return None if isinstance(stage, (sensing.GatedIntegration, sensing.ItofCorrelation)) else mean
 
 

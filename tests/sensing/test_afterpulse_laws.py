@@ -61,9 +61,9 @@ each_law = pytest.mark.parametrize("name", LAWS)
 def test_every_afterpulse_has_its_bin(name):
     """Folded round a period the shares add up to the probability, whatever the period."""
     module = LAWS[name]()
-    for period in (1, 2, 7, BINS, 1000):
+    for period in (1, 7, BINS, 1000):
         assert float(module.kernel(period).sum()) == pytest.approx(0.2, rel=1e-9)
-    folded, first = module.kernel(7), module.first_kernel(7 * 60_000)
+    folded, first = module.kernel(7), module.first_kernel(7 * 20_000)
     rest = 0.2 - float(first.sum())
     torch.testing.assert_close(folded, first.view(-1, 7).sum(0), rtol=1e-6, atol=rest + 1e-12)
 
@@ -130,8 +130,8 @@ def test_exponents_and_times_are_learnt():
     x[0, 3] = 1000.0
     true = PowerLawDelays(1.1, 300 * WIDTH)
     wanted = Afterpulsing(0.06, dead_time_s=4 * WIDTH, delays=true, bin_width_s=WIDTH)(x)
-    optimizer = torch.optim.Adam(module.parameters(), lr=0.05)
-    for _ in range(250):
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
+    for _ in range(120):
         optimizer.zero_grad()
         (module(x) - wanted).square().sum().backward()
         optimizer.step()

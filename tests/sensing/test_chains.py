@@ -67,7 +67,7 @@ def test_constant_light_stays_constant():
     [
         ({"jitter": 60e-12}, ShapeError, "jitter to be Response or DetectionJitter or None"),
         ({"pulse": sensing.ShotNoise()}, ShapeError, "pulse to be Response or ImpulseResponse"),
-        ({"detector": sensing.ShotNoise()}, ShapeError, "detector to be SynchronousSPAD"),
+        ({"detector": sensing.ShotNoise()}, ShapeError, "detector to make counts of rates"),
         ({"converter": WIDTHS}, ShapeError, "converter to be TDC"),
         ({"budget": None}, ShapeError, "budget to be PhotonBudget"),
         ({"detector": sensing.SynchronousSPAD(99)}, UnitError, "one number of cycles"),

@@ -17,6 +17,7 @@ from torchtransient.sensing import (
     ImpulseResponse,
     Optics,
     PhotonBudget,
+    PixelSkew,
     StreakCamera,
     SweepJitter,
     SynchronousSPAD,
@@ -122,6 +123,7 @@ def zero():
         lambda: [budget(), SweepJitter(400 * PS, AXIS, boundary="zero")],
         lambda: [budget(), StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")],
         lambda: [budget(), TDC(torch.ones(64), boundary="zero")],
+        lambda: [budget(), PixelSkew(torch.full((2, 2), 90 * PS), AXIS, boundary="zero")],
     ],
 )
 def test_constant_light_in_front_of_a_closed_window_is_refused(stages):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchtransient.errors import UnitError
+from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing import (
     TDC,
     Compose,
@@ -244,6 +244,25 @@ def test_log_probability_of_multinomial_counts():
     value.sum().backward()
     assert bool(torch.isfinite(p.grad).all())
     assert float(multinomial_log_prob(n + 1, p, 12)) == -float("inf")
+
+
+def test_likelihood_of_a_chain():
+    """That of its last stages, and highest in expectation where the light is right."""
+    x = bright(total=2.0)
+    chain = counter()
+    counts = chain.sample(x.expand(200, 1, 40, 1, 1), generator())
+    found = [float(chain.log_prob(counts, f * x).mean()) for f in (0.9, 1.0, 1.1)]
+    assert found[1] > max(found[0], found[2])
+    whole = Compose([ImpulseResponse(GaussianResponse(30 * PS), bin_width_s=WIDTH), Compose(list(chain.stages))])
+    assert whole.log_prob(counts, x).shape == (200, 1, 1, 1)
+    alone = Compose([SynchronousSPAD(500)])
+    assert torch.equal(alone.log_prob(counts, x), SynchronousSPAD(500).log_prob(counts, x))
+    leaf = x.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: chain.log_prob(counts[0], v), leaf, fast_mode=True)
+    with pytest.raises(GradientError, match="one detector that draws"):
+        Compose([ShotNoise(), jitter()]).log_prob(counts, x)
+    with pytest.raises(GradientError, match="one detector that draws"):
+        counter(dead_time_s=100 * PS, bin_width_s=WIDTH).log_prob(counts, x)
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ ON_AN_AXIS = {
     "DetectionJitter": lambda axis: sensing.DetectionJitter(sensing.GaussianResponse(300 * PS), axis),
     "PixelSkew": lambda axis: sensing.PixelSkew(50 * PS, axis),
     "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
+    "CoincidencePixel": lambda axis: sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, 2, 1 * NS, axis=axis),
     "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),
     "StreakCamera": lambda axis: sensing.StreakCamera(axis, time_fwhm_s=300 * PS, jitter_fwhm_s=300 * PS),
     "GatedIntegration": lambda axis: sensing.GatedIntegration([2 * NS], 1 * NS, axis),

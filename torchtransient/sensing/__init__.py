@@ -11,6 +11,7 @@ from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD as Afterpu
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
 from torchtransient.sensing.chains import counting_chain as counting_chain
+from torchtransient.sensing.coincidence import CoincidencePixel as CoincidencePixel
 from torchtransient.sensing.compose import Compose as Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram
 from torchtransient.sensing.compressed_histograms import EquiDepthHistogram as EquiDepthHistogram
@@ -85,12 +86,15 @@ from torchtransient.sensing.itof_reading import phase_noise_rad as phase_noise_r
 from torchtransient.sensing.itof_reading import read_itof as read_itof
 from torchtransient.sensing.linear_part import adjoint as adjoint
 from torchtransient.sensing.linear_part import linearity_error as linearity_error
+from torchtransient.sensing.macro_pixel import MacroPixel as MacroPixel
+from torchtransient.sensing.macro_pixel import ZoneSum as ZoneSum
 from torchtransient.sensing.photon_budget import BudgetReport as BudgetReport
 from torchtransient.sensing.photon_budget import Optics as Optics
 from torchtransient.sensing.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.photon_budget import ambient_photon_rate as ambient_photon_rate
 from torchtransient.sensing.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.physics import deepinv_physics as deepinv_physics
+from torchtransient.sensing.pixel_groups import PixelGroups as PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew as DetectionSkew
 from torchtransient.sensing.pixel_skew import PixelSkew as PixelSkew
 from torchtransient.sensing.pixel_skew import shift_time as shift_time

@@ -8,18 +8,19 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
+from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
 from torchtransient.sensing.policies import GradPolicy
-from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.time_convolution import filter_rows
+from torchtransient.sensing.wrapped_detector import WrappedDetector
 
 _LEFT = 1e-7  # of the afterpulses, where generations end
 
 
-class AfterpulsingSPAD(Sensor):
+class AfterpulsingSPAD(WrappedDetector):
     """A `SynchronousSPAD` or `FreeRunningSPAD` with afterpulses: rates (..., C, T, H, W) in, counts out.
 
     Carriers that are set free act on the detector as photons do: they fire it when it is armed and are lost when it is
@@ -37,6 +38,7 @@ class AfterpulsingSPAD(Sensor):
     histogram vary as photons do.
     """
 
+    detector: SynchronousSPAD | FreeRunningSPAD
     takes, gives = ("rate",), "counts"
 
     def __init__(
@@ -46,7 +48,6 @@ class AfterpulsingSPAD(Sensor):
         *,
         grad: GradPolicy | None = None,
     ) -> None:
-        super().__init__()
         where = "AfterpulsingSPAD"
         if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD)):
             raise UnitError(f"{where}: expected detector to be a SynchronousSPAD or FreeRunningSPAD, got {detector!r}.")
@@ -58,9 +59,12 @@ class AfterpulsingSPAD(Sensor):
                 f"{where}: expected the detector's dead time of {float(own):g} s in afterpulsing, got "
                 f"{afterpulsing.dead_time_s:g} s. One detector has one dead time."
             )
-        self.detector, self.afterpulsing = detector, afterpulsing
-        if grad is not None:
-            detector.grad = grad
+        super().__init__(detector, grad)
+        self.afterpulsing = afterpulsing
+
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.afterpulsing.check_bins(x)
 
     def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
         """In the frequencies of a period, and of two windows for what has to be left out; the period in bins."""
@@ -88,6 +92,7 @@ class AfterpulsingSPAD(Sensor):
             free = (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
         return free.movedim(-1, TIME)
 
+    @in_single
     def released(self, x: Tensor) -> Tensor:
         """Rate of carriers set free, per cycle and bin, in the shape and dtype of `x`; they fire an armed detector."""
         transfers = self._transfers(x)
@@ -97,19 +102,7 @@ class AfterpulsingSPAD(Sensor):
             free = self._released(self.detector.probabilities(x + free), transfers).to(x.dtype)
         return free
 
-    def expected(self, x: Tensor) -> Tensor:
-        return self.detector.expected(x + self.released(x))
-
-    def variance(self, x: Tensor) -> Tensor:
-        """That of the detector at the rate of photons and carriers."""
-        return self.detector.variance(x + self.released(x))
-
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """One draw, without gradient."""
-        with torch.no_grad():
-            return self.detector.sample(x + self.released(x), generator)
-
-    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The measurement under the policy of the detector."""
-        result: Tensor = self.detector(x + self.released(x), generator=generator)
-        return result
+    @in_single
+    def rate(self, x: Tensor) -> Tensor:
+        """Photons and carriers set free."""
+        return x + self.released(x)

@@ -8,20 +8,13 @@ import torch
 from torch import nn
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.binary_frames import BinaryFrames
 from torchtransient.sensing.detection_jitter import DetectionJitter
-from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.photon_budget import PhotonBudget
-from torchtransient.sensing.shot_noise import ShotNoise
-from torchtransient.sensing.spad import SynchronousSPAD
-from torchtransient.sensing.sweep_jitter import SweepJitter
+from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.tdc import TDC
 
-_DETECTORS = (SynchronousSPAD, FreeRunningSPAD, BinaryFrames, ShotNoise)
-_PILE_UP = (SynchronousSPAD, FreeRunningSPAD)
-_SPREAD = (ImpulseResponse, DetectionJitter, SweepJitter, TDC)
 # share of a gate outside the window that starves no image by more than the rounding of a count
 _OUTSIDE = 1e-6
 
@@ -42,13 +35,18 @@ def has_background(budget: PhotonBudget) -> bool:
     return bool((ambient > 0).any()) or bool((torch.as_tensor(budget.dark_count_rate_hz) > 0).any())
 
 
+def _detects(stage: nn.Module) -> bool:
+    """Whether a stage makes counts of light."""
+    return isinstance(stage, Sensor) and stage.gives == "counts" and bool({"rate", "electrons"} & set(stage.takes))
+
+
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
     """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
     background, behind = False, None
     found = list(flattened(stages))
     for number, stage in enumerate(found):
         name = type(stage).__name__
-        if background and isinstance(stage, _SPREAD) and stage.boundary == "zero":
+        if background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
             raise UnitError(
                 f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
                 "ambient light and dark counts would starve at the ends of the window. Put an ImpulseResponse in "
@@ -62,7 +60,7 @@ def check_order(stages: Iterable[nn.Module], where: str) -> None:
                 "which moves every detection, or put the response in front of the detector."
             )
         on_detections = isinstance(stage, DetectionJitter) or (isinstance(stage, TDC) and stage.acts_on == "detections")
-        later = next((type(s).__name__ for s in found[number + 1 :] if isinstance(s, _DETECTORS)), None)
+        later = next((type(s).__name__ for s in found[number + 1 :] if _detects(s)), None)
         if on_detections and later is not None:
             raise UnitError(
                 f"{where}: expected {name} behind the detector, got it in front of {later}. It acts on detections. "
@@ -70,7 +68,7 @@ def check_order(stages: Iterable[nn.Module], where: str) -> None:
             )
         if isinstance(stage, PhotonBudget):
             background = background or has_background(stage)
-        elif isinstance(stage, _PILE_UP):
+        elif _detects(stage) and "rate" in getattr(stage, "takes", ()):
             behind = name
 
 

@@ -13,22 +13,18 @@ from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.crosstalk import Crosstalk
 from torchtransient.sensing.detection_jitter import DetectionJitter
-from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.photon_budget import PhotonBudget
 from torchtransient.sensing.pixel_skew import DetectionSkew
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.responses import Response
 from torchtransient.sensing.sensor import Sensor
-from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.tdc import TDC
-
-Detector = SynchronousSPAD | FreeRunningSPAD | AfterpulsingSPAD
 
 
 def counting_chain(
     budget: PhotonBudget,
-    detector: Detector,
+    detector: Sensor,
     *,
     optics: Sequence[Sensor] = (),
     pulse: Response | ImpulseResponse | None = None,
@@ -43,17 +39,21 @@ def counting_chain(
     """Radiance (..., C, T, H, W) to counts: the parts of a single-photon detector as one chain, whatever their order.
 
     Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds what is constant;
-    `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add others;
-    `converter` gives each of them its code; `readout` is what the pixel keeps (`CodedHistogram`, say). A `Response` is
-    taken for the bins of the budget. Why so: docs/photon_counting.md. `grad` as of `Compose`.
+    `detector` counts them (`SynchronousSPAD`, `FreeRunningSPAD`, a `MacroPixel` of them, ...); `jitter` and `skew` move
+    every detection; `afterpulsing` and `crosstalk` add others; `converter` gives each of them its code; `readout` is
+    what the pixel keeps (`ZoneSum`, `CodedHistogram`). A `Response` is taken for the bins of the budget. Why so:
+    docs/photon_counting.md. `grad` as of `Compose`.
 
     Raises ShapeError for a part that is none of its kind, UnitError for parts that do not go together: another number
     of cycles, another laser period, other bins, afterpulses of a detector that has its own (`AfterpulsingSPAD`).
     """
     where = "counting_chain"
     _check(budget, (PhotonBudget,), "budget", where)
-    _check(detector, (SynchronousSPAD, FreeRunningSPAD, AfterpulsingSPAD), "detector", where)
-    if isinstance(detector, AfterpulsingSPAD) and afterpulsing is not None:
+    if not isinstance(detector, Sensor) or (detector.takes, detector.gives) != (("rate",), "counts"):
+        raise ShapeError(
+            f"{where}: expected detector to make counts of rates, such as SynchronousSPAD, got {shown(detector)}."
+        )
+    if afterpulsing is not None and any(isinstance(part, AfterpulsingSPAD) for part in detector.modules()):
         raise ShapeError(
             f"{where}: expected afterpulsing=None with an AfterpulsingSPAD, got both. Its own afterpulses are enough."
         )

@@ -9,11 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing.agreement import check_axis as check_axis
 from torchtransient.sensing.agreement import check_stages, check_window
 from torchtransient.sensing.chain_order import check_order
-from torchtransient.sensing.first_photon_moves import moved_first_photons, moving_together
+from torchtransient.sensing.first_photon_moves import (
+    moved_first_photons,
+    moved_probabilities,
+    moving_together,
+    multinomial_log_prob,
+)
 from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.layout import TIME, not_a_transient
 from torchtransient.sensing.policies import GradPolicy, check_policy
@@ -95,6 +100,31 @@ class Compose(Sensor):
 
         with torch.no_grad():
             return self._run(x, draw, at_once)
+
+    def log_prob(self, measurement: Tensor, x: Any) -> Tensor:
+        """Log-probability of a measurement, time summed: (..., C, H, W), differentiable in `x` and the parameters.
+
+        For chains in which one detector draws, behind stages that do not: the `log_prob` of the last stage, or the
+        multinomial of a `SynchronousSPAD` of one detection per cycle and the `DetectionJitter` and `TDC` behind it.
+        GradientError for other chains: draws of several stages have no closed form.
+        """
+        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
+        stages = list(self.stages)[used:]
+        while stages:
+            last, found = stages[0], moving_together(stages, policy=False)
+            if found is not None and len(found[1]) == len(stages) - 1:
+                spad, moves = found
+                return multinomial_log_prob(measurement, moved_probabilities(spad, moves, y), spad.cycles)
+            if len(stages) == 1 and isinstance(last, (RandomSensor, Compose)):
+                return last.log_prob(measurement, y)
+            if any(isinstance(module, RandomSensor) for module in last.modules()):
+                break
+            y = last.expected(y) if isinstance(last, Sensor) else last(y)
+            stages = stages[1:]
+        raise GradientError(
+            f"Compose: expected one detector that draws, at the end of the chain or with nothing but DetectionJitter "
+            f"and TDC behind it, got {[type(s).__name__ for s in self.stages]}. log_prob is not supported for it."
+        )
 
     def _run(
         self,

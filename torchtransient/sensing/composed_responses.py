@@ -10,7 +10,14 @@ from torch import Tensor, nn
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.layout import check_seconds
 from torchtransient.sensing.response_shapes import integrated_counts, normal_integrals, remove_floor, resample_counts
-from torchtransient.sensing.responses import CLOSED_BINS, GaussianResponse, Response, TailedResponse, WithinBin
+from torchtransient.sensing.responses import (
+    CLOSED_BINS,
+    GaussianResponse,
+    Response,
+    TailedResponse,
+    WithinBin,
+    kernel_of,
+)
 from torchtransient.sensing.time_convolution import check_choice
 
 
@@ -137,8 +144,7 @@ class ComposedResponse(Response):
     def kernel(self, bin_width_s: float, within_bin: WithinBin = "uniform") -> tuple[int, Tensor]:
         check_choice(within_bin, WithinBin, "within_bin", "ComposedResponse")
         if len(self.responses) == 1:
-            alone: tuple[int, Tensor] = self.responses[0].kernel(bin_width_s, within_bin)  # type: ignore[operator]
-            return alone
+            return kernel_of(self.responses[0], bin_width_s, within_bin)  # type: ignore[arg-type]
         if within_bin == "uniform" and self._normal_part() is not None:
             first, last = self._lags(bin_width_s)
             if last - first <= CLOSED_BINS:
@@ -146,7 +152,7 @@ class ComposedResponse(Response):
         fine = self.oversampling
         first, total = 0, None
         for response in self.responses:
-            begin, weights = response.kernel(bin_width_s / fine, within_bin)  # type: ignore[operator]
+            begin, weights = kernel_of(response, bin_width_s / fine, within_bin)  # type: ignore[arg-type]
             first += begin
             total = weights if total is None else _full_convolution(total, weights)
         if total is None:

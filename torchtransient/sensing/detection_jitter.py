@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.sensing.impulse_response import check_response, kernel_of
+from torchtransient.sensing.impulse_response import check_response
 from torchtransient.sensing.layout import TIME, bin_width_of, check_transient
 from torchtransient.sensing.moved_counts import MovedCounts, Moves
 from torchtransient.sensing.policies import GradPolicy
-from torchtransient.sensing.responses import Response, WithinBin
+from torchtransient.sensing.responses import Response, WithinBin, kernel_of
 from torchtransient.sensing.time_convolution import Boundary, check_choice, convolve_time, window_lags
 
 
@@ -31,7 +31,7 @@ class DetectionJitter(MovedCounts):
     the detector alone. Raises UnitError, ShapeError. Not modelled: jitter that depends on the rate (time walk).
     """
 
-    gives = "the same"
+    takes, gives = ("counts",), "counts"
 
     def __init__(
         self,

@@ -31,6 +31,7 @@ from torchtransient.sensing.afterpulse_delays import MeasuredDelays, PowerLawDel
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames
+from torchtransient.sensing.coincidence import CoincidencePixel
 from torchtransient.sensing.compose import Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
 from torchtransient.sensing.crosstalk import Crosstalk
@@ -50,7 +51,9 @@ from torchtransient.sensing.itof import ItofCorrelation
 from torchtransient.sensing.itof_codes import FourierCode, hamiltonian_code, measured_code, sine_code, square_code
 from torchtransient.sensing.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
 from torchtransient.sensing.layout import check_number
+from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget
+from torchtransient.sensing.pixel_groups import PixelGroups
 from torchtransient.sensing.pixel_skew import DetectionSkew, PixelSkew
 from torchtransient.sensing.polarization import Analysers, PolarizationMosaic, linear_analysers
 from torchtransient.sensing.policies import GradPolicy
@@ -81,7 +84,8 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             PolarizationMosaic, ReversedCode, ShotNoise, StreakCamera, SweepJitter, SynchronousSPAD, TDC,
             TailedResponse, TapDifference, TwoTapCode, UniformResponse,
             fourier_codes, hamiltonian_code, linear_analysers, measured_code, sine_code, square_code,
-            AfterpulsingSPAD, DetectionSkew, MeasuredDelays, PixelSkew, PowerLawDelays,
+            AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
+            PowerLawDelays, ZoneSum,
         )
     },
     "polarsens": PolarizationMosaic.polarsens,
@@ -137,13 +141,19 @@ class Device:
         return Compose(stages, grad=grad)
 
     def changed(self, stage: int | str, **arguments: Any) -> Device:
-        """The same device with other arguments of one stage: its number, or its kind where that is there once."""
-        kinds = [s["kind"] for s in self.stages]
-        if isinstance(stage, str) and kinds.count(stage) != 1:
-            raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got the stages {kinds}.")
-        number = kinds.index(stage) if isinstance(stage, str) else stage
+        """The same device with other arguments of one stage: its number, or its kind where that is there once.
+
+        A kind may be that of a part, the `SynchronousSPAD` of a `MacroPixel` for instance.
+        """
         stages = [copy.deepcopy(s) for s in self.stages]
-        stages[number].update(arguments)
+        if isinstance(stage, str):
+            parts = [part for part in _parts(stages) if part["kind"] == stage]
+            if len(parts) != 1:
+                kinds = [part["kind"] for part in _parts(stages)]
+                raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
+            parts[0].update(arguments)
+        else:
+            stages[stage].update(arguments)
         return Device(self.name, self.description, self.sources, tuple(stages), self.bin_width_s, self.num_bins)
 
     def to_dict(self) -> dict[str, Any]:
@@ -256,6 +266,16 @@ def _check_spec(spec: Any, where: str) -> None:
             raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
         if isinstance(value, dict) and "kind" in value:
             _check_spec(value, where)
+
+
+def _parts(spec: Any) -> list[dict[str, Any]]:
+    """Every dictionary with a kind in a stage, or in a list of them: the stage, and what it is made of."""
+    if isinstance(spec, (list, tuple)):
+        return [part for entry in spec for part in _parts(entry)]
+    if not isinstance(spec, dict):
+        return []
+    own = [spec] if "kind" in spec else []
+    return own + [part for value in spec.values() for part in _parts(value)]
 
 
 def _text(source: str | Path, mark: str) -> str:

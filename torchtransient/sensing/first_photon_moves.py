@@ -43,6 +43,14 @@ def _watched(stage: nn.Module) -> bool:
     return bool(stage._forward_hooks or stage._forward_pre_hooks or stage._backward_hooks)
 
 
+def moved_probabilities(spad: SynchronousSPAD, moves: Sequence[MovedCounts], x: Tensor) -> Tensor:
+    """Probability of each time stamp in a cycle, in single precision at least."""
+    p = spad.probabilities(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
+    for stage in moves:
+        p = stage.expected(p)
+    return p
+
+
 def moved_first_photons(
     spad: SynchronousSPAD,
     moves: Sequence[MovedCounts],
@@ -52,19 +60,16 @@ def moved_first_photons(
 ) -> Tensor:
     """The measurement behind a SPAD and its moves under a policy; None: a draw without gradient."""
     check_generator(generator, type(spad).__name__)
-    half = x.dtype in (torch.float16, torch.bfloat16)
-    p = spad.probabilities(x.float() if half else x)
-    for stage in moves:
-        p = stage.expected(p)
+    p = moved_probabilities(spad, moves, x)
     if policy == "gaussian":
-        return (p * spad.cycles + multinomial_noise(p, spad.cycles, generator)).to(x.dtype)
+        return p * spad.cycles + multinomial_noise(p, spad.cycles, generator)
     with torch.no_grad():
         counts = sample_multinomial(spad.cycles, p, generator)
     if policy == "straight_through" and torch.is_grad_enabled():
         counts = straight_through(counts, p * spad.cycles)
     elif policy == "score":
         record_score(lambda: multinomial_log_prob(counts, p, spad.cycles), type(spad).__name__)
-    return counts.to(x.dtype)
+    return counts
 
 
 def multinomial_log_prob(counts: Tensor, probabilities: Tensor, trials: int) -> Tensor:

@@ -13,7 +13,7 @@ from torchtransient.sensing.responses import GaussianResponse as GaussianRespons
 from torchtransient.sensing.responses import Response as Response
 from torchtransient.sensing.responses import TailedResponse as TailedResponse
 from torchtransient.sensing.responses import UniformResponse as UniformResponse
-from torchtransient.sensing.responses import WithinBin
+from torchtransient.sensing.responses import WithinBin, kernel_of
 from torchtransient.sensing.responses import emg_response as emg_response
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.time_convolution import Boundary, Method, check_choice, convolve_time
@@ -27,11 +27,6 @@ def check_response(response: object, where: str) -> Response:
             "measured histogram goes into MeasuredResponse(counts, bin_width_s)."
         )
     return response
-
-
-def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
-    """`response.kernel`; responses with a kernel of their own need not know of the default `within_bin`."""
-    return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
 
 
 class ImpulseResponse(Sensor):

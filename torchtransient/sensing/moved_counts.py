@@ -1,8 +1,8 @@
 """Counts that move in time: the linear map of their means, and draws in which every detection moves by itself.
 
 A move is a table of shares: of the counts of bin t, a share goes `lag` bins later. Whole counts are split over the lags
-by a tree of binomials, which is the multinomial distribution exactly. Splits are balanced by weight; branches that few
-entries reach are followed for these entries only, so that the cost goes with the places that counts end up in.
+by a tree of binomials, which is the multinomial distribution exactly. Rare lags part first and are followed for the few
+entries that reach them; the others part in halves of nearly equal weight, which `halve` draws fast.
 """
 
 from __future__ import annotations
@@ -117,46 +117,56 @@ class _Tree:
         rest = (1 - self.shares.sum(0, keepdim=True)).clamp_min(0)
         if float(rest.max()) > 1e-12:
             self.shares = torch.cat([self.shares, rest])  # those that are lost
-        self.upto = torch.nn.functional.pad(self.shares.movedim(0, -1).cumsum(-1), (1, 0)).movedim(-1, 0)
-        self.weight = self.upto if self.upto.ndim == 1 else self.upto.mean(1)
+        self.weights = (self.shares if self.shares.ndim == 1 else self.shares.mean(1)).tolist()
         self.total = torch.zeros_like(data)
 
     def run(self, generator: torch.Generator | None) -> Tensor:
         if self.data.numel():
-            self._node(0, self.shares.shape[0], None, self.data, generator)
+            self._node(list(range(len(self.weights))), None, self.data, generator)
         return self.total
 
-    def _node(
-        self, low: int, high: int, place: Tensor | None, counts: Tensor, generator: torch.Generator | None
-    ) -> None:
-        """`counts` go to the lags low ... high - 1; `place`: which entries they are, None for all."""
-        if high - low == 1:
-            self._leaf(low, place, counts)
+    def _node(self, lags: list[int], place: Tensor | None, counts: Tensor, generator: torch.Generator | None) -> None:
+        """`counts` go to these lags; `place`: which entries they are, None for all."""
+        if len(lags) == 1:
+            self._leaf(lags[0], place, counts)
             return
-        weights = self.weight[low : high + 1].tolist()
-        middle = 0.5 * (weights[0] + weights[-1])
-        cut = min(range(1, high - low), key=lambda i: abs(weights[i] - middle)) + low
-        whole = self.upto[high] - self.upto[low]
-        share = ((self.upto[cut] - self.upto[low]) / whole.clamp_min(1e-300)).clamp(0, 1)
-        small_first = float(share.mean()) < 0.5
-        rare = share if small_first else 1 - share
-        if float(rare.max()) < _RARE:
-            events = thin(counts, self._of_entries(rare, place, counts), generator)
-            keep = counts.clone().view(-1)
-            keep[events.place] -= events.number
+        small, large = self._split(lags)
+        few, whole = (self.shares[list(part)].sum(0) for part in (small, lags))
+        share = (few / whole.clamp_min(1e-300)).clamp(0, 1)
+        if float(share.max()) < _RARE:
+            events = thin(counts, self._of_entries(share, place, counts), generator)
+            rest = counts.clone()
+            rest.view(-1)[events.place] -= events.number
             few_place = events.place if place is None else place[events.place]
-            few, many = (few_place, events.number), (place, keep.view(counts.shape))
-            first, second = (few, many) if small_first else (many, few)
+            parts = [(small, few_place, events.number), (large, place, rest)]
         else:
             taken = halve(counts, self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts), generator)
-            first, second = (place, taken), (place, counts - taken)
-        for begin, end, (where, number) in ((low, cut, first), (cut, high, second)):
-            occupied = number.view(-1).nonzero().squeeze(-1)
-            if occupied.numel() < _FEW * number.numel():
-                where = occupied if where is None else where[occupied]
-                number = number.view(-1)[occupied]
-            if number.numel():
-                self._node(begin, end, where, number, generator)
+            parts = [(small, place, taken), (large, place, counts - taken)]
+        for part, where, number in parts:
+            occupied = int(torch.count_nonzero(number))
+            if occupied < _FEW * number.numel():
+                kept = number.view(-1).nonzero().squeeze(-1)
+                where = kept if where is None else where[kept]
+                number = number.view(-1)[kept]
+            if occupied:
+                self._node(part, where, number, generator)
+
+    def _split(self, lags: list[int]) -> tuple[list[int], list[int]]:
+        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get."""
+        order = sorted(lags, key=self.weights.__getitem__)
+        whole, total, rare = sum(self.weights[i] for i in lags), 0.0, 0
+        while rare < len(order) - 1 and total + self.weights[order[rare]] < _RARE * whole:
+            total += self.weights[order[rare]]
+            rare += 1
+        if rare:
+            return order[:rare], order[rare:]
+        halves: tuple[list[int], list[int]] = ([], [])
+        sums = [0.0, 0.0]
+        for i in reversed(order):
+            side = int(sums[1] < sums[0])
+            halves[side].append(i)
+            sums[side] += self.weights[i]
+        return halves
 
     def _of_entries(self, share: Tensor, place: Tensor | None, counts: Tensor) -> Tensor:
         """A share of bins as one of entries."""

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError
 from torchtransient.floating import in_single
 from torchtransient.sensing.added_counts import is_whole
 from torchtransient.sensing.layout import TIME, bin_width_of, check_seconds, check_transient
 from torchtransient.sensing.pixel_maps import check_map, pixels_of
-from torchtransient.sensing.policies import GradPolicy, gaussian_noise
+from torchtransient.sensing.policies import GradPolicy, gaussian_noise, record_score, straight_through
 from torchtransient.sensing.sensor import PhysicalModule, RandomSensor, Sensor
 from torchtransient.sensing.thinning import halve
 from torchtransient.sensing.time_convolution import check_choice
@@ -125,8 +124,9 @@ class DetectionSkew(RandomSensor):
 
     Draws move whole counts one by one: each of a bin goes to the earlier or the later of the two bins that its delay
     reaches, a binomial number. Counts that are not whole are means of another sensor, and are moved as `expected` does.
-    Arguments as of `PixelSkew`. Policies: all but "score" of a learnable delay or of whole counts with a gradient,
-    which is a GradientError; "gaussian" has the covariance of the binomials.
+    Arguments as of `PixelSkew`. Policies: all four. "gaussian" has the covariance of the binomials; "score" the
+    probabilities of the moves that were drawn, for learnable delays, while the counts given pass with the gradient of
+    the mean.
     """
 
     takes, gives = ("counts",), "counts"
@@ -168,29 +168,42 @@ class DetectionSkew(RandomSensor):
         noise = _moved(late, whole + 1, self.boundary) - _moved(late, whole, self.boundary)
         return self.expected(x) + noise
 
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def _drawn(self, x: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor | None]:
+        """The counts moved, and how many of each bin went to the later one; None where there are means to move."""
         with torch.no_grad():
             delay = self._delay_bins(x)
-            counts = x.detach()
-            if not is_whole(counts):
-                return self.expected(counts)
+            work = x.detach().contiguous()
+            if not is_whole(work):
+                return shift_time(work, delay, boundary=self.boundary), None
             whole, part = _whole_and_part(delay, x)
-            late = halve(counts.contiguous(), part.to(x.dtype).expand(x.shape).contiguous(), generator)
-            return _moved(counts - late, whole, self.boundary) + _moved(late, whole + 1, self.boundary)
+            late = halve(work, part.to(work.dtype).expand(work.shape).contiguous(), generator)
+            moved = _moved(work - late, whole, self.boundary) + _moved(late, whole + 1, self.boundary)
+            return moved, late
 
-    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Zero: draws from counts without gradient have none. Raises GradientError where they would have one."""
-        if self.delays.delay_ps.requires_grad or (x.requires_grad and is_whole(x.detach())):
-            raise GradientError(
-                "DetectionSkew: grad='score' is not supported for learnable delays or whole counts with a gradient: a "
-                "histogram does not tell which of its counts were moved. Choose grad='gaussian'."
-            )
-        return x.new_zeros(*x.shape[:-3], *x.shape[-2:])
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._drawn(x, generator)[0]
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        if self.grad == "score" and isinstance(x, Tensor) and x.requires_grad and not is_whole(x.detach()):
-            return self.expected(x)  # nothing is drawn, and the mean has its own gradient
-        return super().forward(x, generator)
+        if self.grad != "score":
+            return super().forward(x, generator)
+        moved, late = self._drawn(x, generator)
+        if late is None:
+            return self.expected(x)
+        if not torch.is_grad_enabled():
+            return moved
+        _, part = _whole_and_part(self._delay_bins(x), x)
+
+        def log_prob() -> Tensor:
+            # no count takes a way of probability 0
+            tiny = torch.finfo(torch.float64).tiny
+            ways = late.double() * part.clamp_min(tiny).log() + (x.detach() - late).double() * torch.log1p(-part)
+            return ways.sum(TIME)
+
+        if part.requires_grad:
+            record_score(log_prob, type(self).__name__)
+        with torch.no_grad():
+            fixed = self._delay_bins(x)
+        return straight_through(moved, shift_time(x, fixed, boundary=self.boundary)) if x.requires_grad else moved
 
     def extra_repr(self) -> str:
         return f"delays={tuple(self.delays.delay_ps.shape)}, boundary={self.boundary!r}, {super().extra_repr()}"

@@ -165,6 +165,11 @@ def _between(below: Tensor, above: Tensor) -> Tensor:
     return torch.where(late, above[:-1] - above[1:], below[1:] - below[:-1])
 
 
+def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
+    """`response.kernel`; responses with a kernel of their own need not know of the default `within_bin`."""
+    return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
+
+
 class GaussianResponse(Response):
     """A normal distribution around `delay_s`, full width at half maximum `fwhm_s` (2.3548 standard deviations)."""
 

@@ -18,6 +18,11 @@ Method = Literal["auto", "direct", "fft"]
 
 # Up to here a direct convolution is as fast as the transform, and it keeps the relative precision of faint late bins.
 _DIRECT_TAPS = 192
+# Short kernels over images: whole images are added, shifted in time, which leaves the layout as it is.
+# A backward pass writes an image of zeros for every shift.
+_SHIFTED_TAPS = 96
+_SHIFTED_TAPS_BACKWARD = 24
+_SHIFTED_PIXELS = 64
 
 
 def check_choice(value: str, choices: object, name: str, where: str) -> None:
@@ -52,6 +57,10 @@ def convolve_time(
         return x * 0
     if method == "auto":
         method = "direct" if kernel.numel() <= _DIRECT_TAPS else "fft"
+    backward = torch.is_grad_enabled() and (x.requires_grad or kernel.requires_grad)
+    shifts = _SHIFTED_TAPS_BACKWARD if backward else _SHIFTED_TAPS
+    if method == "direct" and kernel.numel() <= shifts and x.shape[-1] * x.shape[-2] >= _SHIFTED_PIXELS:
+        return _by_shifts(x, kernel, first, boundary)
     rows = x.movedim(TIME, -1)
     y = _direct(rows, kernel, first, boundary) if method == "direct" else _by_fft(rows, kernel, first, boundary)
     return y.movedim(-1, TIME)
@@ -78,6 +87,22 @@ def _crop(kernel: Tensor, first: int, bins: int) -> tuple[Tensor, int]:
     begin = min(max(0, 1 - bins - first), kernel.numel())
     end = max(min(kernel.numel(), bins - first), begin)
     return kernel[begin:end], first + begin
+
+
+def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    bins, taps = x.shape[TIME], kernel.numel()
+    work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+    if boundary == "periodic":
+        work, first, left = work.roll(first, TIME), 0, taps - 1
+        padded = torch.cat([work.narrow(TIME, bins - left, left), work], TIME)
+    else:
+        left = max(first + taps - 1, 0)
+        padded = functional.pad(work, (0, 0, 0, 0, left, max(-first, 0)))
+    weights = kernel.to(work.dtype)
+    total = padded.narrow(TIME, left - first, bins) * weights[0]
+    for j in range(1, taps):
+        total.addcmul_(padded.narrow(TIME, left - first - j, bins), weights[j])
+    return total.to(x.dtype)
 
 
 def _direct(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:

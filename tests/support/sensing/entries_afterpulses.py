@@ -13,7 +13,7 @@ WIDTH = {"bin_width_s": 20 * PS}
 
 
 def several(**keywords):
-    return sensing.Afterpulsing([0.03, 0.05], [90 * PS, 700 * PS], 50 * PS, **WIDTH, learnable=True, **keywords)
+    return sensing.Afterpulsing([0.03, 0.05], [90 * PS, 300 * PS], 50 * PS, **WIDTH, learnable=True, **keywords)
 
 
 def power_law(**keywords):
@@ -85,7 +85,7 @@ ENTRIES = [
     ),
     Entry(
         "AfterpulsingSPAD-free",
-        obeyed(lambda: sensing.FreeRunningSPAD(500, 70 * PS, **WIDTH)),
+        obeyed(lambda: sensing.FreeRunningSPAD(500, 70 * PS, **WIDTH, kind="paralyzable")),
         shape=(2, 1, 8, 1, 2),
         random=True,
     ),

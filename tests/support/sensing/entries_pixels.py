@@ -34,6 +34,20 @@ def skew(make, **keywords):
     return lambda **k: make(delay_s, bin_width_s=20 * PS, learnable=True, **keywords, **k)
 
 
+def paralyzable(cycles):
+    """A free-running detector with a closed form: solving for the other kind takes the time of all other entries."""
+    return sensing.FreeRunningSPAD(cycles, 70 * PS, bin_width_s=20 * PS, kind="paralyzable")
+
+
+def dead_times(**keywords):
+    values = torch.tensor([[40.0, 70, 40], [110, 70, 55]]) * PS
+
+    def spad(dead_time_s):
+        return sensing.SynchronousSPAD(200, dead_time_s=dead_time_s, bin_width_s=20 * PS)
+
+    return sensing.PixelGroups.by_value(values, spad, **keywords)
+
+
 ENTRIES = [
     Entry(
         "PhotonBudget-maps",
@@ -57,13 +71,82 @@ ENTRIES = [
         conserves=lambda y: y.sum(-3),
         input=whole_counts,
         random=True,
-        # what is drawn depends on whole counts, which have no gradient
-        policies=("expected", "gaussian", "straight_through"),
         errors=(
             (lambda: sensing.DetectionSkew(50.0, bin_width_s=20 * PS), UnitError),
             (lambda: sensing.PixelSkew(50 * PS), UnitError),
             (lambda: sensing.PixelSkew(50 * PS, bin_width_s=20 * PS, boundary="open"), ShapeError),
             (lambda: skew(sensing.PixelSkew)()(torch.ones(1, 12, 3, 3)), ShapeError),
+        ),
+    ),
+    Entry("MacroPixel", lambda **k: sensing.MacroPixel(sensing.SynchronousSPAD(50), 9, **k), random=True),
+    Entry(
+        "MacroPixel-weights",
+        lambda **k: sensing.MacroPixel(
+            sensing.SynchronousSPAD(200, dead_time_s=70 * PS, bin_width_s=20 * PS), 4, weights=[1, 3, 1, 0], **k
+        ),
+        random=True,
+        errors=(
+            (lambda: sensing.MacroPixel(sensing.ShotNoise(), 4), UnitError),
+            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 0), UnitError),
+            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 3, weights=[1.0]), ShapeError),
+            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 2, weights=[1.0, -1.0]), UnitError),
+            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 2, weights=torch.zeros(2)), UnitError),
+        ),
+    ),
+    Entry(
+        "MacroPixel-free",
+        lambda **k: sensing.MacroPixel(paralyzable(100), 4, **k),
+        shape=(2, 1, 8, 1, 2),
+        random=True,
+    ),
+    Entry(
+        "CoincidencePixel",
+        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(300), 6, 2, 50 * PS, bin_width_s=20 * PS, **k),
+        shape=(2, 1, 8, 1, 2),
+        random=True,
+        errors=(
+            (lambda: sensing.CoincidencePixel(sensing.ShotNoise(), 6, 2, 50 * PS, bin_width_s=20 * PS), UnitError),
+            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, 3, 5e-11, bin_width_s=2e-11), UnitError),
+            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, 2, 50.0, bin_width_s=2e-11), UnitError),
+            (lambda: sensing.CoincidencePixel(
+                sensing.FreeRunningSPAD(9, 70 * PS, bin_width_s=20 * PS), 2, 2, 80 * PS, bin_width_s=20 * PS
+            ), UnitError),
+            (lambda: sensing.CoincidencePixel(
+                sensing.SynchronousSPAD(9), 2, 2, 80 * PS, bin_width_s=20 * PS
+            )(torch.ones(1, 2, 1, 1)), UnitError),
+            (lambda: sensing.CoincidencePixel(
+                sensing.FreeRunningSPAD(9, 1e-8, bin_width_s=1e-8), 99, 1, 1e-10, bin_width_s=1e-8
+            ).sample(torch.full((1, 8, 1, 1), 99.0)), UnitError),
+        ),
+    ),
+    Entry(
+        "CoincidencePixel-weights",
+        lambda **k: sensing.CoincidencePixel(
+            paralyzable(300), 4, 2, 45 * PS, weights=[1, 2, 2, 5], bin_width_s=20 * PS, **k
+        ),
+        shape=(2, 1, 8, 1, 2),
+        random=True,
+    ),
+    Entry(
+        "PixelGroups",
+        dead_times,
+        random=True,
+        errors=(
+            (lambda: sensing.PixelGroups([], MAP), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.ones(2, 3)), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.zeros(3)), ShapeError),
+            (lambda: sensing.PixelGroups([sensing.ShotNoise(), sensing.SynchronousSPAD(3)], 0 * MAP), UnitError),
+            (lambda: dead_times()(torch.ones(1, 12, 3, 3)), ShapeError),
+            (lambda: sensing.PixelGroups.by_value(torch.rand(20, 20), lambda d: sensing.ShotNoise()), UnitError),
+        ),
+    ),
+    Entry(
+        "ZoneSum",
+        lambda: sensing.ZoneSum(2, 3),
+        conserves=lambda y: y.sum((-1, -2)),
+        errors=(
+            (lambda: sensing.ZoneSum(0, 1), UnitError),
+            (lambda: sensing.ZoneSum(2, 2)(torch.ones(1, 3, 4, 3)), ShapeError),
         ),
     ),
 ]  # fmt: skip

@@ -1,0 +1,82 @@
+"""The base of sensors around a detector: its random numbers and its policy are the detector's."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor
+
+from torchtransient.sensing.policies import GradPolicy, check_policy
+from torchtransient.sensing.sensor import RandomSensor
+
+
+class WrappedDetector(RandomSensor):
+    """A random sensor whose draws are made by its `detector`. `grad` is the detector's, and sets it."""
+
+    detector: RandomSensor
+
+    def __init__(self, detector: RandomSensor, grad: GradPolicy | None = None) -> None:
+        super(RandomSensor, self).__init__()
+        self.detector = detector
+        if grad is not None:
+            self.grad = grad
+
+    @property
+    def grad(self) -> GradPolicy:
+        """The policy of the detector."""
+        return self.detector.grad
+
+    @grad.setter
+    def grad(self, value: GradPolicy) -> None:
+        self.detector.grad = check_policy(value, type(self).__name__)
+
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        self.detector.check_bins(x)
+
+    def rate(self, x: Tensor) -> Tensor:
+        """The rate that the detector is given."""
+        raise NotImplementedError(f"{type(self).__name__} has to define rate(x).")
+
+    def probabilities(self, x: Tensor) -> Tensor:
+        """Expected detections per cycle and bin."""
+        result: Tensor = self.detector.probabilities(self.rate(x))  # type: ignore[operator]
+        return result
+
+    def expected(self, x: Tensor) -> Tensor:
+        return self.detector.expected(self.rate(x))
+
+    def variance(self, x: Tensor) -> Tensor:
+        return self.detector.variance(self.rate(x))
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        return self.detector.log_prob(measurement, self.rate(x))
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            return self.detector.sample(self.rate(x), generator)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The measurement under the policy of the detector."""
+        result: Tensor = self.detector(self.rate(x), generator=generator)
+        return result
+
+
+def of_cycles(detector: RandomSensor, cycles: int) -> RandomSensor:
+    """A detector with the numbers of another one (its parameters are the same tensors) for as many cycles."""
+    other = copy.copy(detector)
+    if isinstance(other, WrappedDetector):
+        other._modules = dict(other._modules)  # its own children
+        other.detector = of_cycles(other.detector, cycles)
+    else:
+        other.cycles = cycles  # type: ignore[assignment]
+    return other
+
+
+def cycles_of(detector: RandomSensor) -> int:
+    """How many laser cycles a detector counts."""
+    inner = detector
+    while isinstance(inner, WrappedDetector):
+        inner = inner.detector
+    return int(inner.cycles)  # type: ignore[arg-type]
