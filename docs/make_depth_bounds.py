@@ -79,7 +79,7 @@ def without_pile_up() -> list[str]:
         "centre of mass, 6 bins": lambda x, r, n, b: centre(x, b),
     }
     for way, estimate in ways.items():
-        for fwhm_bins, background in ((1.0, 0.0), (2.0, 0.0), (5.0, 0.0), (5.0, 0.05), (5.0, 0.6)):
+        for fwhm_bins, background in ((0.6, 0.0), (1.0, 0.0), (1.0, 0.6), (5.0, 0.0), (5.0, 0.05), (5.0, 0.6)):
             response, row = sensing.GaussianResponse(fwhm_bins * AXIS.bin_width_s), []
             for photons in PHOTONS:
                 g = torch.Generator().manual_seed(1)

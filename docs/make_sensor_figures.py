@@ -242,6 +242,62 @@ def itof_depth() -> None:
     save(figure, "itof_depth.png")
 
 
+def itof_pixels() -> None:
+    """Noise of the readouts, drawn and in closed form; a camera whose pixels differ, with and without calibration."""
+    figure, panels = sheet(4, 3.3)
+    axis = tt.TimeAxis(0.0, 0.02, 500)
+    levels = torch.logspace(2.5, 5, 9, dtype=torch.float64)
+    x = torch.zeros(1, 500, 1, 1, dtype=torch.float64)
+    x[0, 150] = 1.0
+    for (readout, ambient), colour in zip(
+        [(r, b) for r in ("single", "differential") for b in (0.0, 20_000.0)], ("C0", "C1", "C2", "C3"), strict=True
+    ):
+        code = sensing.sine_code(4) if readout == "single" else sensing.TwoTapCode(sensing.sine_code(4))
+        camera = sensing.ItofCorrelation(code, 60.6e6, axis, contrast=0.6, background_e=ambient)
+        chain = [sensing.PixelElectronics(read_noise_e=20.0)]
+        chain += [sensing.TapDifference()] if readout == "differential" else []
+        drawn = []
+        for level in levels.tolist():
+            taps = camera.expected(level * x).expand(1, -1, 1, 4000)
+            frames = sensing.Compose(chain).sample(taps, generator(3))
+            phase = sensing.read_itof(frames, 60.6e6, 4, readout=readout).phase.flatten()
+            drawn.append(float(sensing.wrapped_difference(phase, phase[:1] * 0 + 2 * math.pi * 0.6084).std()))
+        theory = sensing.phase_noise_rad(0.6 * levels / 4, (levels + ambient) / 4, 4, 20.0, readout)
+        metres = SPEED_OF_LIGHT / (4 * math.pi * 60.6e6)
+        label = f"{readout}, {ambient:g} e of background"
+        panels[0].loglog(levels, 1000 * metres * theory, colour, label=label)
+        panels[0].loglog(levels, 1000 * metres * torch.tensor(drawn), colour + "o", markersize=3)
+    panels[0].set(title="four steps, 60.6 MHz", xlabel="electrons of light", ylim=(0.3, 800))
+    panels[0].set_ylabel("deviation of depth in mm")
+    panels[0].legend(fontsize=7, loc="lower left")
+    distance, light = ball()
+    rows = torch.linspace(-1, 1, 96, dtype=torch.float64)
+    pattern = 0.15 * rows[:, None] * rows + 0.02 * torch.randn(96, 96, generator=generator(4), dtype=torch.float64)
+    known = sensing.ItofCalibration(0.3, -1, depth_map_m=pattern)
+    camera = sensing.Compose(
+        [
+            sensing.ItofCorrelation(
+                sensing.TwoTapCode(sensing.sine_code(4)), (80e6, 60e6), axis, contrast=0.6, background_e=2000.0,
+                electrons_per_unit=6e4, calibration=known,
+            ),
+            sensing.PixelElectronics(read_noise_e=20.0),
+            sensing.TapDifference(),
+        ]
+    )  # fmt: skip
+    frames = camera.sample(transient(axis, distance, light), generator(0))
+    right = sensing.ItofCalibration(0.3, -1)
+    for panel, (name, used) in zip(
+        panels[1:], {"no map": right, "with its map": known, "steps taken the wrong way": None}.items(), strict=True
+    ):
+        found = sensing.read_itof(
+            frames, (80e6, 60e6), 4, readout="differential", calibration=used, max_depth_m=5.0
+        ).depth_m[0]
+        shown = panel.imshow(1000 * (found - distance), vmin=-200, vmax=200, cmap="RdBu_r")
+        panel.set(title=name, xticks=[], yticks=[])
+    figure.colorbar(shown, ax=panels[3], label="error of depth in mm")
+    save(figure, "itof_pixels.png")
+
+
 def electronics() -> None:
     """Photon transfer curve with saturation, and the range of phase noise."""
     light = torch.logspace(0, 4.6, 60, dtype=torch.float64)
@@ -388,8 +444,8 @@ def polarization() -> None:
 PARTS: dict[str, Callable[[], None]] = {
     f.__name__: f
     for f in (
-        responses, pile_up, dead_time, after_detection, itof_codes, itof_depth, electronics, depth_estimators, gates,
-        streak, polarization,
+        responses, pile_up, dead_time, after_detection, itof_codes, itof_depth, itof_pixels, electronics,
+        depth_estimators, gates, streak, polarization,
     )
 }  # fmt: skip
 

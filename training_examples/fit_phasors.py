@@ -1,9 +1,10 @@
 """Fit a wall to the phasors of an iToF camera whose light also takes a detour over a side wall.
 
-A camera with light modulated at 20 and 100 MHz sees a wall 4 m away. Light that comes by a bright panel beside it
-arrives late, and the phase takes the wall to be further away than it is: multipath. The renderer knows the detour. Its
-phasor film gives what the camera's taps collect, and `tt.losses.phasor_loss` compares that with the measured phasors.
-Unknown are distance, two tilts, and the albedos of wall and panel.
+A camera with light modulated at 20 and 100 MHz sees a wall 4 m away. Its pixels have two taps and hand out their
+differences, with shot and read noise and a converter. Light that comes by a bright panel beside the wall arrives late,
+and the phase takes the wall to be further away than it is: multipath. The renderer knows the detour. Its phasor film
+gives what the taps collect, and `tt.losses.phasor_loss` compares what the same sensor makes of it with the measured
+phasors. Unknown are distance, two tilts, and the albedos of wall and panel.
 
     python training_examples/fit_phasors.py --seeds 0 1 2 --output demo_output
 
@@ -32,10 +33,18 @@ from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
 HERTZ = (100e6, 20e6)
-CODE = sensing.sine_code(4)
-ELECTRONS = 6.4e5  # of a radiance of one: 20 000 in each tap
+STEPS = 4  # of the phase, one exposure of both taps each
+ELECTRONS = 6.4e5  # of a radiance of one: 10 000 in each tap
 FREQUENCIES = tt.FrequencyAxis.from_hertz([0.0, *HERTZ])
 WINDOW = tt.TimeAxis(6.0, 0.05, 200)
+CODE = sensing.TwoTapCode(sensing.sine_code(STEPS))
+CAMERA = sensing.Compose(
+    [
+        sensing.ItofCorrelation(CODE, HERTZ, WINDOW, contrast=0.8, background_e=2e4, electrons_per_unit=ELECTRONS),
+        sensing.PixelElectronics(full_well_e=6e4, read_noise_e=20.0, gain_e_per_dn=15.0, bits=12),
+        sensing.TapDifference(),
+    ]
+)
 CAMERA_HEIGHT, FOV_DEG, SPP = 4.0, 20.0, 64
 WALL = torch.tensor(scale(6.0)).float()  # before it is moved
 KEYS = ("wall.to_world", "wall.bsdf.reflectance.value", "side.bsdf.reflectance.value")
@@ -89,8 +98,7 @@ def distances_to_wall(values: Sequence[float], resolution: int) -> Tensor:
 def plane_through(distances: Tensor) -> Tensor:
     """(H, W): distances to the plane that lies nearest to measured ones, by least squares."""
     points = (distances[..., None] * rays(distances.shape[-1])).reshape(-1, 3)
-    design = torch.cat([points[:, :2], torch.ones(len(points), 1)], dim=1)
-    a, b, c = torch.linalg.lstsq(design, points[:, 2]).solution
+    a, b, c = torch.linalg.lstsq(torch.cat([points[:, :2], torch.ones(len(points), 1)], 1), points[:, 2]).solution
     return c / (rays(distances.shape[-1]) @ torch.stack([-a, -b, torch.tensor(1.0)]))
 
 
@@ -98,32 +106,23 @@ def rms_mm(error: Tensor) -> float:  # of metres
     return 1e3 * float(error.square().mean().sqrt())
 
 
-class Model(torch.nn.Module):
-    """Mean electrons of the taps (1, 8, H, W) of five parameters, by a phasor film or by a histogram film."""
-
-    def __init__(self, resolution: int, film: str) -> None:
-        super().__init__()
-        what = {"frequencies": FREQUENCIES} if film == "phasor" else {"time_axis": WINDOW}
-        described = tt.load(scene(resolution), variant="llvm_ad_mono")
-        self.renderer = tt.TransientRenderer(described, KEYS, **what)
-        self.camera = sensing.ItofCorrelation(CODE, HERTZ, WINDOW, electrons_per_unit=ELECTRONS)
-
-    def forward(self, values: Sequence[Tensor], seed: int, spp: int) -> Tensor:
-        given = dict(zip(KEYS, (wall_to_world(*values[:3]), values[3], values[4]), strict=True))
-        out = self.renderer(given, seed=seed, spp=spp)
-        if out.phasor is not None:
-            return self.camera.expected_from_phasor(out.phasor, FREQUENCIES)
-        return self.camera(out.transient)
+def renderer_of(resolution: int, film: str) -> tt.TransientRenderer:
+    """With a phasor film or a histogram film."""
+    what = {"frequencies": FREQUENCIES} if film == "phasor" else {"time_axis": WINDOW}
+    return tt.TransientRenderer(tt.load(scene(resolution), variant="llvm_ad_mono"), KEYS, **what)
 
 
-def fit(model: Model, measured: Tensor, seed: int, steps: int, seconds: float | None = None) -> Fit:
+def by(values: Sequence[Tensor]) -> dict[str, Tensor]:  # what the renderer is given
+    return dict(zip(KEYS, (wall_to_world(*values[:3]), values[3], values[4]), strict=True))
+
+
+def fit(renderer: tt.TransientRenderer, measured: Tensor, seed: int, steps: int, seconds: float | None = None) -> Fit:
     """Adam on the phasors of the taps, for a number of steps or for some seconds of the processor."""
     values = [torch.nn.Parameter(torch.tensor(value)) for value in START]
     groups = [{"params": [value], "lr": rate} for value, rate in zip(values, RATES, strict=True)]
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
-    target, resolution = sensing.tap_phasor(measured, CODE.num_taps), measured.shape[-1]
-    truth = distances_to_wall(TRUTH, resolution)
-    rest = distances_to_wall(START, resolution) - truth
+    target, resolution = sensing.tap_phasor(measured, STEPS, "differential"), measured.shape[-1]
+    rest = distances_to_wall(START, resolution) - (truth := distances_to_wall(TRUTH, resolution))
     result = Fit(list(START), [rms_mm(rest)], rest)
     began, share = time.process_time(), 0.0
     progress = tqdm(total=steps, desc="fit_phasors", unit="step", leave=False)
@@ -131,7 +130,8 @@ def fit(model: Model, measured: Tensor, seed: int, steps: int, seconds: float | 
         for group, rate in zip(optimizer.param_groups, RATES, strict=True):
             group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * share))
         optimizer.zero_grad()
-        found = sensing.tap_phasor(model(values, len(result.errors_mm) + 10_000 * seed, SPP), CODE.num_taps)
+        out = renderer(by(values), seed=len(result.errors_mm) + 10_000 * seed, spp=SPP)
+        found = sensing.tap_phasor(CAMERA.expected(out), STEPS, "differential")
         tt.losses.phasor_loss(found, target).backward()
         optimizer.step()
         result.values = [value.item() for value in values]
@@ -170,14 +170,14 @@ def main(argv: Sequence[str] | None = None) -> dict[str, list[float]]:
     options = parser.parse_args(argv)
     seeds, steps, resolution = (options.seeds[:1], 60, 8) if options.smoke else (options.seeds, 300, 16)
     tt.threads(1)
-    models = {f"{film} film": Model(resolution, film) for film in ("phasor", "histogram")}
+    models = {f"{film} film": renderer_of(resolution, film) for film in ("phasor", "histogram")}
     with torch.no_grad():
-        light = models["phasor film"]([torch.tensor(value) for value in TRUTH], seed=1_000_003, spp=16_384)
+        light = models["phasor film"](by([torch.tensor(value) for value in TRUTH]), seed=1_000_003, spp=16_384)
     truth = distances_to_wall(TRUTH, resolution)
     errors: dict[str, list[float]] = {name: [] for name in ("camera", "plane", *models)}
     for seed in seeds:
-        measured = sensing.poisson(light, torch.Generator().manual_seed(seed))
-        depth = sensing.read_itof(measured, HERTZ, CODE.num_taps, max_depth_m=7.0).depth_m[0]
+        measured = CAMERA.sample(light, torch.Generator().manual_seed(seed))
+        depth = sensing.read_itof(measured, HERTZ, STEPS, readout="differential", max_depth_m=7.0).depth_m[0]
         naive, flat = depth - truth, plane_through(depth) - truth
         fits = {"phasor film": fit(models["phasor film"], measured, seed, steps)}
         budget = fits["phasor film"].seconds[-1]

@@ -2,8 +2,9 @@
 
 Light that came over two or more walls is late, and an amplitude-modulated camera cannot tell it from the light of its
 pixel: corners are rounded off and everything is too far by centimetres, by less at high frequencies. A recipe builds
-rooms of many sizes and paints with two boxes, seen by `tt.sensing.device("kinect_v2_like")` (three frequencies, three
-taps, noise, 10 bits). The network sees phases and amplitudes of all frequencies and corrects the unwrapped depth.
+rooms of many sizes and paints with two boxes, seen by `tt.sensing.device("kinect_v2_like")` (differences of two taps,
+three frequencies with three phase steps, noise, 10 bits). The network sees phases and amplitudes of all frequencies
+and corrects the unwrapped depth.
 
     python training_examples/itof_multipath.py --output demo_output
 
@@ -60,13 +61,17 @@ def rooms(sizes: argparse.Namespace, max_depth: int = 6) -> tt.data.Recipe:
     )  # fmt: skip
 
 
-
 def generated(recipe: tt.data.Recipe, count: int, options: argparse.Namespace) -> tuple[Tensor, Tensor]:
-    """Taps (N, 1, 9, H, W) in electrons, and depth (N, 1, H, W) in metres."""
+    """Differences (N, 1, 9, H, W) in electrons, and depth (N, 1, H, W) in metres."""
     folder = options.output / f"itof_multipath-{recipe.key()[:8]}-{count}"
     print(tt.data.generate(recipe, folder, count, options.workers))
     whole = next(iter(DataLoader(tt.data.TransientDataset(folder), batch_size=count)))
     return whole["measurement"], whole["depth"].unsqueeze(1)
+
+
+def read(taps: Tensor) -> sensing.ItofReading:
+    """Phases and amplitudes of three frequencies, unwrapped to one depth."""
+    return sensing.read_itof(taps, FREQUENCIES, 3, readout="differential", max_depth_m=FARTHEST_M)
 
 
 def convolution(before: int, after: int) -> nn.Module:
@@ -83,26 +88,26 @@ class Coarser(nn.Sequential):
 
 
 class MultipathNetwork(nn.Module):
-    """Depth (B, 1, H, W) from taps (B, 1, 9, H, W): the unwrapped depth and what a U-Net adds to it."""
+    """Depth (B, 1, H, W) from differences (B, 1, 9, H, W): the unwrapped depth and what a U-Net adds to it."""
 
     def __init__(self, c: int) -> None:
         super().__init__()
         inmost = Coarser(convolution(4 * c, 4 * c), convolution(4 * c, 4 * c))
         inner = Coarser(convolution(2 * c, 4 * c), inmost, convolution(8 * c, 4 * c))
         middle = Coarser(convolution(c, 2 * c), inner, convolution(6 * c, 2 * c))
-        self.layers = nn.Sequential(convolution(13, c), middle, convolution(3 * c, c), nn.Conv2d(c, 1, 1))
+        self.layers = nn.Sequential(convolution(10, c), middle, convolution(3 * c, c), nn.Conv2d(c, 1, 1))
         nn.init.zeros_(self.layers[-1].weight)
         nn.init.zeros_(self.layers[-1].bias)
 
     def forward(self, taps: Tensor) -> Tensor:
-        """What frequencies say beyond the depth: how far their phases are from its own, amplitudes, contrast."""
-        reading = sensing.read_itof(taps, FREQUENCIES, 3, max_depth_m=FARTHEST_M)
+        """What frequencies say beyond the depth: how far their phases are from its own, amplitudes."""
+        reading = read(taps)
         depth = reading.depth_m
         frequencies = reading.phase.new_tensor(FREQUENCIES).reshape(-1, 1, 1)
         late = reading.phase.squeeze(1) - 2 * torch.pi * frequencies * tt.units.opl_to_seconds(2 * depth)
         amplitude = reading.amplitude.squeeze(1).clamp_min(1.0).log()
         ratios = amplitude[:, 1:] - amplitude[:, :1]
-        features = [late.cos(), late.sin(), ratios, reading.contrast.squeeze(1), amplitude[:, :1] - 7, depth - 3]
+        features = [late.cos(), late.sin(), ratios, amplitude[:, :1] - 7, depth - 3]
         return depth + self.layers(torch.cat(features, 1)) / 10
 
 
@@ -126,12 +131,12 @@ def train(taps: Tensor, depth: Tensor, sizes: argparse.Namespace, generator: tor
 
 def phase_depth(taps: Tensor) -> Tensor:
     """What a driver reports: three frequencies, unwrapped."""
-    return sensing.read_itof(taps, FREQUENCIES, 3, max_depth_m=FARTHEST_M).depth_m
+    return read(taps).depth_m
 
 
 def lowest(taps: Tensor) -> Tensor:
     """Depth of the only frequency that needs no unwrapping."""
-    return sensing.depth_of_phase(sensing.read_itof(taps, FREQUENCIES, 3).phase[:, :, 2], FREQUENCIES[2])
+    return sensing.depth_of_phase(read(taps).phase[:, :, 2], FREQUENCIES[2])
 
 
 def errors_of(found: Tensor, depth: Tensor) -> list[float]:

@@ -7,8 +7,9 @@ heights of a mesh; the albedo of every pixel is unknown too and taken out, so th
 
     python training_examples/shape_from_polarization.py --seeds 0 1 2 --output demo_output
 
-Prints the errors of heights and normals for two fits from the same flat start and the same light: one detector that
-counts all of it (S0), and four behind polarizers, which share it and lose half.
+Prints the errors of heights and normals for three fits from the same flat start and the same light: one detector that
+counts all of it (S0); four behind polarizers, which share it and lose half; and a gated chip whose pixels have one
+polarizer each (a mosaic) with read noise and a converter, by the Stokes channels that are interpolated from its pixels.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,13 @@ PULSE = tt.Pulse.gaussian(0.3)  # 1 ns
 WIDTH, SIDE, CELLS, WAVES = 0.03, 0.05, 40, 20
 DISTANCE, INCIDENCE, PIXELS = 0.5, math.radians(50.0), (24, 16)
 PHOTONS = 1e6  # of a pixel without filters
-SHARES = {
-    "S0 alone": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-    "Stokes": sensing.linear_analysers([0.0, 45.0, 90.0, 135.0], transmission=0.25),
+FOUR = sensing.linear_analysers([0.0, 45.0, 90.0, 135.0], transmission=0.25)
+MOSAIC = sensing.PolarizationMosaic.polarsens(300.0)
+CHIP = sensing.PixelElectronics(full_well_e=2e5, read_noise_e=10.0, gain_e_per_dn=12.0, bits=14, black_level_dn=64)
+SENSORS = {
+    "S0 alone": sensing.Compose([sensing.Analysers(torch.tensor([[1.0, 0.0, 0.0, 0.0]])), sensing.ShotNoise()]),
+    "Stokes": sensing.Compose([sensing.Analysers(FOUR), sensing.ShotNoise()]),
+    "mosaic": sensing.Compose([MOSAIC, CHIP]),
 }
 
 
@@ -96,25 +100,23 @@ def seen() -> Tensor:
     return (x.abs() < WIDTH / 2 - 1e-3) & (y.abs() < WIDTH / PIXELS[0] * PIXELS[1] / math.cos(INCIDENCE) / 2 - 1e-3)
 
 
-class Model(torch.nn.Module):
-    """Light (A, 1, T, H, W) of heights (N, N), as every one of A detectors gets it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.renderer = tt.TransientRenderer(tt.load(scene(), variant="llvm_ad_mono_polarized"), [KEY], irf=PULSE)
-
-    def forward(self, heights: Tensor, shares: Tensor, seed: int, spp: int) -> Tensor:
-        vertices = torch.stack([*grid(), heights], dim=-1).reshape(-1, 3)
-        return sensing.Analysers(shares)(self.renderer({KEY: vertices}, seed=seed, spp=spp).transient)
+def stokes(renderer: tt.TransientRenderer, heights: Tensor, seed: int, spp: int) -> Tensor:
+    """Stokes components (4, 1, T, H, W) of heights (N, N): what falls on a sensor."""
+    vertices = torch.stack([*grid(), heights], dim=-1).reshape(-1, 3)
+    return renderer({KEY: vertices}, seed=seed, spp=spp).transient
 
 
-@dataclass
-class Fit:
-    """Heights (N, N) in metres, errors (mm and degrees, rms) before the first step and after each, processor time."""
+def difference(name: str, light: Tensor, measured: Tensor) -> Tensor:
+    """The loss: each pixel's light is made the measured one, in all detectors and bins together; no say to albedos."""
+    if name == "mosaic":
+        ours, theirs = (x / x[:1].sum(2, keepdim=True) for x in (MOSAIC.stokes(light), MOSAIC.stokes(measured)))
+        noise = (theirs[:1].clamp_min(0) + 1e-3).sqrt()  # of counts; the faintest bins have that of the chip
+        return tt.losses.squared_loss(ours / noise, theirs / noise)
+    total = measured.sum((0, 2), keepdim=True)
+    return tt.losses.root_loss(light / light.sum((0, 2), keepdim=True) * total, measured)
 
-    heights: Tensor
-    errors: list[tuple[float, float]]
-    seconds: float = 0.0
+
+Fit = tuple[Tensor, list[tuple[float, float]], float]  # heights, errors before the first step and after each, seconds
 
 
 def errors_of(heights: Tensor) -> tuple[float, float]:
@@ -124,51 +126,47 @@ def errors_of(heights: Tensor) -> tuple[float, float]:
     return 1e3 * float(height), math.degrees(float(cosine.clamp(-1, 1).arccos().square().mean().sqrt()))
 
 
-def fit(model: Model, counts: Tensor, shares: Tensor, seed: int, steps: int, spp: int) -> Fit:
+def fit(light_of: Callable[..., Tensor], name: str, measured: Tensor, seed: int, steps: int, spp: int) -> Fit:
     """Adam on the cosines of the heights, from a flat relief, 1.5 mm too deep; long waves move more than short ones."""
     order = torch.arange(WAVES)
     scale = 1e-4 / (1 + (order[:, None].square() + order.square()) / 9).sqrt()
     shape = torch.nn.Parameter(torch.zeros(WAVES, WAVES))
     optimizer = torch.optim.Adam([shape], lr=0.3, betas=(0.9, 0.95))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    total = counts.sum((0, 2), keepdim=True)
-    found = Fit(flat := torch.zeros(CELLS + 1, CELLS + 1), [errors_of(flat)])
-    began = time.process_time()
-    for step in tqdm(range(steps), desc=f"{len(shares)} detectors", unit="step", leave=False):
-        light = model(waves() @ (scale * shape) @ waves().T, shares, step + 10_000 * seed, spp)
-        # Each pixel's light is made the measured one, in all detectors and bins together: albedos have no say.
-        loss = tt.losses.root_loss(light / light.sum((0, 2), keepdim=True) * total, counts)
+    found = waves() @ (scale * shape.detach()) @ waves().T
+    errors, began = [errors_of(found)], time.process_time()
+    for step in tqdm(range(steps), desc=name, unit="step", leave=False):
+        light = light_of(waves() @ (scale * shape) @ waves().T, step + 10_000 * seed, spp)
         optimizer.zero_grad()
-        loss.backward()
+        difference(name, SENSORS[name].expected(light), measured).backward()
         optimizer.step()
         schedule.step()
-        found.heights = waves() @ (scale * shape.detach()) @ waves().T
-        found.errors.append(errors_of(found.heights))
-    found.seconds = time.process_time() - began
-    return found
+        found = waves() @ (scale * shape.detach()) @ waves().T
+        errors.append(errors_of(found))
+    return found, errors, time.process_time() - began
 
 
 def draw(path: Path, fits: dict[str, Fit]) -> None:
     """The reliefs under a slanting lamp, cut to what the camera sees, and the errors over the steps."""
-    figure = figure_type()(figsize=(12, 3.5), layout="compressed")
-    panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.2))
-    shown = {"truth": true_heights(), **{name: one.heights for name, one in fits.items()}}
+    figure = figure_type()(figsize=(14, 3.5), layout="compressed")
+    panels = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.2))
+    shown = {"truth": true_heights(), **{name: one[0] for name, one in fits.items()}}
     for panel, (name, heights) in zip(panels, shown.items(), strict=False):
         picture = (normals(heights) @ torch.tensor([-0.6, 0.5, 0.62])).clamp_min(0)
         picture[~seen()[1:-1, 1:-1]] = torch.nan
         rows, columns = (part.any(dim).nonzero() for dim in (1, 0) for part in [picture.isfinite()])
         cut = picture[int(rows[0]) : int(rows[-1]) + 1, int(columns[0]) : int(columns[-1]) + 1]
         panel.imshow(cut, cmap="gray", vmin=0.3, vmax=0.9, origin="lower")
-        panel.set(xticks=[], yticks=[], title=name if name == "truth" else f"{name}: {fits[name].errors[-1][1]:.1f}°")
+        panel.set(xticks=[], yticks=[], title=name if name == "truth" else f"{name}: {fits[name][1][-1][1]:.1f}°")
     for name, one in fits.items():
-        panels[3].semilogy([degrees for _, degrees in one.errors], label=name)
-    panels[3].set(xlabel="step", ylabel="error of the normals [degrees]")
-    panels[3].legend()
+        panels[4].semilogy([degrees for _, degrees in one[1]], label=name)
+    panels[4].set(xlabel="step", ylabel="error of the normals [degrees]")
+    panels[4].legend()
     save_figure(figure, path, "shape_from_polarization")
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, list[tuple[float, float]]]:
-    """Command line. Returns the last errors (mm, degrees) of both fits, one of each seed."""
+    """Command line. Returns the last errors (mm, degrees) of every fit, one of each seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="noise of the counts (%(default)s)")
     parser.add_argument("--smoke", action="store_true", help="one seed, few steps")
@@ -176,18 +174,18 @@ def main(argv: Sequence[str] | None = None) -> dict[str, list[tuple[float, float
     options = parser.parse_args(argv)
     seeds, steps, spp = (options.seeds[:1], 60, 8) if options.smoke else (options.seeds, 200, 32)
     tt.threads(1)
-    model = Model()
+    renderer = tt.TransientRenderer(tt.load(scene(), variant="llvm_ad_mono_polarized"), [KEY], irf=PULSE)
     with torch.no_grad():
-        light = {name: model(true_heights(), shares, 1_000_003, 4096) for name, shares in SHARES.items()}
-    exposure = PHOTONS / light["S0 alone"].sum(2).mean()
-    errors: dict[str, list[tuple[float, float]]] = {name: [] for name in SHARES}
+        light = stokes(renderer, true_heights(), 1_000_003, 4096)
+    exposure = PHOTONS / light[0].sum(1).mean()
+    errors: dict[str, list[tuple[float, float]]] = {name: [] for name in SENSORS}
     for seed in seeds:
         fits = {}
-        for name, shares in SHARES.items():
-            counts = sensing.poisson(exposure * light[name], torch.Generator().manual_seed(seed))
-            fits[name] = fit(model, counts, shares, seed, steps, spp)
-            errors[name].append(fits[name].errors[-1])
-            said = "{:.3f} mm, {:.2f} degrees ({:.1f} s of one core)".format(*errors[name][-1], fits[name].seconds)
+        for name, sensor in SENSORS.items():
+            measured = sensor.sample(exposure * light, torch.Generator().manual_seed(seed))
+            fits[name] = fit(lambda *of: exposure * stokes(renderer, *of), name, measured, seed, steps, spp)
+            errors[name].append(fits[name][1][-1])
+            said = "{:.3f} mm, {:.2f} degrees ({:.1f} s of one core)".format(*errors[name][-1], fits[name][2])
             print(f"shape_from_polarization, seed {seed}, {name}: {said}")
         if seed == seeds[0]:
             options.output.mkdir(parents=True, exist_ok=True)

@@ -123,9 +123,14 @@ def test_kinect_sees_the_depth_of_a_wall():
     axis = preset.axis()
     x = torch.zeros(1, axis.num_bins, 4, 4, dtype=torch.float64)
     x[:, int(axis.bin_index(2 * 3.21))] = 1.0
-    taps = preset.sensor(grad="straight_through")(x, torch.Generator().manual_seed(0))
-    reading = read_itof(taps, (120e6, 80e6, 16e6), 3, max_depth_m=8.0)
+    frames = preset.sensor(grad="straight_through")(x, torch.Generator().manual_seed(0))
+    assert frames.shape == (1, 9, 4, 4)  # three phase steps of three frequencies: differences of two taps
+    assert bool((frames % 60 == 0).all()) and float(frames.min()) < 0  # of converters with 60 electrons per number
+    reading = read_itof(frames, (120e6, 80e6, 16e6), 3, readout="differential", max_depth_m=8.0)
     assert float((reading.depth_m - 3.21).abs().max()) < 0.05
+    # Unmodulated light leaves no difference, but its noise.
+    dark = preset.sensor().expected(torch.zeros_like(x))
+    torch.testing.assert_close(dark, torch.zeros_like(dark), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,18 @@ def test_first_example():
     assert bool(torch.isfinite(names["reading"].depth_std_m).all())
 
 
+def test_example_of_two_taps():
+    names = run(1)
+    assert names["frames"].shape == (1, 4, 16, 16)
+    error = names["found"].depth_m - 0.5 * 120.5 * names["axis"].bin_width_opl
+    # The deviation that the reading says, and what noise leaves of a mean of 256 pixels.
+    said = float(names["found"].depth_std_m.mean())
+    assert abs(float(error.std()) / said - 1) < 0.2
+    assert abs(float(error.mean())) < 4 * said / 16
+
+
 def test_devices_example():
-    assert run(1)["quiet"].sensor().stages[1].read_noise_e == 5.0
+    assert run(2)["quiet"].sensor().stages[1].read_noise_e == 5.0
 
 
 def test_names_exist():
@@ -40,7 +50,8 @@ def test_names_exist():
     known = {n for n in named if hasattr(sensing, n)}
     elsewhere = {
         "Compose", "TransientRenderer", "expected", "forward", "gaussian", "straight_through", "score", "transform",
-        "polarsens", "LinearPhysics", "Physics", "img_size", *sensing.DEVICES,
+        "polarsens", "LinearPhysics", "Physics", "img_size", *sensing.DEVICES, "depth_std_m", "std_e", "offset_e",
+        "electrons_per_unit",
     }  # fmt: skip
     assert named - known - elsewhere == set()
     assert {"read_itof", "StreakCamera", "PolarizationMosaic", "log_matched_filter"} <= known

@@ -208,7 +208,8 @@ def test_the_score_has_mean_zero_and_coates_makes_it_vanish(dead_bins):
     mean = spad(as_image(rate))
     best = coates(mean, cycles, spad.dead_bins).rate.requires_grad_()
     (at_best,) = torch.autograd.grad(spad.log_prob(mean, best).sum(), best)
-    assert float(at_best.abs().max()) < 1e-6
+    # with a dead time the likelihood is right to second order in the photons of a bin
+    assert float(at_best.abs().max()) < (1e-6 if dead_bins is None else 2e-3 * cycles)
 
 
 @pytest.mark.parametrize(

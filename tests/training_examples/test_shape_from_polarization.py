@@ -33,10 +33,12 @@ def test_stokes_components_know_the_normals(example, tmp_path, capsys):
 
     with mi.variant_context("llvm_ad_mono_polarized"):  # else each render goes to and fro between it and another test's
         errors = example["main"](["--smoke", "--output", str(tmp_path)])
-    assert capsys.readouterr().out.count("shape_from_polarization, seed 0, ") == 2
-    ((alone,), (stokes,)) = (errors[name] for name in ("S0 alone", "Stokes"))
+    assert capsys.readouterr().out.count("shape_from_polarization, seed 0, ") == 3
+    ((alone,), (stokes,), (mosaic,)) = (errors[name] for name in ("S0 alone", "Stokes", "mosaic"))
     # Albedos are free, so S0 has the times alone: a pulse of 15 cm for heights of half a millimetre. S1 and S2 have the
     # normals in a single pixel, with half the light.
     assert stokes[1] < 0.5 * alone[1]
     assert stokes[1] < 0.5 * example["errors_of"](torch.zeros_like(example["true_heights"]()))[1]
+    # A quarter of the pixels for each direction, and the noise of a chip: still better than all of the light.
+    assert mosaic[1] < 0.6 * alone[1]
     assert (tmp_path / "shape_from_polarization.png").read_bytes().startswith(b"\x89PNG")

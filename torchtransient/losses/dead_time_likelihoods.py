@@ -35,8 +35,8 @@ from torchtransient.losses.likelihoods import (
 )
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.quantities import positive
-from torchtransient.sensing.running_sums import armed_cycles, split_dead_time
-from torchtransient.sensing.spad import first_photon_log_prob
+from torchtransient.sensing.dead_time_cycle import check_dead_bins
+from torchtransient.sensing.spad import exposed_cycles, first_photon_log_prob
 
 _TIME = -3
 
@@ -45,7 +45,7 @@ def _check_dead_time(dead_bins: float, where: str) -> float:
     check_number("dead_bins", dead_bins, where)
     number = positive(f"{where}: dead_bins", dead_bins)
     try:
-        split_dead_time(number)
+        check_dead_bins(number)
     except UnitError as error:
         raise UnitError(f"{where}: {error}") from None
     return number
@@ -92,15 +92,22 @@ def first_photon_nll(
     check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(floored(rate, floor, where), dim).to(torch.float64)
     level = dark_level(n, floor, number)
-    # nothing is dark where there are no counts
-    dark = torch.zeros_like(n, dtype=torch.bool) if level is None else (n != 0) & (r < level)
-    near = r if level is None else torch.where(dark, level, r)
+    dark = None if level is None else _dark(n, r, level)
+    near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
-    if level is not None and bool(dark.any()):
+    if level is not None and dark is not None:
+        # the tangent: what does not fire is linear in the rate anyway
         least = torch.where(dark, level, 1.0)
-        quiet = (armed_cycles(n, number, dead) - n).clamp_min(0)
+        quiet = (exposed_cycles(n, number, dead) - n).clamp_min(0)
         value = value + torch.where(dark, (quiet - n / torch.expm1(least)) * (r - least), 0.0)
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
+
+
+def _dark(n: Tensor, r: Tensor, level: Tensor) -> Tensor | None:
+    """Counts where rates are below the level; None without any, as a rule."""
+    below = r < level
+    found = below & (n != 0) if bool(below.any()) else below
+    return found if bool(found.any()) else None
 
 
 first_photon_loss = first_photon_nll

@@ -12,9 +12,12 @@ from torchtransient.sensing.detection_jitter import DetectionJitter
 from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.photon_budget import PhotonBudget
+from torchtransient.sensing.pixel_groups import PixelGroups
+from torchtransient.sensing.pixel_skew import DetectionSkew
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.tdc import TDC
 
+_MOVES = (DetectionJitter, DetectionSkew)
 # share of a gate outside the window that starves no image by more than the rounding of a count
 _OUTSIDE = 1e-6
 
@@ -43,7 +46,8 @@ def _detects(stage: nn.Module) -> bool:
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
     """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
     background, behind = False, None
-    found = list(flattened(stages))
+    # of pixels of several kinds the first stands for all
+    found = [stage.sensors[0] if isinstance(stage, PixelGroups) else stage for stage in flattened(stages)]
     for number, stage in enumerate(found):
         name = type(stage).__name__
         if background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
@@ -59,12 +63,13 @@ def check_order(stages: Iterable[nn.Module], where: str) -> None:
                 f"{where}: expected no ImpulseResponse behind {behind}: it would average counts. Use DetectionJitter, "
                 "which moves every detection, or put the response in front of the detector."
             )
-        on_detections = isinstance(stage, DetectionJitter) or (isinstance(stage, TDC) and stage.acts_on == "detections")
+        on_detections = isinstance(stage, _MOVES) or (isinstance(stage, TDC) and stage.acts_on == "detections")
         later = next((type(s).__name__ for s in found[number + 1 :] if _detects(s)), None)
         if on_detections and later is not None:
             raise UnitError(
                 f"{where}: expected {name} behind the detector, got it in front of {later}. It acts on detections. "
-                + ("Say acts_on='rates' to convert light." if isinstance(stage, TDC) else "ImpulseResponse: light.")
+                + ("Say acts_on='rates'" if isinstance(stage, TDC) else "Take an ImpulseResponse or a PixelSkew")
+                + " for light."
             )
         if isinstance(stage, PhotonBudget):
             background = background or has_background(stage)

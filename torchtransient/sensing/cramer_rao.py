@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.sensing.impulse_response import Response
 from torchtransient.sensing.layout import TIME, check_count, check_time_axis
 from torchtransient.sensing.response_shapes import resample_counts
@@ -66,7 +66,7 @@ def return_rates(
     where = "return_rates"
     _check_response(response, where)
     check_time_axis(axis, where)
-    distance, light, dark = _pixels((distance_m, signal, background), where)
+    distance, light, dark = _pixels((distance_m, signal, background), response, where)
     return light.unsqueeze(-1) * _shares(response, axis, distance) + dark.unsqueeze(-1)
 
 
@@ -98,7 +98,7 @@ def crlb(
     check_time_axis(axis, where)
     names = _check_unknown(unknown, where)
     number = None if cycles is None else check_count(cycles, "cycles", where)
-    distance, light, dark = _pixels((distance_m, signal, background), where)
+    distance, light, dark = _pixels((distance_m, signal, background), response, where)
     both = torch.func.jvp(lambda d: _shares(response, axis, d), (distance,), (torch.ones_like(distance),))
     shares, change = both[0], both[1]
     light = light.unsqueeze(-1)
@@ -218,15 +218,20 @@ def _deviations(covariance: Tensor) -> Tensor:
     return covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
-def _pixels(values: tuple[Tensor | float, ...], where: str) -> tuple[Tensor, ...]:
-    """Distance, signal and background of every pixel, float64, of one shape."""
+def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) -> tuple[Tensor, ...]:
+    """Distance, signal and background of every pixel, float64, of one shape, on the device of the response."""
     names = ("distance_m", "signal", "background")
     tensors = []
-    devices = [v.device for v in values if isinstance(v, Tensor) and v.ndim]
     for name, value in zip(names, values, strict=True):
         if isinstance(value, bool) or not isinstance(value, (Tensor, int, float)):
             raise UnitError(f"{where}: expected {name} to be a number or a tensor, got {type(value).__name__}.")
-        tensor = torch.as_tensor(value, device=devices[0] if devices else None)
+        device = response.delay_ps.device
+        tensor = torch.as_tensor(value, device=None if isinstance(value, Tensor) and value.ndim else device)
+        if tensor.device != device:
+            raise DeviceError(
+                f"{where}: expected {name} on the device of the response, got {tensor.device} and {device}. Move the "
+                "response with .to(device)."
+            )
         if tensor.is_complex() or tensor.dtype == torch.bool:
             raise UnitError(f"{where}: expected {name} of real numbers, got {tensor.dtype}.")
         tensor = tensor.to(torch.float64)

@@ -30,11 +30,16 @@ def _weights(largest: float) -> list[float]:
     return weights
 
 
-def moments(x: Tensor) -> Moments:
-    """For x >= 0, float64. One of them is a series where x is small; the others follow by parts, adding up only."""
+def moments(x: Tensor, largest: float | None = None) -> Moments:
+    """For x >= 0, float64. One of them is a series where x is small; the others follow by parts, adding up only.
+
+    `largest`: a bound of x that is known, for x that cannot be looked at (torch.func.vmap).
+    """
     small = x < _SERIES_BELOW
     near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
-    weights = _weights(float(near.detach().amax()) if near.numel() else 0.0)
+    if largest is None:
+        largest = float(near.detach().amax()) if near.numel() else 0.0
+    weights = _weights(min(largest, _SERIES_BELOW))
     series = torch.full_like(x, weights[-1])
     for weight in reversed(weights[:-1]):
         series = weight - near * series
@@ -43,3 +48,14 @@ def moments(x: Tensor) -> Moments:
     decay_1 = torch.where(small, 0.5 - near * series, (1 - (1 + far) * torch.exp(-far)) / far**2)
     decay_0 = torch.exp(-x) + x * decay_1
     return Moments((decay_0, decay_1), (decay_0 - decay_1, hit_1))
+
+
+def second_moment(x: Tensor) -> Tensor:
+    """Integral over z from 0 to 1 of z^2 exp(-x z), for x >= 0, float64: less the slope of the first moment."""
+    small = x < _SERIES_BELOW
+    near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
+    series = torch.zeros_like(x)
+    for n in range(18, -1, -1):  # the next term is below 1e-18
+        series = 1 / (math.factorial(n) * (n + 3)) - near * series
+    first = (1 - (1 + far) * torch.exp(-far)) / far**2
+    return torch.where(small, series, (2 * first - torch.exp(-far)) / far)

@@ -19,9 +19,10 @@ from torch import Tensor, nn
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.sensing.dead_time_cycle import check_dead_bins, whole_and_part
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running_draws import Path, bin_chances, draw_path, log_likelihood, path_log_prob
-from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state, whole_and_part
+from torchtransient.sensing.free_running_state import FreeRunningState, stationary_state
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
@@ -32,7 +33,6 @@ from torchtransient.sensing.layout import (
     check_transient,
 )
 from torchtransient.sensing.policies import GradPolicy, record_score
-from torchtransient.sensing.running_sums import split_dead_time
 from torchtransient.sensing.sensor import RandomSensor
 from torchtransient.sensing.time_convolution import check_choice
 
@@ -79,7 +79,7 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """
     check_transient(rate, "nonparalyzable_histogram")
     check_rates(rate, "nonparalyzable_histogram")
-    split_dead_time(dead_bins)  # says what is wrong with a dead time that is too short
+    check_dead_bins(dead_bins)
     return state_image(rate, dead_bins).detected.to(rate.dtype)
 
 

@@ -1,4 +1,4 @@
-"""Draws of a free-running detector over one period, from its stationary state, and how probable they were."""
+"""Draws of detectors over one period, bin by bin, and how probable they were."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from torchtransient.sensing.layout import TIME
 class BinChances:
     """Probabilities of every step of a run through the bins of a period, (..., T, H, W)."""
 
-    begin: Tensor  # bin 0: armed at the start; then (T + 1 in all) dead at the start and armed again in bin 0, 1, ...
+    # bin 0: armed at the start; then (T + 1 in all) dead at the start and armed again in bin 0, 1, ...; None: all armed
+    begin: Tensor | None
     fire: Tensor  # detected in the bin, when armed at its start
     soon: Tensor  # detected in the bin, when armed again in it
     late: Tensor  # armed again after `whole` + 1 bins instead of `whole`, when detected
@@ -27,7 +28,7 @@ class BinChances:
 class Path:
     """How many detectors took which step, same layout as BinChances."""
 
-    begin: Tensor
+    begin: Tensor | None
     armed: Tensor  # at the start of the bin
     back: Tensor  # armed again in it
     fired: Tensor  # of `armed`
@@ -57,26 +58,37 @@ def bin_chances(rate: Tensor, state: FreeRunningState) -> BinChances:
     dead = back_soon * (index < whole) + back_late * (index < whole + 1)
     begin = torch.cat([state.armed.narrow(TIME, 0, 1), dead], TIME)
     begin = begin / begin.sum(TIME, keepdim=True).clamp_min(1)  # rounding
+    return step_chances(rate, state.detected, state.armed, state.late, back, begin, whole)
+
+
+def step_chances(
+    rate: Tensor, detected: Tensor, armed: Tensor, late: Tensor, back: Tensor, begin: Tensor | None, whole: int
+) -> BinChances:
+    """Of bins with these means; `back`: armed again in the bin."""
     fire = -torch.expm1(-rate)
-    rest = state.detected - state.armed * fire
+    rest = detected - armed * fire
     # straight lines can put a little too much or too little here; one chance for both keeps the mean
-    whole_chance = _share(state.detected, state.armed + back)
+    whole_chance = _share(detected, armed + back)
     fits = (rest >= 0) & (rest <= back)
     return BinChances(
         begin=begin,
         fire=torch.where(fits, fire, whole_chance),
         soon=torch.where(fits, _share(rest, back), whole_chance),
-        late=_share(state.late, state.detected),
+        late=_share(late, detected),
         whole=whole,
     )
 
 
 def draw_path(chances: BinChances, periods: int, generator: torch.Generator | None) -> Path:
     """`periods` detectors, each run over one period."""
-    begin = sample_multinomial(periods, chances.begin, generator)
-    bins = chances.fire.shape[TIME]
-    armed = begin.select(TIME, 0)
-    returning = list(begin.unbind(TIME)[1:])
+    bins, begin = chances.fire.shape[TIME], None
+    if chances.begin is None:
+        armed = torch.full_like(chances.fire.select(TIME, 0), float(periods))
+        returning = [torch.zeros_like(armed) for _ in range(bins)]
+    else:
+        begin = sample_multinomial(periods, chances.begin, generator)
+        armed = begin.select(TIME, 0)
+        returning = list(begin.unbind(TIME)[1:])
     taken: list[list[Tensor]] = [[], [], [], [], []]
     for k in range(bins):
         back = returning[k]
@@ -101,9 +113,11 @@ def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:
 
 def path_log_prob(path: Path, chances: BinChances, periods: int) -> Tensor:
     """Log-probability (..., H, W) of the steps that were drawn, up to a number that does not depend on the light."""
-    dead = periods - path.begin.sum(TIME)  # all period long
-    total = log_likelihood(path.begin, chances.begin).sum(TIME)
-    total = total + log_likelihood(dead, 1 - chances.begin.sum(TIME))
+    total = torch.zeros_like(chances.fire.select(TIME, 0))
+    if path.begin is not None and chances.begin is not None:
+        dead = periods - path.begin.sum(TIME)  # all period long
+        total = total + log_likelihood(path.begin, chances.begin).sum(TIME)
+        total = total + log_likelihood(dead, 1 - chances.begin.sum(TIME))
     for hits, trials, chance in (
         (path.fired, path.armed, chances.fire),
         (path.soon, path.back, chances.soon),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
+from torchtransient.sensing.dead_time_cycle import whole_and_part
 from torchtransient.sensing.renewal_chain import RenewalChain
 from torchtransient.sensing.stationary_phases import stationary_phases
 
@@ -26,14 +27,6 @@ class FreeRunningState:
     armed: Tensor  # probability at the start of the bin
     late: Tensor  # of `detected`: those that are armed again in bin i + `whole` + 1; the others in i + `whole`
     whole: int
-
-
-def whole_and_part(dead_bins: Tensor) -> tuple[int, Tensor]:
-    """Whole bins of a dead time and the rest of it, differentiable."""
-    # a whole number that rounding has put just below itself is still that number
-    whole = math.floor(float(dead_bins.detach()) + 1e-9)
-    part = dead_bins - whole
-    return whole, part - part.detach().clamp_max(0)
 
 
 def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:

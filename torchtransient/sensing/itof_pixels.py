@@ -109,9 +109,8 @@ class TapDifference(Sensor):
     """Taps A_0, B_0, A_1, B_1, ... (..., C, 2 M, H, W) to the differences ``A - B`` (..., C, M, H, W).
 
     Stands behind the `PixelElectronics` that draw the noise of both taps; a second `PixelElectronics(shot_noise=False,
-    ...)` behind it is the converter of a camera that digitizes the difference. Half precision is kept: counts beyond
-    2048 (float16) or 256 (bfloat16) have lost their last digits before they come here. Raises ShapeError for an odd
-    number of taps.
+    ...)` behind it is the converter of a camera that digitizes the difference. Raises ShapeError for an
+    odd number of taps.
     """
 
     gives = "the same"

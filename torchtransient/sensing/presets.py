@@ -263,21 +263,25 @@ _SINGLE_PHOTON = (
 _CAMERAS = (
     Device(
         name="kinect_v2_like",
-        description="A consumer indirect time-of-flight camera: three modulation frequencies with three taps each. "
-        "Takes electrons per unit of radiance and bin, gives electrons, (..., C, 9, H, W); depth by "
-        "tt.sensing.read_itof(taps, (120e6, 80e6, 16e6), 3, max_depth_m=8).",
+        description="A consumer indirect time-of-flight camera: pixels of two taps, three modulation frequencies with "
+        "three phase steps each. Takes electrons per unit of radiance and bin, gives the differences of the taps in "
+        "electrons, (..., C, 9, H, W); depth by tt.sensing.read_itof(frames, (120e6, 80e6, 16e6), 3, "
+        "readout='differential', max_depth_m=8).",
         sources=(
             "libfreenect2, driver by the OpenKinect project: phases of 0, 120 and 240 degrees, 3 of them at each of "
-            "16, 80 and 120 MHz, which repeat together after 18.7 m; also Jaremo Lawin et al. (ECCV 2016). In truth "
-            "exposures of a pixel with two taps, whose difference is recorded; here three taps share one exposure",
+            "16, 80 and 120 MHz, which repeat together after 18.7 m; also Jaremo Lawin et al. (ECCV 2016). Signed "
+            "frames of 11 bits, packed unevenly, which is left out here",
+            "Sell & O'Connor, The Xbox One system on a chip and Kinect sensor (IEEE Micro 2014); Bamji et al. (IEEE "
+            "JSSC 2015): differential pixels of two taps",
             "assumed: square codes; one contrast of 0.6 for all frequencies (Bamji et al., IEEE JSSC 2015, go up to "
-            "130 MHz); full well 60 000 electrons, 20 electrons read noise; 10 bit, 60 electrons per number, black "
-            "level 16; 2e4 electrons per unit, 500 of background; light in 1200 bins of 50 ps",
+            "130 MHz); full well 60 000 electrons, 20 electrons read noise; each tap with 10 bit, 60 electrons per "
+            "number, black level 16, hence differences of 11 bit; 2e4 electrons per unit and frequency, 500 of "
+            "background; light in 1200 bins of 50 ps",
         ),
         stages=(
             {
                 "kind": "ItofCorrelation",
-                "code": {"kind": "square_code", "num_taps": 3},
+                "code": {"kind": "TwoTapCode", "code": {"kind": "square_code", "num_taps": 3}},
                 "frequencies_hz": [120e6, 80e6, 16e6],
                 "axis": _AXIS,
                 "contrast": 0.6,
@@ -292,6 +296,7 @@ _CAMERAS = (
                 "bits": 10,
                 "black_level_dn": 16.0,
             },
+            {"kind": "TapDifference"},
         ),
         bin_width_s=50e-12,
         num_bins=1200,

@@ -41,8 +41,11 @@ class BinResponse:
     decay: Tensor  # still armed at the end
 
 
-def bin_response(rate: Tensor, part: Tensor) -> BinResponse:
-    """For rates (P, T) per bin and the fraction of a bin in the dead time, float64, differentiable in both."""
+def bin_response(rate: Tensor, part: Tensor, largest: float | None = None) -> BinResponse:
+    """For rates (P, T) per bin and the fraction of a bin in the dead time, float64, differentiable in both.
+
+    `largest`: a bound of the rates, where it is known.
+    """
     first = 1 - part  # inflow of the younger line lasts from `part` to the end of the bin, `first` long
 
     def parts(near: tuple[Tensor, Tensor], whole: tuple[Tensor, Tensor]) -> Tensor:
@@ -52,7 +55,7 @@ def bin_response(rate: Tensor, part: Tensor) -> BinResponse:
         old = (2 * first + 1) * rest[0] - 2 * rest[1]
         return torch.stack([near[0], _ROOT * young, rest[0], _ROOT * old], 1)
 
-    near, over = moments(rate * first), moments(rate)
+    near, over = moments(rate * first, largest), moments(rate, largest)
     kept = parts((first * near.decay[0], first**2 * near.decay[1]), over.decay)
     waited = parts((first**2 * near.hit[0], first**3 * near.hit[1]), over.hit)
     one = torch.ones(1, 1, dtype=rate.dtype, device=rate.device)

@@ -15,21 +15,20 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
+from torchtransient.sensing.dead_time_cycle import check_dead_bins, detected_rows, double_detections
+from torchtransient.sensing.dead_time_draws import DrawnRows, draw_cycles, gaussian_cycles, score_of_cycles
+from torchtransient.sensing.dead_time_inverse import armed_time, check_cycles, rates_of_counts
 from torchtransient.sensing.draws import check_rates, sample_first_photons
 from torchtransient.sensing.layout import (
     TIME,
     bin_width_of,
     check_count,
+    check_generator,
     check_seconds,
     check_transient,
 )
-from torchtransient.sensing.policies import GradPolicy, gaussian_noise
-from torchtransient.sensing.running_sums import (
-    armed_cycles,
-    detections_with_dead_time,
-    split_dead_time,
-    sum_before,
-)
+from torchtransient.sensing.policies import GradPolicy, gaussian_noise, record_score
+from torchtransient.sensing.running_sums import sum_before
 from torchtransient.sensing.sensor import RandomSensor
 
 
@@ -59,17 +58,48 @@ class CoatesEstimate(NamedTuple):
     valid: Tensor
 
 
+def _rows(x: Tensor) -> Tensor:
+    """(..., T, H, W) -> rows (P, T), float64."""
+    return x.to(torch.float64).movedim(TIME, -1).reshape(-1, x.shape[TIME])
+
+
+def _image(rows: Tensor, like: Tensor) -> Tensor:
+    return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
+
+
+def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
+    """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
+
+    `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
+    `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
+    Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
+    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md).
+    """
+    check_transient(rate, "detections_with_dead_time")
+    check_dead_bins(dead_bins)
+    if rate.numel() == 0:
+        return rate.to(torch.float64)
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    return _image(detected_rows(_rows(rate), dead), rate)
+
+
 @in_single
 def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
     """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
 
-    `counts`: (..., C, T, H, W) detections of `cycles` cycles; `dead_bins`: dead time in bins for several detections per
-    cycle, None for one. Where no cycle was armed any more the rate is 0, where every armed one fired it is that of a
-    share 1 - 1/(2 cycles); both are marked not valid. Differentiable in `counts`. dtype and device are kept.
+    `counts`: (..., C, T, H, W) detections of `cycles` cycles; `dead_bins`: dead time in bins, at least 1, for several
+    detections per cycle, None for one. With it the cycles that come back inside a bin count for as long as they are
+    armed in it: the inverse of `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Where no cycle was
+    armed any more the rate is 0, where every armed one fired it is that of a share 1 - 1/(2 cycles); both are marked
+    not valid. Differentiable in `counts`, with a dead time once. dtype and device are kept. Raises UnitError for a
+    dead time below one bin.
     """
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
-    armed = armed_cycles(counts, number, dead_bins)
+    if dead_bins is not None and counts.numel():
+        rate, valid = rates_of_counts(_rows(counts), number, float(dead_bins))
+        return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
+    armed = number - sum_before(counts)
     usable = ~(armed <= 0.5)  # NaN stays NaN
     safe = torch.where(usable, armed, torch.ones_like(armed))
     share = torch.where(usable, counts.to(torch.float64) / safe, torch.zeros_like(armed))
@@ -84,32 +114,28 @@ def sample_detections(
 ) -> Tensor:
     """A histogram of `cycles` cycles, without gradient, in the shape and dtype of `rate` (..., C, T, H, W).
 
-    `dead_bins` None: one detection per cycle, multinomial by a tree of binomials. Else bin by bin: of the armed cycles
-    a binomial share fires, and those that fired are armed again after the dead time (a fractional number of bins is
-    met on average, by a binomial share that takes one bin more).
+    `dead_bins` None: one detection per cycle, multinomial by a tree of binomials. Else bin by bin (pieces of bins where
+    they hold more than a photon): of the armed cycles a binomial share fires, and those that fired are armed again
+    after the dead time. Means are those of `detections_with_dead_time`, correlations those of the cycles.
     """
     check_transient(rate, "sample_detections")
     number = check_count(cycles, "cycles", "sample_detections")
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, _working(rate), generator).to(rate.dtype)
+    return _drawn(rate, number, dead_bins, generator)[0]
+
+
+def _drawn(
+    rate: Tensor, cycles: int, dead_bins: float, generator: torch.Generator | None
+) -> tuple[Tensor, list[DrawnRows]]:
+    check_dead_bins(dead_bins)
     check_rates(rate, "sample_detections")
-    whole, part = split_dead_time(dead_bins)
-    share = part.to(rate.device)
-    fire = -torch.expm1(-rate.to(torch.float64))
-    bins = rate.shape[TIME]
-    armed = torch.full_like(fire.select(TIME, 0), float(number))
-    returning = [torch.zeros_like(armed) for _ in range(bins + whole + 2)]
-    counts = torch.empty_like(fire)
-    for k in range(bins):
-        armed = armed + returning[k]
-        hit = torch.binomial(armed, fire.select(TIME, k), generator=generator)
-        later = torch.binomial(hit, share.expand_as(hit), generator=generator) if float(share) > 0 else hit * 0
-        counts.select(TIME, k).copy_(hit)
-        returning[k + whole] = returning[k + whole] + (hit - later)
-        returning[k + whole + 1] = returning[k + whole + 1] + later
-        armed = armed - hit
-    return counts.to(rate.dtype)
+    if rate.numel() == 0:
+        return rate.clone(), []
+    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
+    counts, drawn = draw_cycles(_rows(rate), dead, cycles, generator)
+    return _image(counts, rate).to(rate.dtype), drawn
 
 
 def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Generator | None = None) -> Tensor:
@@ -125,12 +151,13 @@ class SynchronousSPAD(RandomSensor):
 
     The input is the rate of an always-armed detector: signal, ambient light and dark counts, as `PhotonBudget` gives
     it. `gate`: (T,) profile between 0 and 1 that multiplies the rate (bins before the gate opens do not pile up).
-    `dead_time_s` with `axis` or `bin_width_s`: several detections per cycle, the detector being armed at the start of
-    each; without it, the first photon of a cycle is the only one (dead until the next cycle).
+    `dead_time_s` with `axis` or `bin_width_s`: several detections per cycle (`detections_with_dead_time`), the detector
+    being armed at the start of each; without it, the first photon of a cycle is the only one (dead until the next).
 
-    Policies: all four. The normal surrogate has the covariance of the multinomial (with a dead time: independent bins
-    with variance N d (1 - d)). The score is exact, with a dead time if dead time/bin width + 1/2 is whole, else it
-    takes the re-arming of a share of cycles on average. Afterpulses and crosstalk are modules of their own, behind.
+    Policies: all four. The normal surrogate has the covariance of the cycles, between bins too; the score is that of
+    the draws, bin by bin. With a dead time `log_prob` is that of every bin given those before it, exact but for where
+    in a bin detections lay; `inverse` needs a dead time of at least one bin. Afterpulses and crosstalk are modules of
+    their own, behind.
     """
 
     takes, gives = ("rate",), "counts"
@@ -158,7 +185,7 @@ class SynchronousSPAD(RandomSensor):
         if dead_time_s is not None:
             dead = check_seconds(dead_time_s, "dead_time_s", "SynchronousSPAD")
             self.dead_bins = dead / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
-            split_dead_time(self.dead_bins)  # says what is wrong with a dead time that is too short
+            check_dead_bins(self.dead_bins)
         if gate is not None:
             if not isinstance(gate, Tensor) or gate.ndim != 1:
                 shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
@@ -189,12 +216,20 @@ class SynchronousSPAD(RandomSensor):
 
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
-        variance: Tensor = self.cycles * p * (1 - p)
-        return variance
+        variance = p * (1 - p)
+        if self.dead_bins is not None and self.dead_bins < 1 and x.numel():
+            # a cycle may fire twice in a bin
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            variance = variance + 2 * _image(double_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
+        return variance * self.cycles
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.dead_bins is not None:
-            return super().gaussian(x, generator)
+            rate = self._gated(x)
+            if rate.numel() == 0:
+                return rate * self.cycles
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            return _image(gaussian_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
         p = self.probabilities(x)
         return p * self.cycles + multinomial_noise(p, self.cycles, generator)
 
@@ -203,6 +238,20 @@ class SynchronousSPAD(RandomSensor):
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         return first_photon_log_prob(measurement, self._gated(x), self.cycles, self.dead_bins).sum(TIME)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        if self.grad != "score" or self.dead_bins is None:
+            return super().forward(x, generator)
+        check_generator(generator, "SynchronousSPAD")
+        with torch.no_grad():
+            measurement, drawn = _drawn(self._gated(x), self.cycles, self.dead_bins, generator)
+
+        def log_prob() -> Tensor:
+            rate, dead = _rows(self._gated(x)), torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            return score_of_cycles(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
+
+        record_score(log_prob, type(self).__name__)
+        return measurement
 
     def inverse(self, counts: Tensor) -> CoatesEstimate:
         """The rate behind a histogram (`coates`), divided by the gate; bins where the gate is shut are not valid."""
@@ -218,6 +267,13 @@ class SynchronousSPAD(RandomSensor):
         return f"cycles={self.cycles}, dead_time_s={self.dead_time_s}, {super().extra_repr()}"
 
 
+def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
+    """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
+    if dead_bins is None:
+        return cycles - sum_before(counts)
+    return armed_time(counts, cycles, float(dead_bins)).exposed
+
+
 @in_single
 def first_photon_log_prob(
     counts: Tensor,
@@ -231,26 +287,27 @@ def first_photon_log_prob(
     """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)). (..., C, T, H, W).
 
     Its sum over time is that of the histogram. `constant` False leaves the binomial coefficient out, which does not
-    depend on the rate. Concave in the rate. Values and gradients are finite wherever counts are possible; a count at
-    rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than `cycles`
-    cycles.
+    depend on the rate. Concave in the rate. With `dead_bins`, cycles that come back inside a bin count for the part of
+    it in which they could fire: linear in the counts, greatest where the mean is right, to second order in the photons
+    of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are possible; a count
+    at rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than
+    `cycles` cycles.
     """
     number = check_count(cycles, "cycles", where)
-    armed = armed_cycles(counts.detach(), number, dead_bins)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
-    quiet = armed - n
-    # with a fractional dead time the armed cycles are known on average only
-    whole = dead_bins is None or float(split_dead_time(dead_bins)[1]) < 1e-6
-    if bool((quiet < (-0.5 if whole else -0.5 - 6 * number**0.5)).any()):
-        raise UnitError(
-            f"{where}: expected counts of at most {number} cycles, got a pixel with more detections "
-            "than armed cycles. Check cycles and the dead time."
-        )
+    if dead_bins is None:
+        sooner, exposed = torch.zeros_like(r), number - sum_before(n.detach())
+    else:
+        time = armed_time(n.detach(), number, float(dead_bins))
+        sooner, exposed = time.sooner(r), time.exposed
+    quiet = exposed - n
+    # with a dead time the armed cycles are known on average only
+    check_cycles(quiet, number, -0.5 if dead_bins is None else -0.5 - 6 * number**0.5, where)
     quiet = quiet.clamp_min(0)
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
     fire = torch.where(hit, -torch.expm1(-r), torch.ones_like(r))
-    value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * quiet
+    value = torch.where(hit, n * fire.log(), torch.zeros_like(r)) - r * quiet - sooner
     if constant:
         value = value + torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
     return value.to(rate.dtype)

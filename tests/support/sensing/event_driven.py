@@ -202,10 +202,15 @@ class Agreement(NamedTuple):
 
     total_variation: float
     noise: float
+    spread: float  # standard deviation of `noise`, as if bins were independent: it counts where they are few
 
     @property
     def ratio(self):
         return self.total_variation / self.noise
+
+    def within(self, factor=1.5, exact=0.0):
+        """Whether noise explains it: up to `factor` times the expected noise, and `exact` for what a chain claims."""
+        return self.total_variation <= max(factor * self.noise, self.noise + 4 * self.spread) + exact
 
 
 def compare(events, expected):
@@ -224,7 +229,9 @@ def compare(events, expected):
     # mean of the size of a normal number; a bin of which nothing was seen has the noise of its expectation
     variance = np.maximum(counts.var(0, ddof=1), (counts.sum(0) == 0) * expected / events.periods)
     noise = np.sqrt(2 / np.pi * variance / events.runs).sum()
-    return Agreement(0.5 * np.abs(counts.mean(0) - expected).sum() / total, 0.5 * noise / total)
+    spread = np.sqrt((1 - 2 / np.pi) * variance.sum() / events.runs)
+    far = np.abs(counts.mean(0) - expected).sum()
+    return Agreement(*(0.5 * float(value) / total for value in (far, noise, spread)))
 
 
 # --- photons --------------------------------------------------------------------------------------------------------
