@@ -36,6 +36,7 @@ CAPTIONS = {
     "Crosstalk": "neighbours fire it",
     "TDC": "codes of unequal width",
     "ItofCorrelation": "electrons of each tap",
+    "TapDifference": "A - B of each exposure",
     "PixelElectronics": "noise, full well, numbers",
     "PolarizationMosaic": "one analyser per pixel",
     "SweepJitter": "sweeps start early or late",
@@ -92,7 +93,7 @@ def draw_panel(
     """One pixel behind one stage."""
     bins = mean.numel()
     axes.tick_params(labelsize=7)
-    if bins <= 16:
+    if bins <= 20:
         axes.bar(range(bins), mean.tolist(), color="tab:blue", alpha=0.4)
         if drawn is not None:
             axes.plot(range(bins), drawn.tolist(), ".", color="tab:orange")
@@ -108,7 +109,7 @@ def draw_panel(
     shown = mean if before is None else torch.stack([mean, before]).amax(0)
     top = float(shown.max())
     axes.set_yscale("log")
-    axes.set_ylim(max(float(mean.min()) / 3, 3e-5 * top), 3 * top)
+    axes.set_ylim(max(float(mean.min()) / 3, (3e-5 if bins > 400 else 1e-6) * top), 3 * top)
     if timed and bins > 400:  # where something happens, so that bins can be seen
         axes.set_xlim(where[round(0.26 * bins)], where[round(0.52 * bins)])
     axes.set_xlabel("ns" if timed else "gate", fontsize=8)
@@ -131,6 +132,7 @@ def device_row(name: str) -> Figure:
     sensor = device.sensor()
     mean = light_of(name, sensor, axis)
     takes = device.description.split("Takes ")[-1].split(",")[0].split(".")[0].replace("the expected ", "")
+    takes = "radiance" if "radiance" in takes else takes
     panels: list[tuple[str, str, Tensor, Tensor | None, Tensor | None, str]]
     panels = [("light", takes, pixel(mean), None, None, "S0 to S3")]
     drawn, is_drawn, random = mean, False, torch.Generator().manual_seed(0)
@@ -158,7 +160,7 @@ def device_row(name: str) -> Figure:
 def pixel(values: Tensor) -> Tensor:
     """What is drawn of (..., C, T, H, W): the middle pixel, or all of a picture without time."""
     if values.shape[-3] == 1:
-        return values.flatten() if values.numel() <= 16 else values.flatten(-2)[..., 0].flatten()
+        return values.flatten() if values.numel() <= 20 else values.flatten(-2)[..., 0].flatten()
     return values[..., values.shape[-2] // 2, values.shape[-1] // 2].flatten()
 
 
