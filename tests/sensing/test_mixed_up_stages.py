@@ -319,6 +319,11 @@ NANOSECONDS = {
     "picometres": lambda: budget(axis=AXIS, wavelength_m=532e-12),
     "millimetres": lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, 1e-10),
     "millimetres, aperture": lambda: sensing.Optics.from_aperture(25e-3, 12.5, 1e-10),
+    "codes in seconds": lambda: sensing.TDC(torch.full((128,), 100 * PS)),
+    "codes in picoseconds": lambda: sensing.TDC(torch.full((128,), 100.0)),
+    "millimetres of depth": lambda: sensing.read_itof(torch.ones(1, 8, 1, 1), (80e6, 60e6), 4, max_depth_m=7000.0),
+    "one frequency, two ranges": lambda: sensing.unwrap_depth(torch.ones(1, 1, 1, 1), (80e6,), max_depth_m=4.0),
+    "frames of another sensor": lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
     "square micrometres": lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
 }
 

@@ -95,6 +95,11 @@ class TDC(MovedCounts):
         widths = code_widths.detach().double()
         if not bool((widths > 0).all()) or not bool(torch.isfinite(widths).all()):
             raise UnitError("TDC: expected code_widths > 0, finite, relative to the bin (mean about 1).")
+        if not 0.1 <= float(widths.mean()) <= 10:
+            raise UnitError(
+                f"TDC: expected code_widths relative to the bin (mean about 1), got a mean of {float(widths.mean()):g}."
+                " Seconds or picoseconds? Divide them by the bin."
+            )
         check_choice(acts_on, ActsOn, "acts_on", "TDC")
         check_choice(boundary, Boundary, "boundary", "TDC")
         self.acts_on: ActsOn = acts_on
