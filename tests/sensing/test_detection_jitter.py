@@ -87,7 +87,7 @@ def test_draws_have_mean_and_covariance_of_moved_counts(level, boundary):
 
 def test_no_count_is_lost_or_halved_in_an_image():
     """Sparse and dense blocks, both dtypes, an image of many columns and a batch."""
-    for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 70), 40.0), ((3, 2, 16, 2, 2), 1e5)):
+    for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 40), 40.0), ((3, 2, 16, 2, 2), 1e5)):
         for dtype in (torch.float32, torch.float64):
             x = torch.poisson(torch.full(shape, level, dtype=dtype), generator=generator(1))
             y = jitter().sample(x, generator(2))
