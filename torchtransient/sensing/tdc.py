@@ -95,6 +95,11 @@ class TDC(MovedCounts):
         widths = code_widths.detach().double()
         if not bool((widths > 0).all()) or not bool(torch.isfinite(widths).all()):
             raise UnitError("TDC: expected code_widths > 0, finite, relative to the bin (mean about 1).")
+        if not 0.1 <= float(widths.mean()) <= 10:
+            raise UnitError(
+                f"TDC: expected code_widths relative to the bin (mean about 1), got a mean of {float(widths.mean()):g}."
+                " Seconds or picoseconds? Divide them by the bin."
+            )
         check_choice(acts_on, ActsOn, "acts_on", "TDC")
         check_choice(boundary, Boundary, "boundary", "TDC")
         self.acts_on: ActsOn = acts_on
@@ -162,9 +167,8 @@ class TDC(MovedCounts):
 
     def expected(self, x: Tensor) -> Tensor:
         bins = self._check(x).shape[TIME]
-        work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-        bands = self.bands.to(work.dtype)
-        total, periodic = torch.zeros_like(work), self.goes_round
+        bands = self.bands.to(x.dtype)
+        total, periodic = torch.zeros_like(x), self.goes_round
         for b, column in enumerate(bands.view(bins, -1, 1, 1).unbind(1)):
             # code k gets light of the true bin k + offset
             offset = self.first + b
@@ -174,8 +178,8 @@ class TDC(MovedCounts):
                 low, high = max(0, true - offset), min(bins, true + bins - offset)
                 if low < high:
                     codes = total.narrow(TIME, low, high - low)
-                    codes.addcmul_(column[low:high], work.narrow(TIME, low + offset - true, high - low))
-        return total.to(x.dtype)
+                    codes.addcmul_(column[low:high], x.narrow(TIME, low + offset - true, high - low))
+        return total
 
     def moves(self, x: Tensor) -> Moves:
         self._check(x)
