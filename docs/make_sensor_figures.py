@@ -135,6 +135,29 @@ def pile_up() -> None:
     save(figure, "pile_up.png")
 
 
+def order_of_effects() -> None:
+    """Jitter before and behind pile-up; ambient light before and behind the budget."""
+    axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 128)
+    response = sensing.TailedResponse(50 * PS, [90 * PS], [0.3])
+    light = column(6 * pulse(axis, 1.2 * NS, 60 * PS))
+    spad, jitter = sensing.SynchronousSPAD(1), sensing.DetectionJitter(response, axis)
+    spread = sensing.ImpulseResponse(response, axis)
+    figure, (left, right) = sheet(2, 4.2)
+    time_ns = axis.centers_s / NS
+    left.plot(time_ns, light.flatten() / 6, color="0.7", label="light")
+    left.plot(time_ns, jitter.expected(spad.expected(light)).flatten(), label="jitter behind the detector")
+    left.plot(time_ns, spad.expected(spread(light)).flatten(), "--", label="in front of it: too early")
+    left.set(title="6 photons a cycle", xlabel="time in ns", ylabel="share of cycles", xlim=(0.9, 1.9))
+    left.legend(fontsize=8)
+    ambient = column(torch.full((128,), 1e-3, dtype=torch.float64) + 0.2 * pulse(axis, 1.5 * NS, 60 * PS))
+    signal = ambient - 1e-3
+    right.plot(time_ns, (spread(signal) + 1e-3).flatten() * 1e3, label="background added behind the response")
+    right.plot(time_ns, spread(ambient).flatten() * 1e3, "--", label="in front of it: edges starve")
+    right.set(title="ambient light", xlabel="time in ns", ylabel="detections in 1000 cycles", ylim=(0, 3))
+    right.legend(fontsize=8)
+    save(figure, "order_of_effects.png")
+
+
 def dead_time() -> None:
     """Free-running detectors: shape and rate."""
     axis = tt.TimeAxis.from_seconds(0.0, 200 * PS, 250)
@@ -444,8 +467,8 @@ def polarization() -> None:
 PARTS: dict[str, Callable[[], None]] = {
     f.__name__: f
     for f in (
-        responses, pile_up, dead_time, after_detection, itof_codes, itof_depth, itof_pixels, electronics,
-        depth_estimators, gates, streak, polarization,
+        responses, order_of_effects, pile_up, dead_time, after_detection, itof_codes, itof_depth, itof_pixels,
+        electronics, depth_estimators, gates, streak, polarization,
     )
 }  # fmt: skip
 

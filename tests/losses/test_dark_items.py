@@ -67,12 +67,14 @@ def test_levels_of_items_in_every_loss(case):
 def test_a_model_without_light_has_a_slope(name, loss, dtype, count):
     """Every number of counts, in every precision: towards light where there are counts, to none where there are none.
 
-    The tangent at 1e-9 of the counts of a bin: slopes of a sum are at most 1e9. Of float16, whose numbers end at 65504,
-    the gradient is looked at before it is given in that. What Adam holds, the square, is a number of float32.
+    The tangent at 1e-9 of the counts of a bin: slopes of a sum are at most 1e9 (of float16, whose numbers end at 65504,
+    3e4; of rates per cycle, which are as many times more, and of many scales, the gradient is looked at before it is
+    given in that). What Adam holds, the square, is a number of float32.
     """
     x, y = torch.zeros(2, 1, 8, 2, 2, dtype=dtype), torch.full((2, 1, 8, 2, 2), count)
-    value, slope = slope_of(loss, x.float() if dtype == torch.float16 else x, y)
-    torch.testing.assert_close(value, loss(x, y), rtol=0, atol=0)
+    assert bool(torch.isfinite(loss(x, y)))
+    beyond = dtype == torch.float16 and name in (*PER_CYCLE, "multiscale_loss")
+    value, slope = slope_of(loss, x.float() if beyond else x, y)
     assert bool(torch.isfinite(value)) and bool((slope < 0).all() if count else (slope > 0).all())
     assert float(value) < 50 * 25 * CYCLES
     most = 1.01e9 * (CYCLES if name in PER_CYCLE else 1) / y.numel()

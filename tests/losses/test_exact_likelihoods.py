@@ -164,6 +164,14 @@ def test_a_bin_without_counts_has_its_mean_as_value_and_one_as_slope(loss, expos
     assert bool((slope == exposures).all())
 
 
+def test_slopes_of_half_precision_are_numbers():
+    """Of counts in the dark: 32768 of float16, which ends at 65504; a fit of float16 is one of its precision."""
+    for dtype, most in ((torch.float16, 2.0**15), (torch.bfloat16, 1.01e9)):
+        m = torch.zeros(1, 8, 4, 4, dtype=dtype, requires_grad=True)
+        losses.poisson_nll(m, torch.full(m.shape, 7), reduction="sum").backward()
+        assert m.grad.dtype == dtype and bool(torch.isfinite(m.grad).all()) and float(m.grad.abs().max()) <= most
+
+
 @each
 def test_the_tangent_in_the_dark(loss, exposures):
     """Continuous in value and slope where it begins, straight below, convex, and the formula above."""

@@ -185,6 +185,9 @@ def test_modules_are_the_functions():
     n, r = SynchronousSPAD(CYCLES).sample(rates(), seeded()), rates()
     pairs = [
         (PoissonNLL(), poisson_nll(r, n)),
+        (PoissonNLL(constant=True, reduction="sum"), poisson_nll(r, n, constant=True, reduction="sum")),
+        (FirstPhotonNLL(CYCLES, 4.5, constant=True), first_photon_nll(r, n, CYCLES, dead_bins=4.5, constant=True)),
+        (ReadNoiseNLL(3.0, constant=False), read_noise_nll(r, n, 3.0, constant=False)),
         (FirstPhotonNLL(CYCLES), first_photon_nll(r, n, CYCLES)),
         (FreeRunningNLL(CYCLES, 2.5), free_running_nll(r, n, CYCLES, 2.5)),
         (ReadNoiseNLL(3.0), read_noise_nll(r, n, 3.0)),

@@ -16,6 +16,7 @@ from torchtransient.errors import UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
+    check_flag,
     check_mask,
     check_number,
     check_option,
@@ -91,7 +92,7 @@ def first_photon_nll(
     measured = _exact(target, mask, dim)
     check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    level = dark_level(n, floor, number)
+    level = dark_level(n, floor, input, number)
     dark = None if level is None else _dark(n, r, level)
     near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead, constant=constant, where=where)
@@ -172,7 +173,7 @@ def free_running_nll(
             "got more. Check periods and dead time."
         )
     r = as_columns(floored(rate, floor, where), dim).to(torch.float64)
-    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, periods))
+    value = r * armed.clamp_min(0) - count_log(n, r, dark_level(n, floor, input, periods))
     return _reduce(value.to(rate.dtype).reshape(rate.shape), reduction, where, mask)
 
 
@@ -186,14 +187,17 @@ class FirstPhotonNLL(nn.Module):
         floor: float | None = None,
         dim: int | None = None,
         reduction: Reduction = "mean",
+        *,
+        constant: bool = False,
     ) -> None:
         super().__init__()
         where = "FirstPhotonNLL"
         check_held(reduction, dim, where)
         check_option("floor", floor, where, zero=True)
+        check_flag("constant", constant, where)
         self.cycles = check_whole("cycles", cycles, where, UnitError)
         self.dead_bins = None if dead_bins is None else _check_dead_time(dead_bins, where)
-        self.floor, self.dim, self.reduction = floor, dim, reduction
+        self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant
 
     def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
         return first_photon_nll(
@@ -202,6 +206,7 @@ class FirstPhotonNLL(nn.Module):
             self.cycles,
             dead_bins=self.dead_bins,
             floor=self.floor,
+            constant=self.constant,
             dim=self.dim,
             mask=mask,
             reduction=self.reduction,

@@ -3,15 +3,15 @@
 All take a prediction, rates or means (..., C, T, H, W), and measurements of the same shape: `(input, target)`, as torch
 and the other losses. They are exact, and finite with finite gradients at zero counts, in empty bins and of a model
 without any light. Where the model says "impossible" (a count where the mean is 0) the logarithm goes on as its tangent,
-from a mean of 1e-9 of the counts of the bin on (`count_log`): convex, with a slope, and no fit notices, since as many
-bins as that hold less than one count in all. A `floor` is a choice: in the unit of the mean, it is added to it and
-biases what is as dark as it (0 is the plain formula, infinite there). Counts below 0 (those of a normal surrogate)
-enter the same formulas, which are linear in them: the gradient stays unbiased. With `constant` there is no such
-formula, and they are an error. NaN in what counts, in counts or model, is NaN in the loss. Terms that do not depend on
-the mean are left out unless `constant`. Counts may be whole numbers, truth values of frames, or half precision; the
-loss is computed and returned in the precision of the more precise of the two, float32 at least. `dim`: where time is
-(`layouts.py`). `mask`: truth values that broadcast to the tensors, True counts (`comparison.py`). A measurement in the
-place of the prediction is an error where it shows (`check_prediction`).
+from a mean of 1e-9 of the counts of the bin on (`count_log`; 3e-5 of float16): convex, with a slope, and no fit
+notices, since as many bins as that hold less than one count in all. A `floor` is a choice: in the unit of the mean, it
+is added to it and biases what is as dark as it (0 is the plain formula, infinite there). Counts below 0 (those of a
+normal surrogate) enter the same formulas, which are linear in them: the gradient stays unbiased. With `constant` there
+is no such formula, and they are an error. NaN in what counts, in counts or model, is NaN in the loss. Terms that do not
+depend on the mean are left out unless `constant`. Counts may be whole numbers, truth values of frames, or half
+precision; the loss is computed and returned in the precision of the more precise of the two, float32 at least. `dim`:
+where time is (`layouts.py`). `mask`: truth values that broadcast to the tensors, True counts (`comparison.py`). A
+measurement in the place of the prediction is an error where it shows (`check_prediction`).
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ from torchtransient.losses.results import LIGHT, Light, reads
 # less than one count in a thousand million of them, more than a fit has, so that a fit of exact likelihoods is one of
 # these; and a slope of 1e9 has a square that single precision holds.
 LEAST_MEAN = 1e-9
+# Of predictions in float16, whose numbers of full precision go from 6e-5 to 65504: a slope that is one of them.
+_LEAST_IN_HALF = 2.0**-15
 # Smaller records are examples made by hand, where whole numbers say nothing.
 _A_RECORD = 64
 # Relative to the average of an item: small against noise, large enough that 1/floor stays a usable gradient.
@@ -106,11 +108,14 @@ def floored(model: Tensor, floor: Tensor | float | None, where: str) -> Tensor:
     return model if floor is None else model + check_level("floor", floor, model, where, zero=True)
 
 
-def dark_level(counts: Tensor, floor: object, exposures: int = 1) -> Tensor | None:
-    """Of each bin, the mean per exposure below which a logarithm goes on as its tangent; None with a floor."""
+def dark_level(counts: Tensor, floor: object, input: object, exposures: int = 1) -> Tensor | None:
+    """Of each bin, the mean per exposure below which a logarithm goes on as its tangent; None with a floor. `input`:
+    the prediction as it was given, in the precision that its gradient is given in.
+    """
     if floor is not None:
         return None
-    return (LEAST_MEAN / exposures * counts.detach().abs()).clamp_min(torch.finfo(counts.dtype).tiny)
+    least = _LEAST_IN_HALF if isinstance(input, Tensor) and input.dtype == torch.float16 else LEAST_MEAN
+    return (least / exposures * counts.detach().abs()).clamp_min(torch.finfo(counts.dtype).tiny)
 
 
 def count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
@@ -196,7 +201,7 @@ def poisson_nll(
     check_rates(mean, where)
     check_constant(counts, constant, where)
     m = floored(mean, floor, where)
-    value = m - count_log(counts, m, dark_level(counts, floor))
+    value = m - count_log(counts, m, dark_level(counts, floor, input))
     if constant:
         value = value + torch.lgamma(counts + 1)
     return _reduce(value, reduction, where, mask)
@@ -242,14 +247,30 @@ def read_noise_nll(
 class PoissonNLL(nn.Module):
     """`poisson_nll(input, target)` with its options held."""
 
-    def __init__(self, floor: float | None = None, dim: int | None = None, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        floor: float | None = None,
+        dim: int | None = None,
+        reduction: Reduction = "mean",
+        *,
+        constant: bool = False,
+    ) -> None:
         super().__init__()
         check_held(reduction, dim, "PoissonNLL")
         check_option("floor", floor, "PoissonNLL", zero=True)
-        self.floor, self.dim, self.reduction = floor, dim, reduction
+        check_flag("constant", constant, "PoissonNLL")
+        self.floor, self.dim, self.reduction, self.constant = floor, dim, reduction, constant
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
-        return poisson_nll(input, target, floor=self.floor, dim=self.dim, mask=mask, reduction=self.reduction)
+        return poisson_nll(
+            input,
+            target,
+            floor=self.floor,
+            constant=self.constant,
+            dim=self.dim,
+            mask=mask,
+            reduction=self.reduction,
+        )
 
 
 PoissonLoss = PoissonNLL
@@ -258,14 +279,29 @@ PoissonLoss = PoissonNLL
 class ReadNoiseNLL(nn.Module):
     """`read_noise_nll(input, target, read_noise)` with its options held."""
 
-    def __init__(self, read_noise: float, shot_noise: bool = True, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        read_noise: float,
+        shot_noise: bool = True,
+        reduction: Reduction = "mean",
+        *,
+        constant: bool = True,
+    ) -> None:
         super().__init__()
         check_held(reduction, None, "ReadNoiseNLL")
         check_flag("shot_noise", shot_noise, "ReadNoiseNLL")
+        check_flag("constant", constant, "ReadNoiseNLL")
         check_option("read_noise", read_noise, "ReadNoiseNLL", needed=True, square=True)
         self.read_noise, self.shot_noise, self.reduction = read_noise, shot_noise, reduction
+        self.constant = constant
 
     def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
         return read_noise_nll(
-            input, target, self.read_noise, shot_noise=self.shot_noise, mask=mask, reduction=self.reduction
+            input,
+            target,
+            self.read_noise,
+            shot_noise=self.shot_noise,
+            constant=self.constant,
+            mask=mask,
+            reduction=self.reduction,
         )

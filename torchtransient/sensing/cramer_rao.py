@@ -90,8 +90,9 @@ def crlb(
     parameters of the response, so that a device can be designed by them.
 
     Without background, in bins that are narrow beside a normal pulse, ``distance_m`` is `range_deviation_m`.
+    Memory: some ten numbers of 8 bytes for each pixel and bin.
     Not supported: dead times with several detections a cycle, free-running detectors, readout noise: `covariance_bound`
-    where their statistics are one of the two. Raises ShapeError, UnitError.
+    where their statistics are one of the two. Raises ShapeError, UnitError, DeviceError.
     """
     where = "crlb"
     _check_response(response, where)
