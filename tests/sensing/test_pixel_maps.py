@@ -225,7 +225,7 @@ def test_orders_that_are_none():
     light = budget(ambient_rate_hz=1e6)
     with pytest.raises(UnitError, match="PixelSkew with boundary='zero'"):
         Compose([light, PixelSkew(50e-12, AXIS, boundary="zero"), SynchronousSPAD(1000)])
-    with pytest.raises(UnitError, match=r"counts that a detector has drawn for .*DetectionSkew"):
+    with pytest.raises(UnitError, match="DetectionSkew behind the detector"):
         Compose([light, DetectionSkew(50e-12, AXIS), MacroPixel(SynchronousSPAD(1000), 4)])
     Compose([PixelSkew(50e-12, AXIS, boundary="zero"), light, PixelSkew(50e-12, AXIS), SynchronousSPAD(1000)])
 

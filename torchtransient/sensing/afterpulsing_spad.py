@@ -32,10 +32,12 @@ class AfterpulsingSPAD(WrappedDetector):
     without dead time) leaves the detector dead to the end of the cycle: only afterpulses of later cycles are seen. A
     closed gate stops them, too. `period_s` beyond the window: nothing is detected outside of the window.
 
-    To first order in the probability, releases are taken as independent of whether a photon has fired the detector
-    since the detection that they come from: right where most come later than the next dead time, or in dim light (see
-    docs/photon_counting.md for errors). Draws have the variance of the detector at that rate: afterpulses of the same
-    histogram vary as photons do.
+    Releases are taken as independent of whether a photon has fired the detector since the detection that they come
+    from: right in dim light, in constant light and where most delays are longer than the next dead time; else off by up
+    to a third of the probability, in total variation (see docs/photon_counting.md). Draws have the variance of the
+    detector at that rate: afterpulses vary as photons do, short by twice their share in dim light.
+
+    Raises UnitError for a dead time that is not the detector's, and for periods that do not go with the window.
     """
 
     detector: SynchronousSPAD | FreeRunningSPAD

@@ -56,6 +56,7 @@ ENTRIES = [
         random=True,
         errors=(
             (lambda: sensing.MeasuredDelays(torch.ones(2, 2), 1e-9), ShapeError),
+            (lambda: sensing.MeasuredDelays("delays.csv", 1e-9), ShapeError),
             (lambda: sensing.MeasuredDelays(torch.ones(3), 1e-9, floor=2.0), UnitError),
             (lambda: sensing.MeasuredDelays(-torch.ones(3), 1e-9), UnitError),
             (lambda: sensing.Afterpulsing([0.1, 0.1], [1e-9], 0.0, **WIDTH), ShapeError),
