@@ -135,6 +135,29 @@ def pile_up() -> None:
     save(figure, "pile_up.png")
 
 
+def order_of_effects() -> None:
+    """Jitter before and behind pile-up; ambient light before and behind the budget."""
+    axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 128)
+    response = sensing.TailedResponse(50 * PS, [90 * PS], [0.3])
+    light = column(6 * pulse(axis, 1.2 * NS, 60 * PS))
+    spad, jitter = sensing.SynchronousSPAD(1), sensing.DetectionJitter(response, axis)
+    spread = sensing.ImpulseResponse(response, axis)
+    figure, (left, right) = sheet(2, 4.2)
+    time_ns = axis.centers_s / NS
+    left.plot(time_ns, light.flatten() / 6, color="0.7", label="light")
+    left.plot(time_ns, jitter.expected(spad.expected(light)).flatten(), label="jitter behind the detector")
+    left.plot(time_ns, spad.expected(spread(light)).flatten(), "--", label="in front of it: too early")
+    left.set(title="6 photons a cycle", xlabel="time in ns", ylabel="share of cycles", xlim=(0.9, 1.9))
+    left.legend(fontsize=8)
+    ambient = column(torch.full((128,), 1e-3, dtype=torch.float64) + 0.2 * pulse(axis, 1.5 * NS, 60 * PS))
+    signal = ambient - 1e-3
+    right.plot(time_ns, (spread(signal) + 1e-3).flatten() * 1e3, label="background added behind the response")
+    right.plot(time_ns, spread(ambient).flatten() * 1e3, "--", label="in front of it: edges starve")
+    right.set(title="ambient light", xlabel="time in ns", ylabel="detections in 1000 cycles", ylim=(0, 3))
+    right.legend(fontsize=8)
+    save(figure, "order_of_effects.png")
+
+
 def dead_time() -> None:
     """Free-running detectors: shape and rate."""
     axis = tt.TimeAxis.from_seconds(0.0, 200 * PS, 250)
@@ -179,6 +202,39 @@ def after_detection() -> None:
     figure.colorbar(shown, ax=three, label="log10 of the counts")
     three.set(title="crosstalk: 2 %", xticks=[], yticks=[])
     save(figure, "after_detection.png")
+
+
+def macro_pixels() -> None:
+    """A zone of SPADs against one, coincidences, and afterpulses by three laws."""
+    axis = tt.TimeAxis.from_seconds(0.0, 250 * PS, 128)
+    x = column(3 * pulse(axis, 18 * NS, 1 * NS) + 3 / 128)
+    figure, (one, two, three) = sheet(3)
+    spad = sensing.SynchronousSPAD(1, dead_time_s=10 * NS, axis=axis)
+    times = axis.centers_s / NS
+    one.plot(times, x.flatten(), "0.6", lw=4, label="light")
+    one.plot(times, sensing.MacroPixel(spad, 100)(x).flatten(), label="100 SPADs")
+    one.plot(times, spad(x).flatten(), label="one SPAD")
+    one.set(title="6 photons a cycle, 3 of the pulse", xlabel="time in ns", ylabel="detections per cycle")
+    one.legend(fontsize=8)
+    for k in (1, 2, 3):
+        seen = sensing.CoincidencePixel(spad, 16, k, 2 * NS, axis=axis)(x).flatten()
+        two.semilogy(times, seen / seen.max(), label=f"{k} of 16 SPADs")
+    two.set(title="coincidences within 2 ns", xlabel="time in ns", ylabel="of the peak", ylim=(1e-4, 2))
+    two.legend(fontsize=8)
+    fine = tt.TimeAxis.from_seconds(0.0, 1 * NS, 3000)
+    laws = {
+        "one exponential": sensing.Afterpulsing(0.02, 100 * NS, 20 * NS, axis=fine),
+        "two exponentials": sensing.Afterpulsing([0.012, 0.008], [30 * NS, 400 * NS], 20 * NS, axis=fine),
+        "power law": sensing.Afterpulsing(
+            0.02, dead_time_s=20 * NS, delays=sensing.PowerLawDelays(1.2, 3e-6), axis=fine
+        ),
+    }
+    for name, law in laws.items():
+        three.loglog(fine.edges_s[1:] / NS, law.first_kernel(3000), label=name)
+    three.set(title="afterpulses: 2 %, dead for 20 ns", xlabel="ns after the detection", ylabel="in 1 ns")
+    three.set(xlim=(15, 3000), ylim=(1e-8, 2e-3))
+    three.legend(fontsize=8)
+    save(figure, "macro_pixels.png")
 
 
 def itof_codes() -> None:
@@ -444,8 +500,8 @@ def polarization() -> None:
 PARTS: dict[str, Callable[[], None]] = {
     f.__name__: f
     for f in (
-        responses, pile_up, dead_time, after_detection, itof_codes, itof_depth, itof_pixels, electronics,
-        depth_estimators, gates, streak, polarization,
+        responses, order_of_effects, pile_up, dead_time, after_detection, macro_pixels, itof_codes, itof_depth,
+        itof_pixels, electronics, depth_estimators, gates, streak, polarization,
     )
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.sensing.event_driven import dense_limit, last_phases, total_variation
+from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, free_running_state, nonparalyzable_histogram
 from torchtransient.sensing.banded_solve import solve_banded
@@ -200,17 +200,57 @@ def test_gradients_in_bright_light(flux, dead):
     assert torch.autograd.gradcheck(nonparalyzable_histogram, (x, d), rtol=1e-4, fast_mode=True, check_forward_ad=True)
 
 
-@pytest.mark.parametrize("which, flux, dead", [slow(0, 200.0, 9.6), (1, 50.0, 45.3), slow(2, 3000.0, 1.0)])
-def test_samples_in_bright_light(which, flux, dead):
-    x, cycles, repeats = image(flux * shapes()[which : which + 1]), 200, 2000
-    spad = FreeRunningSPAD(cycles, dead * 1e-10, bin_width_s=1e-10)
-    h = spad.sample(x.expand(repeats, *x.shape), torch.Generator().manual_seed(0)).squeeze()
-    mean, variance = spad.expected(x).flatten(), spad.variance(x).flatten()
-    assert float(variance.min()) >= 0
-    assert bool(((h.mean(0) - mean).abs() <= 5 * (variance / repeats).sqrt() + 1e-9).all())
-    # rare counts are Poisson: the variance of their variance has a term in their mean
-    spread = (variance * (1 + 2 * variance) / repeats).sqrt()
-    assert bool(((h.var(0) - variance).abs() <= 6 * spread + 1e-9).all())
+FANO_CASES = [
+    (3, 0.1, 20.3), (2, 100.0, 5.8),
+    *(slow(w, r, d) for w in (0, 2) for r in (1.0, 10.0) for d in (1.3, 20.3)),
+    slow(0, 100.0, 5.8), slow(2, 100.0, 32.0), slow(0, 30.0, 100.7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("which, flux, dead", FANO_CASES)
+def test_draws_are_those_of_one_detector(which, flux, dead):
+    """Mean, variance of bins and of totals of a train of a hundred periods; totals of independent periods are wider."""
+    row, periods, repeats = (flux * shapes()[which]).numpy(), 100, 400
+    x = image(double(row)[None])
+    spad = FreeRunningSPAD(periods, dead * 1e-10, bin_width_s=1e-10)
+    events = detect(np.random.default_rng(2), row, repeats, periods, dead, free_running=True, warm_up=30)
+    h = spad.sample(x.expand(repeats, *x.shape), torch.Generator().manual_seed(0)).view(repeats, BINS)
+    assert torch.equal(h, h.round()) and float(h.min()) >= 0
+    agreement = compare(events, h.mean(0).numpy() / periods)
+    # two noises of the same size
+    assert agreement.within(1.5 * 2**0.5, exact=1e-3), agreement
+    wanted, found = events.counts.sum(1).var(ddof=1), float(h.sum(1).var())
+    # whole numbers add a quarter to a total; a phase that is locked still knows after 100 periods where it began
+    assert abs(found - wanted) < 5 * 2 * wanted / repeats**0.5 + (0.3 if dead != 32.0 else 1.5)
+    ratio = (h.var(0).numpy() + 0.1) / (events.variance() + 0.1)
+    assert abs(np.median(ratio) - 1) < 0.15 and ratio.min() > 0.5 and ratio.max() < 2.0
+
+
+def test_totals_in_saturation():
+    """Renewal theory: a Fano factor of 1/(1 + n d)^2, 0.010 where independent periods have 0.41."""
+    n, dead, periods = 1.5, 6.0, 10_000
+    x = torch.full((400, 1, 64, 1, 1), n, dtype=torch.float64)
+    spad = FreeRunningSPAD(periods, dead * 1e-10, bin_width_s=1e-10)
+    for grad in ("straight_through", "gaussian"):
+        spad.grad = grad
+        totals = spad(x, generator=torch.Generator().manual_seed(0)).sum((1, 2, 3, 4))
+        assert float(totals.mean()) == pytest.approx(periods * 64 * n / (1 + n * dead), rel=1e-4)
+        assert float(totals.var() / totals.mean()) == pytest.approx(1 / (1 + n * dead) ** 2, rel=0.25)
+
+
+def test_trains_of_one_period_and_of_the_dark():
+    x = torch.zeros(2, 1, 16, 1, 3, dtype=torch.float64)
+    x[..., 1], x[..., 2] = 1e-14, 0.3
+    one = FreeRunningSPAD(1, 5e-10, bin_width_s=1e-10)
+    h = one.sample(x.expand(2, 1, 16, 500, 3), torch.Generator().manual_seed(0))
+    assert not h[..., :2].any()
+    mean = one.expected(x)[..., 2].sum((1, 2, 3))
+    assert float(h[..., 2].sum() / 1000) == pytest.approx(float(mean[0]), rel=0.06)
+    many = FreeRunningSPAD(10**8, 5e-10, bin_width_s=1e-10)
+    assert float(many.sample(x, torch.Generator().manual_seed(0))[..., 1].sum()) < 200
+    empty = torch.zeros(0, 1, 16, 2, 2)
+    for grad in ("gaussian", "straight_through", "expected"):
+        assert FreeRunningSPAD(5, 5e-10, bin_width_s=1e-10, grad=grad)(empty).shape == empty.shape
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_draws_have_mean_and_covariance_of_moved_counts(level, boundary):
 
 def test_no_count_is_lost_or_halved_in_an_image():
     """Sparse and dense blocks, both dtypes, an image of many columns and a batch."""
-    for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 70), 40.0), ((3, 2, 16, 2, 2), 1e5)):
+    for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 40), 40.0), ((3, 2, 16, 2, 2), 1e5)):
         for dtype in (torch.float32, torch.float64):
             x = torch.poisson(torch.full(shape, level, dtype=dtype), generator=generator(1))
             y = jitter().sample(x, generator(2))
@@ -115,6 +115,37 @@ def test_means_and_rates_stay_means():
         module = jitter(grad=policy)
         assert torch.equal(module(x, generator=generator()), module.expected(x))
     assert torch.equal(jitter().sample(x), jitter().expected(x))
+
+
+@pytest.mark.parametrize("shape", [(0, 1, 16, 2, 2), (1, 16, 0, 2), (2, 1, 16, 3, 0), (1, 1, 2, 2)])
+@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
+def test_empty_batches_and_windows_shorter_than_the_response(shape, policy):
+    x = torch.full(shape, 3.0, dtype=torch.float64)
+    late = tails() if shape[-3] > 1 else GaussianResponse(50 * PS, 900 * PS)
+    closed = DetectionJitter(late, bin_width_s=WIDTH, boundary="zero", grad=policy)
+    for module in (jitter(grad=policy), closed, TDC(torch.ones(shape[-3]), dither=True, grad=policy)):
+        y = module(x, generator=generator())
+        assert y.shape == x.shape
+        if shape[-3] == 1 and policy != "gaussian":
+            assert float(y.sum()) == pytest.approx(0 if module is closed else 12)
+    chain = Compose([SynchronousSPAD(10), jitter()], grad=policy)
+    assert chain(x, generator=generator()).shape == x.shape
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_broken_counts_are_refused(value):
+    """torch.binomial never returns from them."""
+    x = column([1.0, 2.0, value, 3.0])
+    for module in (jitter(grad="straight_through"), TDC(torch.ones(4), grad="straight_through")):
+        with pytest.raises(UnitError, match="expected finite counts"):
+            module(x, generator=generator())
+
+
+def test_counts_beyond_single_precision():
+    x = torch.full((1, 8, 2, 2), 3e7)
+    y = jitter().sample(x, generator())
+    assert y.dtype == torch.float32 and abs(float(y.double().sum()) / 96e7 - 1) < 1e-6
+    assert float(jitter().sample(1e6 * x.double(), generator()).sum()) == 96e13
 
 
 def test_half_precision_counts_are_moved_in_single():

@@ -92,7 +92,7 @@ def test_sums_are_those_of_events(mode, dead, total, weights):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
 @pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("free", 9.3), ("free", 41.2)])
+@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("several", 1.4), ("free", 9.3), ("free", 41.2)])
 def test_sums_everywhere(mode, dead, total, kind):
     rate, found = light(total, kind), []
     for seed in range(3):
@@ -203,10 +203,11 @@ def test_coincidences_are_those_of_events(mode, dead, total, weights, k, window)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
 @pytest.mark.parametrize("total", [1.0, 10.0, 100.0])
-@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("free", 9.3), ("free", 41.2)])
+@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("several", 4.4), ("free", 9.3), ("free", 41.2)])
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_coincidences_everywhere(mode, dead, total, kind, k):
-    rate, found = light(total, kind), []
+    # of SPADs that fire several times a cycle, detections are even in a bin up to about one photon in it
+    rate, found = light(min(total, 30.0) if mode == "several" else total, kind), []
     for seed in range(3):
         events = zone(np.random.default_rng(seed), mode, dead, rate, [1] * 16, 300)
         seen = coincidences(events, k, 3.4, in_step=mode != "free")

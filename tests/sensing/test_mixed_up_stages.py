@@ -107,10 +107,10 @@ def test_cycles_of_all_stages_agree():
         with pytest.raises(UnitError, match=r"1000 in stage '0' \(PhotonBudget\) and 99 in stage '1.*budget\.cycles"):
             sensing.Compose([budget(1000), spad])
     assert sensing.Compose([budget(1000), sensing.SynchronousSPAD(1000)])(torch.ones(1, 128, 1, 1)).shape[1] == 128
-    changed = sensing.device("vl53l8_like").changed("PhotonBudget", cycles=1000)
+    changed = sensing.device("vl53l8_like").changed("SynchronousSPAD", cycles=1000)
     with pytest.raises(UnitError, match="one number of cycles"):
         changed.sensor()
-    assert changed.changed("SynchronousSPAD", cycles=1000).sensor()
+    assert changed.changed("PhotonBudget", cycles=1000).sensor()
 
 
 def test_a_free_running_window_is_one_period():
@@ -210,12 +210,15 @@ def test_one_change_of_a_device_reaches_all_stages():
     stages = (
         {**kind, **numbers, "exposure_s": 1e-3},
         {"kind": "SynchronousSPAD", "cycles": "@cycles"},
-        {**after, "axis": "@axis", "period_s": "@period_s"},
+        {**after, "axis": "@axis", "period_s": "@period_s", "background": "@background"},
     )
     device = sensing.Device("linked", "", (), stages, 100e-12, 128)
     sensor = sensing.Device.from_json(device.to_json()).sensor()
     assert [s.cycles for s in list(sensor.stages)[:2]] == [10_000] * 2
     assert sensor.stages[2].period_s == pytest.approx(100 * NS)
+    assert sensor.stages[2].background == 0
+    bright = device.changed("PhotonBudget", ambient_rate_hz=1e6, quantum_efficiency=0.5).sensor()
+    assert bright.stages[2].background == pytest.approx(0.5e6 * 10_000 * 100 * PS)
     faster = device.changed("PhotonBudget", repetition_rate_hz=20e6).sensor()
     assert faster.stages[1].cycles == 20_000 and faster.stages[2].period_s == pytest.approx(50 * NS)
     for stage in stages[1:]:
@@ -231,6 +234,69 @@ def test_devices_agree_with_themselves(name):
 
 
 # --------------------------------------------------------------------------------------------------- seconds and hertz
+
+COUNTS = torch.tensor([0.0, 1.0, 9.0, 3.0, 0.0, 0.0])
+SPAD = sensing.SynchronousSPAD(100, dead_time_s=2 * NS, axis=AXIS)
+GAUSS = sensing.GaussianResponse(300 * PS)
+# everything that takes seconds, as it is meant
+SECONDS = {
+    "Afterpulsing": {
+        "probability": 0.01, "tau_s": 30 * NS, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS
+    },
+    "CoincidencePixel": {
+        "detector": SPAD, "spads": 4, "coincidence": 2, "window_s": 1 * NS, "bin_width_s": 100 * PS
+    },
+    "DetectionJitter": {"response": GAUSS, "bin_width_s": 100 * PS},
+    "DetectionSkew": {"delay_s": 70 * PS, "bin_width_s": 100 * PS},
+    "FreeRunningSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS},
+    "GatedIntegration": {"delays_s": [2 * NS], "widths_s": 1 * NS, "axis": AXIS, "rise_s": 200 * PS, "fall_s": 2 * NS},
+    "GaussianResponse": {"fwhm_s": 60 * PS, "delay_s": 1 * NS},
+    "ImpulseResponse": {"response": GAUSS, "bin_width_s": 100 * PS},
+    "MeasuredDelays": {"counts": COUNTS, "bin_width_s": 100 * PS, "start_s": 5 * NS},
+    "MeasuredResponse": {"counts": COUNTS, "bin_width_s": 4 * PS, "delay_s": 1 * NS},
+    "PhotonBudget": {
+        "optics": sensing.Optics(f_number=2.0), "pulse_energy_j": 1e-9, "wavelength_m": 532e-9,
+        "repetition_rate_hz": 10e6, "exposure_s": 1e-3, "bin_width_s": 100 * PS,
+    },
+    "PixelSkew": {"delay_s": -70 * PS, "bin_width_s": 100 * PS},
+    "PowerLawDelays": {"exponent": 1.1, "longest_s": 10e-6},
+    "StreakCamera": {"axis": AXIS, "time_fwhm_s": 200 * PS, "jitter_fwhm_s": 100 * PS},
+    "SweepJitter": {"jitter_fwhm_s": 100 * PS, "bin_width_s": 100 * PS},
+    "SynchronousSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS},
+    "TailedResponse": {"fwhm_s": 60 * PS, "tails_s": [80 * PS], "fractions": [0.1], "delay_s": 1 * NS},
+    "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
+    "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
+    "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
+    "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
+}  # fmt: skip
+# formulas that hold in any unit, what others compute, and devices, which say it when they are built
+OTHERS = {
+    "BudgetReport", "CramerRaoBound", "Device", "Response", "afterpulse_kernel", "emg_cdf", "emg_density",
+    "emg_survival", "gate_profiles", "resample_counts",
+}  # fmt: skip
+
+
+def seconds_of(name):
+    made = getattr(sensing, name)
+    names = inspect.signature(made.__init__ if inspect.isclass(made) else made).parameters
+    return [n for n in names if n.endswith("_s")]
+
+
+def test_nothing_that_takes_seconds_is_left_out():
+    public = {n for n, v in vars(sensing).items() if callable(v) and not n.startswith("_")}
+    assert {n for n in public if seconds_of(n)} == set(SECONDS) | OTHERS
+
+
+@pytest.mark.parametrize("unit", [1e12, 1e9], ids=["picoseconds", "nanoseconds"])
+@pytest.mark.parametrize("name, argument", [(n, a) for n in SECONDS for a in seconds_of(n) if a in SECONDS[n]])
+def test_seconds_in_another_unit_are_told(name, argument, unit):
+    made, given = getattr(sensing, name), SECONDS[name]
+    assert made(**given) is not None
+    value = given[argument]
+    other = [v * unit for v in value] if isinstance(value, list) else value * unit
+    with pytest.raises(UnitError, match=r"expected .* got "):
+        made(**{**given, argument: other})
+
 
 NANOSECONDS = {
     "jitter": lambda: sensing.GaussianResponse(0.06),
@@ -256,6 +322,11 @@ NANOSECONDS = {
     "picometres": lambda: budget(axis=AXIS, wavelength_m=532e-12),
     "millimetres": lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, 1e-10),
     "millimetres, aperture": lambda: sensing.Optics.from_aperture(25e-3, 12.5, 1e-10),
+    "codes in seconds": lambda: sensing.TDC(torch.full((128,), 100 * PS)),
+    "codes in picoseconds": lambda: sensing.TDC(torch.full((128,), 100.0)),
+    "millimetres of depth": lambda: sensing.read_itof(torch.ones(1, 8, 1, 1), (80e6, 60e6), 4, max_depth_m=7000.0),
+    "one frequency, two ranges": lambda: sensing.unwrap_depth(torch.ones(1, 1, 1, 1), (80e6,), max_depth_m=4.0),
+    "frames of another sensor": lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
     "square micrometres": lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
 }
 

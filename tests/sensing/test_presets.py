@@ -76,7 +76,8 @@ def test_derived_numbers():
     assert abs(SPEED_OF_LIGHT / (2 * math.gcd(*(int(f) for f in frequencies))) - 18.7) < 0.05
     # A binary frame takes 10 us; gates are whole steps of 17 ps apart.
     budget, gates = stage("spad512s_like", "PhotonBudget"), stage("spad512s_like", "GatedIntegration")
-    assert budget["cycles"] == gates["electrons_per_unit"] == round(budget["repetition_rate_hz"] * 10e-6)
+    assert budget["cycles"] == round(budget["repetition_rate_hz"] * 10e-6)
+    assert device("spad512s_like").sensor().stages[1].electrons_per_unit == budget["cycles"]
     assert all(abs(d / 17e-12 - round(d / 17e-12)) < 1e-6 for d in gates["delays_s"])
     assert gates["delays_s"][-1] + gates["widths_s"] < 600 * 50e-12
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
 import torch
 
 from torchtransient import sensing
@@ -59,13 +60,30 @@ def test_names_exist():
 def test_pictures_are_there_and_drawn_by_the_script():
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", TEXT)
     assert len(pictures) >= 12
-    script = (PAGE.parent / "make_sensor_figures.py").read_text(encoding="utf-8")
+    scripts = [PAGE.parent / f"make_{what}_figures.py" for what in ("sensor", "chain")]
+    script = "".join(path.read_text(encoding="utf-8") for path in scripts)
     for picture in pictures:
         path = PAGE.parent / picture
         assert path.read_bytes().startswith(b"\x89PNG")
         example = Path(__file__).parents[2] / "training_examples" / f"{path.stem}.py"
-        assert f'"{path.name}"' in script or example.exists()
+        of_device = path.parent.name == "chains" and path.stem in sensing.DEVICES
+        assert f'"{path.name}"' in script or example.exists() or of_device
+        assert not of_device or path.stat().st_size <= 200_000
 
 
-def test_all_devices_are_listed():
-    assert all(f"`{name}`" in TEXT for name in sensing.DEVICES)
+def test_all_devices_are_listed_and_drawn():
+    assert all(f"`{name}`" in TEXT and f"images/chains/{name}.png" in TEXT for name in sensing.DEVICES)
+
+
+@pytest.mark.parametrize("name", [n for n, d in sensing.DEVICES.items() if d.num_bins])
+def test_windows_and_wavelengths_are_those_of_the_devices(name):
+    """Three digits of each, in the second table of devices."""
+    device = sensing.device(name)
+    _, row = re.findall(rf"^\| [^|]*`{name}`.*$", TEXT, flags=re.MULTILINE)[:2]
+    window_s = device.num_bins * device.bin_width_s
+    assert f"{window_s * 1e9:.3g} ns" in row
+    assert f"{device.axis().end_opl / 2:.3g} m" in row
+    budget = next((s for s in device.stages if s["kind"] == "PhotonBudget"), None)
+    if budget:
+        assert f"{budget['wavelength_m'] * 1e9:.0f} nm" in row
+        assert f"of {1e9 / budget['repetition_rate_hz']:.0f} ns" in row

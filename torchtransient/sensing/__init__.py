@@ -10,6 +10,7 @@ from torchtransient.sensing.afterpulsing import hot_pixel_rates as hot_pixel_rat
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD as AfterpulsingSPAD
 from torchtransient.sensing.binary_frames import BinaryFrames as BinaryFrames
 from torchtransient.sensing.binary_frames import frames_to_rate as frames_to_rate
+from torchtransient.sensing.chains import counting_chain as counting_chain
 from torchtransient.sensing.coincidence import CoincidencePixel as CoincidencePixel
 from torchtransient.sensing.compose import Compose as Compose
 from torchtransient.sensing.compressed_histograms import CodedHistogram as CodedHistogram

@@ -58,16 +58,14 @@ class AddedCounts(RandomSensor):
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            given = check_tensor(x, type(self).__name__).detach()
-            counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+            counts = check_tensor(x, type(self).__name__).detach()
             events = self.share() * self._total(counts)
             if not is_whole(counts) or events > _MOST_EVENTS * counts.numel():
-                return given + self._poisson(self.extra(given), generator)
-            return self.trigger(counts, generator).to(x.dtype)
+                return counts + self._poisson(self.extra(counts), generator)
+            return self.trigger(counts, generator)
 
     def _total(self, counts: Tensor) -> float:
-        # float64 would copy all of it, half precision would overflow
-        total = float(counts.sum(dtype=torch.promote_types(counts.dtype, torch.float32)))
+        total = float(counts.sum())
         if not math.isfinite(total):
             raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
         return total
@@ -75,9 +73,7 @@ class AddedCounts(RandomSensor):
     def _poisson(self, mean: Tensor, generator: torch.Generator | None) -> Tensor:
         self._total(mean.detach())
         work = mean.detach().clamp_min(0)
-        if work.dtype in (torch.float16, torch.bfloat16):
-            work = work.float()
-        elif work.dtype == torch.float32 and work.numel() and float(work.amax()) > WHOLE_FLOAT32 / 2:
+        if work.dtype == torch.float32 and work.numel() and float(work.amax()) > WHOLE_FLOAT32 / 2:
             work = work.double()
         return fast_poisson(work, generator).to(mean.dtype)
 

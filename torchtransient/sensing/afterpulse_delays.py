@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import number_tensor
 from torchtransient.sensing.layout import check_number, check_seconds
 from torchtransient.sensing.sensor import PhysicalModule
 
@@ -173,7 +174,7 @@ class MeasuredDelays(AfterpulseDelays):
     def __init__(self, counts: Tensor, bin_width_s: float, *, start_s: float = 0.0, floor: float = 0.0) -> None:
         super().__init__()
         where = "MeasuredDelays"
-        counts = torch.as_tensor(counts)
+        counts = number_tensor(counts, f"{where}: expected counts (K,) of a histogram of delays")
         if counts.ndim != 1 or counts.numel() == 0:
             raise ShapeError(f"{where}: expected counts (K,) of a histogram of delays, got {tuple(counts.shape)}.")
         numbers = counts.detach().double()

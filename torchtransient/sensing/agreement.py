@@ -60,8 +60,9 @@ def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
     yield from walk(getattr(chain, "stages", chain), "")
 
 
-def check_stages(chain: nn.Module) -> None:
-    """UnitError for stages of which one is not made for what those before it give.
+def check_stages(chain: nn.Module) -> bool:
+    """UnitError for stages of which one is not made for what those before it give. Whether `check_window` has more to
+    say of light whose bins are known.
 
     Compared are bins, `cycles`, laser periods and quantities. What a module of another kind does to the light is not
     known, nor what a sensor does that has no `gives`: behind these, bins and quantities are compared anew.
@@ -74,8 +75,11 @@ def check_stages(chain: nn.Module) -> None:
             continue
         _check_quantity(light, stage)
         light = _after(stage, _same_bins(light, stage))
-    _check_cycles(_parts_of(chain))
+    parts = _parts_of(chain)
+    _check_cycles(parts)
     check_window(chain, None)
+    has_period = any(isinstance(getattr(part.sensor, "repetition_rate_hz", None), float) for part in parts)
+    return has_period and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
 
 
 def _parts_of(chain: nn.Module) -> list[Stage]:

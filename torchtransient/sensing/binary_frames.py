@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.floating import in_single
+from torchtransient.errors import UnitError
+from torchtransient.floating import holds, in_single
 from torchtransient.sensing.draws import WHOLE_FLOAT32, check_rates
 from torchtransient.sensing.layout import TIME, check_count, check_transient
 from torchtransient.sensing.policies import GradPolicy
@@ -16,9 +17,16 @@ from torchtransient.sensing.sensor import RandomSensor
 def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     """Photons per frame from the number of frames that saw any: -log(1 - counts/frames), any shape.
 
-    A pixel that fired in every frame is given the rate of a share 1 - 1/(2 frames). Differentiable.
+    A pixel that fired in every frame is given the rate of a share 1 - 1/(2 frames). Differentiable. Raises UnitError
+    for more counts than frames.
     """
     number = check_count(frames, "frames", "frames_to_rate")
+    # a normal surrogate goes beyond all frames by some standard deviations, of which half the root is the largest
+    if not holds(~(counts.detach() > number + 1 + 3 * number**0.5)):
+        raise UnitError(
+            f"frames_to_rate: expected at most as many counts as the {number} frames, got {float(counts.max()):g}. "
+            "Give the frames of the sensor that counted: BinaryFrames.frames."
+        )
     return -torch.log1p(-(counts / number).clamp(0, 1 - 1 / (2 * number)))
 
 

@@ -80,11 +80,12 @@ class CoincidencePixel(RandomSensor):
     `weights` as of `MacroPixel`; `window_s` is at most the dead time, so that a line goes up once in a window, and at
     most the window of bins. A `coincidence` of 1 is an OR of all lines: detections of others are lost while it is up.
 
-    The mean is exact for independent SPADs in any light (to 2e-4 for 40 photons in one bin, 0.1 for 120): detections of
-    each SPAD times the chance that `coincidence` - 1 of the others have detected within the window before. In constant
-    light of r detections per second of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is
-    spread evenly; detections are so too, except those of one per cycle, of which the first photons of a bin are the
-    first. Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
+    The mean is exact for independent SPADs in any light: detections of each SPAD times the chance that
+    `coincidence` - 1 of the others have detected within the window before. In constant light of r detections per second
+    of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; detections are
+    taken so too, except those of one per cycle, of which the first photons of a bin are the first: with a dead time,
+    use bins of at most one photon a SPAD. Integrals over a bin are right to 2e-4 for 40 photons in one, to 0.1 for 120.
+    Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
 
     Samples are independent binomials of the cycles, with the exact mean: neighbouring bins of a cycle exclude each
     other a little, which they leave out. Policies: all. Raises UnitError for more SPADs in coincidence than there are,

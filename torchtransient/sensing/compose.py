@@ -52,7 +52,7 @@ class Compose(Sensor):
             raise ShapeError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
         check_order(stages, "Compose")
         self.stages = nn.ModuleList(stages)
-        check_stages(self)
+        self._window_is_open = check_stages(self)
         if grad is not None:
             self.set_grad(grad)
 
@@ -139,7 +139,7 @@ class Compose(Sensor):
         else:
             y, used = self._opened(x)
             stages = stages[used:]
-        if y.ndim >= 4:
+        if self._window_is_open and y.ndim >= 4:
             check_window(self, y.shape[TIME])
         while stages:
             y, used = at_once(stages, y) if at_once is not None else (y, 0)

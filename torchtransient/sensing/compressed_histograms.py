@@ -104,8 +104,7 @@ class CodedHistogram(Sensor):
         check_transient(x, f"CodedHistogram.{name}")
         if x.shape[TIME] != matrix.shape[1]:
             raise ShapeError(f"CodedHistogram.{name}: expected dimension -3 of {matrix.shape[1]}, got {x.shape[TIME]}.")
-        work = torch.float32 if x.dtype in (torch.float16, torch.bfloat16) else x.dtype
-        return _coded_sums(x.to(work), matrix.to(work)).to(x.dtype)
+        return _coded_sums(x, matrix.to(x.dtype))
 
     def expected(self, x: Tensor) -> Tensor:
         return self._apply_matrix(self.codes, x, "expected")

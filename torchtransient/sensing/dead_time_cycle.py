@@ -85,24 +85,24 @@ class _Levels(torch.autograd.Function):
         return _Levels.apply(level, True), None  # type: ignore[no-untyped-call]
 
 
-def row_levels(rate: Tensor, least: int) -> tuple[Tensor, list[int], bool]:
+def row_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tensor, list[int], bool]:
     """(level of each row (P,), levels that there are, whether they are hidden): rows are cut in `least` 2^level."""
-    peak = torch.nan_to_num(rate.detach().amax(-1), nan=0.0) / (PHOTONS * least)
+    peak = torch.nan_to_num(rate.detach().amax(-1), nan=0.0) / (photons * least)
     level = torch.ceil(torch.log2(peak.clamp(1, 2.0**40)) - 1e-9).long()
     found = _Levels.apply(level, False).tolist()  # type: ignore[no-untyped-call]
     present = [k for k, number in enumerate(found[1:]) if number]
     if present and (least << present[-1]) > MOST_PIECES:
         raise TorchTransientError(
-            f"detections_with_dead_time: expected at most {PHOTONS * MOST_PIECES:g} photons in a bin, got "
-            f"{float(peak.amax()) * PHOTONS * least:g}. Use narrower bins, or less light."
+            f"detections_with_dead_time: expected at most {photons * MOST_PIECES:g} photons in a bin, got "
+            f"{float(peak.amax()) * photons * least:g}. Use narrower bins, or less light."
         )
     return level, present, bool(found[0])
 
 
-def rows_by_level(rate: Tensor, dead: float) -> Iterator[tuple[Tensor | None, int]]:
+def rows_by_level(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
     """(indices of rows, None for all; pieces of their bins) of every level that there is."""
     least = 1 if dead >= 1 - 1e-9 else 2
-    level, present, _ = row_levels(rate, least)
+    level, present, _ = row_levels(rate, least, photons)
     for k in present:
         yield (None if len(present) == 1 else (level == k).nonzero().squeeze(-1)), least << k
 

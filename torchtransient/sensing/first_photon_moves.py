@@ -45,7 +45,7 @@ def _watched(stage: nn.Module) -> bool:
 
 def moved_probabilities(spad: SynchronousSPAD, moves: Sequence[MovedCounts], x: Tensor) -> Tensor:
     """Probability of each time stamp in a cycle, in single precision at least."""
-    p = spad.probabilities(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
+    p = spad.probabilities(x)
     for stage in moves:
         p = stage.expected(p)
     return p

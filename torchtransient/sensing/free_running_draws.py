@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +35,10 @@ class Path:
     fired: Tensor  # of `armed`
     soon: Tensor  # of `back`
     late: Tensor
+    # left behind: armed at the end, armed again in each bin of some later period, and starts of periods missed by these
+    end: Tensor
+    wrapped: Tensor
+    missed: Tensor
 
     @property
     def counts(self) -> Tensor:
@@ -79,7 +84,22 @@ def step_chances(
     )
 
 
-def draw_path(chances: BinChances, periods: int, generator: torch.Generator | None) -> Path:
+def binomial_share(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.binomial(number, chance, generator=generator)
+
+
+def normal_share(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Normal numbers with mean and variance of `binomial_share`."""
+    z = torch.randn(number.shape, dtype=number.dtype, device=number.device, generator=generator)
+    return number * chance + (number.clamp_min(0) * chance * (1 - chance)).sqrt() * z
+
+
+def draw_path(
+    chances: BinChances,
+    periods: int,
+    generator: torch.Generator | None,
+    share: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = binomial_share,
+) -> Path:
     """`periods` detectors, each run over one period."""
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
@@ -90,19 +110,25 @@ def draw_path(chances: BinChances, periods: int, generator: torch.Generator | No
         armed = begin.select(TIME, 0)
         returning = list(begin.unbind(TIME)[1:])
     taken: list[list[Tensor]] = [[], [], [], [], []]
+    wrapped, missed = [torch.zeros_like(armed)] * bins, torch.zeros_like(armed)
     for k in range(bins):
         back = returning[k]
-        fired = torch.binomial(armed, chances.fire.select(TIME, k), generator=generator)
-        soon = torch.binomial(back, chances.soon.select(TIME, k), generator=generator)
+        fired = share(armed, chances.fire.select(TIME, k), generator)
+        soon = share(back, chances.soon.select(TIME, k), generator)
         hit = fired + soon
-        late = torch.binomial(hit, chances.late.select(TIME, k), generator=generator)
+        late = share(hit, chances.late.select(TIME, k), generator)
         for column, value in zip(taken, (armed, back, fired, soon, late), strict=True):
             column.append(value)
         for slot, amount in ((k + chances.whole, hit - late), (k + chances.whole + 1, late)):
-            if slot < bins:
-                returning[slot] = returning[slot] + amount
+            rounds, place = divmod(slot, bins)
+            if rounds:
+                wrapped[place] = wrapped[place] + amount
+                missed = missed + rounds * amount
+            else:
+                returning[place] = returning[place] + amount
         armed = armed + back - hit
-    return Path(begin, *(torch.stack(column, TIME) for column in taken))
+    steps = [torch.stack(column, TIME) for column in (*taken, wrapped)]
+    return Path(begin, steps[0], steps[1], steps[2], steps[3], steps[4], armed, steps[5], missed)
 
 
 def log_likelihood(count: Tensor, chance: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torchtransient.sensing.dead_time_cycle import whole_and_part
 from torchtransient.sensing.renewal_chain import RenewalChain
 from torchtransient.sensing.stationary_phases import stationary_phases
 
-_DARK = 1e-12  # photons per period; below, detections equal photons
+DARK = 1e-12  # photons per period; below, detections equal photons
 _BELOW_ZERO = 1e-5  # of the largest bin: counts as far below zero show bins too wide for what is in them
 _SETTLED = 1e-2  # of all counts: change from pieces twice as wide, some ten times the error that is left
 _FINEST = 32
@@ -37,7 +37,7 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
     until counts settle. Raises TorchTransientError when they do not with 32 pieces.
     """
     # a dark pixel has no phases; its limit is one photon, at most, per many periods
-    dark = rate.detach().sum(-1, keepdim=True) < _DARK
+    dark = rate.detach().sum(-1, keepdim=True) < DARK
     safe = torch.where(dark, torch.full_like(rate, 1.0 / rate.shape[-1]), rate)
     state = _solved(safe, dead_bins, 1)
     low, high = state.detected.detach().aminmax(dim=-1)
@@ -69,18 +69,28 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
     return FreeRunningState(detected, armed, late, state.whole)
 
 
+def per_period(chain: RenewalChain, lines: Tensor) -> Tensor:
+    """Stationary lines whose counts sum to 1 -> detections per period."""
+    # from one detection to the next a detector is dead, then armed
+    return lines * (chain.bins / (chain.whole + chain.part + chain.waiting(lines)))
+
+
+def late_lines(lines: Tensor, part: Tensor) -> Tensor:
+    """Of detections on lines (P, 2 T): those that are armed again after one bin more than the whole dead time."""
+    bins = lines.shape[-1] // 2
+    return part * lines[:, :bins] + math.sqrt(3.0) * (1 - part) * part * lines[:, bins:]
+
+
 def _solved(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
     """With every bin cut in `pieces` of equal rate, and put together again."""
     pixels, bins = rate.shape
     fine = (rate / pieces).repeat_interleave(pieces, -1) if pieces > 1 else rate
     whole, part = whole_and_part(dead_bins * pieces)
     part = part.to(rate.device)
-    lines = stationary_phases(fine, part, whole)
     chain = RenewalChain(fine, whole, part)
-    # from one detection to the next a detector is dead, then armed
-    scale = bins * pieces / (whole + part + chain.waiting(lines))
-    count, slope = (lines * scale).view(pixels, 2, bins, pieces).unbind(1)
-    armed = chain.at_start(chain.inflow(lines * scale)).view(pixels, bins, pieces)[..., 0]
+    lines = per_period(chain, stationary_phases(fine, part, whole))
+    count, slope = lines.view(pixels, 2, bins, pieces).unbind(1)
+    armed = chain.at_start(chain.inflow(lines)).view(pixels, bins, pieces)[..., 0]
     first = 1 - part
     soon = first * count - math.sqrt(3.0) * first * part * slope  # detected in the first 1 - part of a piece
     place = torch.arange(pieces, device=rate.device) + whole % pieces

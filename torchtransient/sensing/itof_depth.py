@@ -205,7 +205,8 @@ def unwrap_depth(
     default. With noise around zero depth give a ``min_depth_m`` a little below zero.
 
     The whole turns are detached; the gradient is that of the least-squares depth in the phases. Memory does not grow
-    with the number of candidates. Raises ShapeError for a wrong F, UnitError for an empty range.
+    with the number of candidates. Raises ShapeError for a wrong F, UnitError for an empty range, and for one over which
+    the phases repeat.
     """
     me = "unwrap_depth"
     values = check_frequencies(frequencies_hz, me)
@@ -214,6 +215,12 @@ def unwrap_depth(
     longest = float(min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m)
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
+    # a tenth more leaves room for noise at both ends
+    if longest - min_depth_m > 1.1 * unambiguous_range_m(values):
+        raise UnitError(
+            f"{me}: expected max_depth_m - min_depth_m of at most {unambiguous_range_m(values):.4g} m, after which the "
+            f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
+        )
     weight = [1.0] * len(values) if weights is None else [float(w) for w in weights]
     if len(weight) != len(values) or not all(w > 0 for w in weight):
         raise UnitError(f"{me}: expected {len(values)} positive weights, got {weights!r}.")

@@ -7,11 +7,13 @@ entries that reach them; the others part in halves of nearly equal weight, which
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchtransient.errors import UnitError
 from torchtransient.sensing.added_counts import is_whole
 from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces
 from torchtransient.sensing.layout import TIME, check_transient
@@ -21,7 +23,9 @@ from torchtransient.sensing.thinning import halve, thin
 from torchtransient.sensing.time_convolution import Boundary
 
 _BLOCK = 1 << 18  # entries at a time, so that temporaries stay in the cache
-_RARE = 0.05  # share of a branch below which single events are sought instead of tossing coins for all
+_RARE = 0.3  # counts of an entry in a branch, on average, below which single events are sought
+_TURNED = 1.0  # coins of an entry that an uneven share turns, on average, above which tossing them does not pay
+_TOSSED = (0.7, 60.0)  # counts of an entry, on average, between which it pays
 _FEW = 0.25  # share of occupied entries below which these alone are followed
 
 
@@ -87,6 +91,8 @@ def move_counts(
     """
     given = counts.detach()
     bins, shape = given.shape[TIME], given.shape
+    if given.numel() == 0:
+        return given.clone(), given.new_zeros(moves.shares.shape[0], *shape[:TIME], *shape[-2:]) if tally else None
     data = given.reshape(-1, bins, shape[-2] * shape[-1])
     tallies: Tensor | None = None
     if tally:
@@ -108,6 +114,10 @@ def _by_blocks(data: Tensor, moves: Moves, generator: torch.Generator | None) ->
     return torch.cat([_Tree(moves, p.contiguous(), None).run(generator) for p in pieces], 2)
 
 
+def _binomial(counts: Tensor, share: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.binomial(counts, share.contiguous(), generator=generator)
+
+
 class _Tree:
     """Splits counts (N, T, P) over lags, adding them up where they go."""
 
@@ -121,8 +131,7 @@ class _Tree:
         self.total = torch.zeros_like(data)
 
     def run(self, generator: torch.Generator | None) -> Tensor:
-        if self.data.numel():
-            self._node(list(range(len(self.weights))), None, self.data, generator)
+        self._node(list(range(len(self.weights))), None, self.data, generator)
         return self.total
 
     def _node(self, lags: list[int], place: Tensor | None, counts: Tensor, generator: torch.Generator | None) -> None:
@@ -130,17 +139,23 @@ class _Tree:
         if len(lags) == 1:
             self._leaf(lags[0], place, counts)
             return
-        small, large = self._split(lags)
+        level = float(counts.sum(dtype=torch.float64)) / counts.numel()
+        small, large = self._split(lags, level)
         few, whole = (self.shares[list(part)].sum(0) for part in (small, lags))
         share = (few / whole.clamp_min(1e-300)).clamp(0, 1)
-        if float(share.max()) < _RARE:
+        highest = float(share.max())
+        if highest * level < _RARE:
             events = thin(counts, self._of_entries(share, place, counts), generator)
             rest = counts.clone()
             rest.view(-1)[events.place] -= events.number
             few_place = events.place if place is None else place[events.place]
             parts = [(small, few_place, events.number), (large, place, rest)]
         else:
-            taken = halve(counts, self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts), generator)
+            even = max(highest, 1 - float(share.min())) * 2 - 1
+            tossed = _TOSSED[0] < level < _TOSSED[1] and even * level < _TURNED
+            shares = self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts)
+            draw = halve if tossed else _binomial
+            taken = draw(counts, shares, generator)
             parts = [(small, place, taken), (large, place, counts - taken)]
         for part, where, number in parts:
             occupied = int(torch.count_nonzero(number))
@@ -151,11 +166,14 @@ class _Tree:
             if occupied:
                 self._node(part, where, number, generator)
 
-    def _split(self, lags: list[int]) -> tuple[list[int], list[int]]:
-        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get."""
+    def _split(self, lags: list[int], level: float) -> tuple[list[int], list[int]]:
+        """Two parts: the rare lags and the others, where there are rare ones, else halves as equal as they get.
+
+        `level`: counts of an entry, on average.
+        """
         order = sorted(lags, key=self.weights.__getitem__)
         whole, total, rare = sum(self.weights[i] for i in lags), 0.0, 0
-        while rare < len(order) - 1 and total + self.weights[order[rare]] < _RARE * whole:
+        while rare < len(order) - 1 and (total + self.weights[order[rare]]) * level < _RARE * whole:
             total += self.weights[order[rare]]
             rare += 1
         if rare:
@@ -204,9 +222,10 @@ class _Tree:
 class MovedCounts(RandomSensor):
     """A sensor that moves detections in time. All four policies.
 
-    Whole counts move one by one. What is not whole, the means of another stage, stays a mean under every policy but
-    "gaussian", which takes its input for a normal surrogate of counts. Under "score" the probabilities are those of
-    the moves; the counts given pass with the gradient of the mean, as under "straight_through".
+    Whole counts move one by one; draws refuse NaN and infinity with UnitError. What is not whole, the means of another
+    stage, stays a mean under every policy but "gaussian", which takes its input for a normal surrogate of counts.
+    Under "score" the probabilities are those of the moves; the counts given pass with the gradient of the mean, as
+    under "straight_through".
     """
 
     def moves(self, x: Tensor) -> Moves:
@@ -223,9 +242,12 @@ class MovedCounts(RandomSensor):
     def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
         given = check_transient(x, type(self).__name__).detach()
         counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
+        highest = float(counts.abs().amax()) if counts.numel() else 0.0
+        if not math.isfinite(highest):
+            raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
         if not is_whole(counts):
             return self.expected(given), None
-        if counts.dtype == torch.float32 and counts.numel() and float(counts.amax()) > WHOLE_FLOAT32 / 2:
+        if counts.dtype == torch.float32 and highest > WHOLE_FLOAT32 / 2:
             counts = counts.double()
         moved, tallies = move_counts(counts, self.moves(x), generator, tally=tally)
         return moved.to(x.dtype), tallies

@@ -84,6 +84,11 @@ class Optics:
         return angle * self.pixel_area_m2 * self.transmission
 
 
+def _check_optics(optics: object, where: str) -> None:
+    if not isinstance(optics, Optics):
+        raise UnitError(f"{where}: expected optics to be an Optics, got {optics!r}. Optics(f_number=2.0), say.")
+
+
 def ambient_photon_rate(
     optics: Optics,
     albedo: float | Tensor,
@@ -106,6 +111,7 @@ def ambient_photon_rate(
     sky adds belongs to the irradiance. Raises UnitError outside the ranges.
     """
     where = "ambient_photon_rate"
+    _check_optics(optics, where)
     energy = photon_energy_j(wavelength_m)
     irradiance = check_number(spectral_irradiance_w_m2_nm, "spectral_irradiance_w_m2_nm", where)
     bandwidth = check_number(filter_bandwidth_m, "filter_bandwidth_m", where)
@@ -194,8 +200,7 @@ class PhotonBudget(Sensor):
     ) -> None:
         super().__init__()
         where = "PhotonBudget"
-        if not isinstance(optics, Optics):
-            raise UnitError(f"{where}: expected optics to be an Optics, got {optics!r}. Optics(f_number=2.0), say.")
+        _check_optics(optics, where)
         self.optics = optics
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)
@@ -235,6 +240,13 @@ class PhotonBudget(Sensor):
     def exposure_s(self) -> float:
         """Duration of the exposure, in seconds."""
         return self.cycles / self.repetition_rate_hz
+
+    @property
+    def background_counts(self) -> float | Tensor:
+        """Ambient and dark counts of a bin in the whole exposure, before pile-up: a number, or a map."""
+        ambient = wide(self.ambient_rate_hz) * wide(self.quantum_efficiency)
+        counts = (ambient + self.dark_count_rate_hz.double()) * (self.bin_width_s * self.cycles)
+        return counts if counts.ndim else float(counts)
 
     @property
     def detections_per_unit(self) -> float | Tensor:

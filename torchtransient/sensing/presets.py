@@ -34,9 +34,9 @@ def _chip_budget(cycles: int, repetition_rate_hz: float) -> dict[str, Any]:
     }
 
 
-def _zone(cycles: int) -> dict[str, Any]:
+def _zone() -> dict[str, Any]:
     """SPADs that share the light of a zone, each with a dead time of its own; their counts are summed."""
-    spad = {"kind": "SynchronousSPAD", "cycles": cycles, "dead_time_s": 10e-9, "axis": _AXIS}
+    spad = {"kind": "SynchronousSPAD", "cycles": "@cycles", "dead_time_s": 10e-9, "axis": _AXIS}
     return {"kind": "MacroPixel", "detector": spad, "spads": 100}
 
 
@@ -148,14 +148,15 @@ _SINGLE_PHOTON = (
                 "dark_count_rate_hz": 40.9,
                 "axis": _AXIS,
             },
-            {"kind": "SynchronousSPAD", "cycles": 100_000},
+            {"kind": "SynchronousSPAD", "cycles": "@cycles"},
             _jitter({"kind": "TailedResponse", "fwhm_s": 27e-12, "tails_s": [60e-12], "fractions": [0.1]}),
             {
                 "kind": "Afterpulsing",
                 "probability": 0.001,
                 "tau_s": 30e-9,
                 "dead_time_s": 75e-9,
-                "period_s": 100e-9,
+                "period_s": "@period_s",
+                "background": "@background",
                 "axis": _AXIS,
             },
         ),
@@ -180,7 +181,7 @@ _SINGLE_PHOTON = (
         stages=(
             _pulse({"kind": "GaussianResponse", "fwhm_s": 0.98e-9}),
             _chip_budget(200_000, 5e6),
-            _zone(200_000),
+            _zone(),
             _jitter({"kind": "GaussianResponse", "fwhm_s": 0.2e-9}),
             {"kind": "Crosstalk", "probability": 0.005},
         ),
@@ -213,7 +214,7 @@ _SINGLE_PHOTON = (
                 }
             ),
             _chip_budget(549_888, 20e6),
-            _zone(549_888),
+            _zone(),
             _jitter({"kind": "GaussianResponse", "fwhm_s": 100e-12}),
         ),
         bin_width_s=88e-12,
@@ -250,7 +251,7 @@ _SINGLE_PHOTON = (
                 "delays_s": _GATES_S,
                 "widths_s": 6e-9,
                 "rise_s": 0.2e-9,
-                "electrons_per_unit": 200.0,
+                "electrons_per_unit": "@cycles",
                 "axis": _AXIS,
             },
             {"kind": "BinaryFrames", "frames": 255},

@@ -45,7 +45,10 @@ class PhysicalModule(nn.Module):
 Quantity = Literal["radiance", "rate", "electrons", "counts"]
 
 # Where light enters a sensor, and the place of the light among the arguments.
-_ENTRANCES = {"expected": 0, "forward": 0, "sample": 0, "variance": 0, "gaussian": 0, "log_prob": 1}
+_ENTRANCES = {
+    **dict.fromkeys(("expected", "forward", "sample", "variance", "gaussian", "probabilities"), 0),
+    "log_prob": 1,
+}
 
 
 def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
@@ -67,7 +70,8 @@ class Sensor(PhysicalModule):
 
     `num_bins`: T of the axis that the sensor was made with, None for one that takes any. Light of another number of
     bins is refused with ShapeError. Half precision is taken and measured in float32, the least in which counts are
-    counts; both hold for `expected`, `forward`, `sample`, `variance`, `gaussian` and `log_prob` of every subclass.
+    counts. Both hold for the methods of every subclass that light enters by: `expected`, `forward`, `sample`,
+    `variance`, `gaussian`, `probabilities` and `log_prob`.
     """
 
     num_bins: int | None = None

@@ -32,10 +32,6 @@ from torchtransient.sensing.running_sums import sum_before
 from torchtransient.sensing.sensor import RandomSensor
 
 
-def _working(x: Tensor) -> Tensor:
-    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-
-
 @in_single
 def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
@@ -44,11 +40,10 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
     1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should.
     """
     check_transient(rate, "first_photon_probabilities")
-    work = _working(rate)
-    before = sum_before(work)
-    p = -torch.expm1(-work) * torch.exp(-before.to(work.dtype))
-    none = torch.exp(-(before.select(TIME, -1) + work.select(TIME, -1).double()))
-    return p.to(rate.dtype), none.to(rate.dtype)
+    before = sum_before(rate)
+    p = -torch.expm1(-rate) * torch.exp(-before.to(rate.dtype))
+    none = torch.exp(-(before.select(TIME, -1) + rate.select(TIME, -1).double()))
+    return p, none.to(rate.dtype)
 
 
 class CoatesEstimate(NamedTuple):
@@ -122,7 +117,7 @@ def sample_detections(
     number = check_count(cycles, "cycles", "sample_detections")
     rate = rate.detach()
     if dead_bins is None:
-        return sample_first_photons(number, _working(rate), generator).to(rate.dtype)
+        return sample_first_photons(number, rate, generator)
     return _drawn(rate, number, dead_bins, generator)[0]
 
 
@@ -203,7 +198,6 @@ class SynchronousSPAD(RandomSensor):
             raise ShapeError(f"SynchronousSPAD: expected T = {self.gate.shape[0]} as in gate, got {x.shape[TIME]}.")
         return x * self.gate.to(x.dtype).view(-1, 1, 1)
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per cycle and bin, after pile-up."""
         rate = self._gated(x)

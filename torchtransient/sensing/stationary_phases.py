@@ -105,6 +105,21 @@ def _tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     return found
 
 
+def tangent_phases(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
+    """All that becomes of lines `right` (P, 2 T) whose counts sum to 0: themselves and every detection after them.
+
+    Up to a multiple of the stationary lines `pi`; its own counts sum to 0. Without gradient.
+    """
+    found = []
+    for r, p, d in zip(*(torch.split(rows, _PIXELS_AT_ONCE) for rows in (chain.rate, pi, right)), strict=True):
+        # rounding is no excess
+        d = d - p * _counts(chain, d)
+        some = d.norm(dim=-1, keepdim=True) > 0
+        one = torch.where(some, d, torch.zeros_like(d))
+        found.append(torch.where(some, _tangent(RenewalChain(r, chain.whole, chain.part), p, one), 0.0))
+    return torch.cat(found)
+
+
 def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Tensor, by_part: Tensor) -> Tensor:
     """Derivative of one step of the chain from `pi` along changes of the rate and of the fraction of a bin.
 

@@ -29,20 +29,34 @@ def random_code_widths(num_bins: int, dnl_std: float, generator: torch.Generator
     return widths / widths.mean()
 
 
-def code_bands(edges: Tensor, num_bins: int, *, periodic: bool = False) -> tuple[int, Tensor]:
+def code_bands(
+    edges: Tensor, num_bins: int, *, periodic: bool = False, dither: bool = False
+) -> tuple[int, Tensor]:
     """(first, (T, B) float64): share of the true bin k + first + b that gets the code k.
 
-    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light outside [0, num_bins] is in no bin, or, if
-    `periodic`, in the bin a whole number of windows away.
+    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light lies evenly in its true bin; `dither` adds a
+    time that is uniform over one bin. Light outside [0, num_bins] is in no bin, or, if `periodic`, in the bin a whole
+    number of windows away.
     """
     lower, upper = edges[:-1], edges[1:]
     index = torch.arange(lower.shape[0], dtype=torch.float64, device=edges.device)
-    first = int(torch.floor((lower - index).amin()))
+    first = int(torch.floor((lower - index).amin())) - int(dither)
     last = int(torch.ceil((upper - index).amax()))
     true = index.unsqueeze(1) + torch.arange(first, max(last, first + 1), dtype=torch.float64, device=edges.device)
-    overlap = torch.minimum(upper.unsqueeze(1), true + 1) - torch.maximum(lower.unsqueeze(1), true)
+    before = _triangle if dither else _box
+    share = before(upper.unsqueeze(1) - true) - before(lower.unsqueeze(1) - true)
     inside = 1.0 if periodic else (true >= 0) & (true < num_bins)
-    return first, overlap.clamp(0, 1) * inside
+    return first, share.clamp_min(0) * inside
+
+
+def _box(z: Tensor) -> Tensor:
+    """Share of a bin's light before z, in bins from its start."""
+    return z.clamp(0, 1)
+
+
+def _triangle(z: Tensor) -> Tensor:
+    """The same with a time on top that is uniform over one bin."""
+    return 0.5 * (z.clamp(0, 1).square() + 1 - (2 - z.clamp(1, 2)).square())
 
 
 def _bands_of_loaded_widths(module: nn.Module, incompatible: object) -> None:
@@ -57,9 +71,9 @@ class TDC(MovedCounts):
 
     `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
     Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known start offsets, one code
-    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown offset, uniform over one
-    bin, that is not taken off: half the events get the next code. `offset_bins`: where, in true bins, the first code
-    begins; light then gets earlier codes by as much.
+    apart, over which conversions are averaged, which evens the DNL out. `dither`: an unknown time, uniform over one
+    bin, that is added before the conversion and not taken off: of equal codes, half the events get the next one.
+    `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
 
     `acts_on` "detections": the input are counts behind a detector. Each of them gets its code: whole counts by a draw,
     under the policies of `MovedCounts`; counts that are not whole stay means. It is the last stage where bins stand
@@ -95,6 +109,11 @@ class TDC(MovedCounts):
         widths = code_widths.detach().double()
         if not bool((widths > 0).all()) or not bool(torch.isfinite(widths).all()):
             raise UnitError("TDC: expected code_widths > 0, finite, relative to the bin (mean about 1).")
+        if not 0.1 <= float(widths.mean()) <= 10:
+            raise UnitError(
+                f"TDC: expected code_widths relative to the bin (mean about 1), got a mean of {float(widths.mean()):g}."
+                " Seconds or picoseconds? Divide them by the bin."
+            )
         check_choice(acts_on, ActsOn, "acts_on", "TDC")
         check_choice(boundary, Boundary, "boundary", "TDC")
         self.acts_on: ActsOn = acts_on
@@ -128,20 +147,12 @@ class TDC(MovedCounts):
             if periodic:
                 # exactly one turn: rounding at the last edge would leave a gap
                 edges[-1] = self.offset_bins + codes
-            parts.append(code_bands(edges, codes, periodic=periodic))
+            parts.append(code_bands(edges, codes, periodic=periodic, dither=self.dither))
         low = min(first for first, _ in parts)
         high = max(first + band.shape[1] for first, band in parts)
         total = widths.new_zeros(codes, high - low)
         for first, band in parts:
             total[:, first - low : first - low + band.shape[1]] += band / self.sliding_scale
-        if self.dither:
-            # half of what code k - 1 would have got goes to code k; the band then begins one bin earlier
-            before = total.roll(1, 0)
-            if not periodic:
-                before[0] = 0
-            later = torch.nn.functional.pad(before, (0, 1))
-            total = 0.5 * torch.nn.functional.pad(total, (1, 0)) + 0.5 * later
-            low -= 1
         return low, total
 
     @property
@@ -162,9 +173,8 @@ class TDC(MovedCounts):
 
     def expected(self, x: Tensor) -> Tensor:
         bins = self._check(x).shape[TIME]
-        work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-        bands = self.bands.to(work.dtype)
-        total, periodic = torch.zeros_like(work), self.goes_round
+        bands = self.bands.to(x.dtype)
+        total, periodic = torch.zeros_like(x), self.goes_round
         for b, column in enumerate(bands.view(bins, -1, 1, 1).unbind(1)):
             # code k gets light of the true bin k + offset
             offset = self.first + b
@@ -174,8 +184,8 @@ class TDC(MovedCounts):
                 low, high = max(0, true - offset), min(bins, true + bins - offset)
                 if low < high:
                     codes = total.narrow(TIME, low, high - low)
-                    codes.addcmul_(column[low:high], work.narrow(TIME, low + offset - true, high - low))
-        return total.to(x.dtype)
+                    codes.addcmul_(column[low:high], x.narrow(TIME, low + offset - true, high - low))
+        return total
 
     def moves(self, x: Tensor) -> Moves:
         self._check(x)

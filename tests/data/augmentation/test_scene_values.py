@@ -13,7 +13,7 @@ from kornia.augmentation import RandomAffine, RandomRotation
 from torchtransient import plugins
 from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
 from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.data.augmentation.scene_values import OF_DEVICES, UNAFFECTED, stays_true
+from torchtransient.data.augmentation.scene_values import OF_DEVICES, UNAFFECTED, check_values, stays_true
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
@@ -167,8 +167,21 @@ NOT_NUMBERS_OF_A_DEVICE = {
     "rows", "codes", "counts", "align", "gain_map", "offset_map_e", "angles_deg", "responses", "response",
     "code", "optics", "diagonal_ratio", "fwhm_px", "spatial_fwhm_px", "phosphor_fwhm_px", "code_widths",
     "sliding_scale", "dither", "num_bins", "seed", "values", "harmonics_of_one_tap", "num_taps", "num_codes",
-    "samples", "closed",
+    "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction", "phase_map_rad",
+    "phase_offset_rad", "start_s", "afterpulsing", "columns", "delays", "detector", "sensors", "weights", "which",
 }  # fmt: skip
+
+
+def test_maps_of_a_device_are_no_numbers():
+    """One efficiency for all pixels stays true of a turned image, one for each pixel does not."""
+    key = "device.PhotonBudget.quantum_efficiency"
+    turned = PixelMap(np.array([[-1.0, 0, 1], [0, 1, 0], [0, 0, 1]]), (2, 2), (2, 2))
+    for number in (0.3, np.float32(0.3), torch.tensor([0.3, 0.4])):
+        check_values({key: number}, turned, (), ())
+    for image in (torch.rand(2, 2), np.ones((1, 2, 2))):
+        with pytest.raises(SceneError, match="quantum_efficiency"):
+            check_values({key: image}, turned, (), ())
+        check_values({key: image}, turned, (), (key,))
 
 
 def test_every_argument_of_a_device_is_known():

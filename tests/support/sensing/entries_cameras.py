@@ -42,6 +42,19 @@ def chain(grad=None):
     )
 
 
+def differences(grad=None):
+    """Two taps with the noise of both, and their difference."""
+    code = sensing.TwoTapCode(itof_codes.sine_code(2))
+    return sensing.Compose(
+        [
+            itof.ItofCorrelation(code, 20e6, AXIS, background_e=2.0),
+            electronics.PixelElectronics(read_noise_e=0.5),
+            sensing.TapDifference(),
+        ],
+        grad=grad,
+    )
+
+
 def streak(grad="expected"):
     return sensing.StreakCamera(
         AXIS, time_fwhm_s=900e-12, jitter_fwhm_s=700e-12, spatial_fwhm_px=0.5, read_noise_e=0.3, grad=grad
@@ -87,6 +100,7 @@ ENTRIES: list[Entry] = [
         errors=((lambda: electronics.PixelElectronics(read_noise_e=-1.0), UnitError),),
     ),
     Entry("Compose", chain, random=True),
+    Entry("Compose-differences", differences, random=True),
     Entry("StreakCamera", streak, random=True),
     Entry(
         "SweepJitter",

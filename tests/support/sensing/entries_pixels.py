@@ -58,6 +58,9 @@ ENTRIES = [
             (lambda: budget(quantum_efficiency=2 * MAP), UnitError),
             (lambda: budget(quantum_efficiency=MAP / 0), UnitError),
             (lambda: sensing.ambient_photon_rate(
+                2.0, 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=1e-8, wavelength_m=9e-7
+            ), UnitError),
+            (lambda: sensing.ambient_photon_rate(
                 sensing.Optics(2.0), 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=10.0, wavelength_m=9e-7
             ), UnitError),
         ),

@@ -53,8 +53,11 @@ OF_DEVICES = frozenset(
         "full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits",
         "black_level_dn", "shot_noise", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins", "f_number",
         "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
+        "spads", "coincidence", "window_s", "exponent", "longest_s", "counted_from", "background",
     )
 )  # fmt: skip
+# Those among them that may be maps of pixels.
+_MAPS_OF_DEVICES = frozenset(("quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz", "delay_s", "background"))
 # Under which plugins keep the numbers of a texture, spectrum or volume.
 _LEAVES = frozenset(("value", "values", "data", "color0", "color1"))
 
@@ -67,8 +70,9 @@ def check_values(values: Any, drawn: PixelMap, cameras: Sequence[str], kept: Seq
         return
     if not isinstance(values, Mapping):
         raise SceneError(f"Augment: expected values as a dictionary by key, got {shown(values)}.")
-    for key in values:
-        if key not in kept and not stays_true(str(key), drawn, cameras):
+    for key, value in values.items():
+        is_map = str(key).split(".")[-1] in _MAPS_OF_DEVICES and getattr(value, "ndim", 0) >= 2
+        if key not in kept and (is_map or not stays_true(str(key), drawn, cameras)):
             named = "" if cameras else ', say what the camera is called, sensor="sensor",'
             raise SceneError(
                 f"Augment: the value {key!r} is not true of the augmented sample, or is not known to be. Read the "
