@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from torchtransient.errors import ShapeError, UnitError
+from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse, cumulative_of_sum, transform
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -114,4 +115,24 @@ def test_transform():
 )
 def test_errors(make, error, message):
     with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Pulse.gaussian(60e-12),  # seconds
+        lambda: Pulse.rectangular(99e-9),
+        lambda: Pulse.tabulated([0.0, 1e-10], [0.0, 1.0]),
+        lambda: Pulse.gaussian_s(60.0),  # picoseconds
+        lambda: Pulse.gaussian_s(0.06),  # nanoseconds
+        lambda: Pulse.rectangular_s(1e-9, center_s=4.0),
+        lambda: Pulse.tabulated_s([0.0, 50.0], [0.0, 1.0]),
+        lambda: Gate.rectangular(10e-9, 14e-9),
+        lambda: Gate.rectangular_s(10.0, 14.0),
+        lambda: Gate.gaussian_s(0.02, 4e-9),
+    ],
+)
+def test_numbers_of_another_unit_are_told(make):
+    with pytest.raises(UnitError, match=r"expected .* got .*(Seconds\?|in metres)"):
         make()

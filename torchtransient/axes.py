@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.units import SPEED_OF_LIGHT, opl_to_seconds, seconds_to_opl
+from torchtransient.units import LATEST_S, SHORTEST_OPL, SPEED_OF_LIGHT, near_seconds, opl_to_seconds, seconds_to_opl
 
 # What a number in another unit looks like. The bins of real records are 1 ps to 1 us wide: in nanoseconds, picoseconds
 # or femtoseconds that is 1e-3 to 1e9, and in seconds taken for metres at most 1e-6.
 WIDEST_BIN_S = 1e-6  # 300 m of path; a picosecond in microseconds is as much
-LATEST_START_S = 1e-2  # light comes back from 1500 km away: satellites
-NARROWEST_BIN_OPL = 1e-7  # 0.3 fs, a quarter of a period of visible light; 300 ns taken for metres
 LOWEST_HERTZ = 1e3  # 1 GHz in megahertz
 MOST_PER_METRE = 5e6  # a wavelength of 200 nm; 5 MHz taken for cycles per metre
 
@@ -56,9 +54,9 @@ class TimeAxis:
                 f"TimeAxis: bins of {width!r} m between {start!r} m and {end!r} m cannot be told apart in float64. "
                 "Use wider bins or an earlier start."
             )
-        if width < NARROWEST_BIN_OPL:
+        if width < SHORTEST_OPL:
             raise UnitError(
-                f"TimeAxis: expected bin_width_opl in metres of optical path, at least {NARROWEST_BIN_OPL:g} (0.3 fs; "
+                f"TimeAxis: expected bin_width_opl in metres of optical path, at least {SHORTEST_OPL:g} (0.3 fs; "
                 f"light itself swings more slowly), got {width!r}. Seconds? TimeAxis.from_seconds takes them."
             )
         # numpy scalars and tensors become plain numbers, so that axes hash and pickle alike wherever they come from
@@ -74,13 +72,8 @@ class TimeAxis:
         or metres: UnitError. Records of that kind are made in metres, `TimeAxis(start_opl, bin_width_opl, num_bins)`.
         """
         start, width = _finite(start_s, "start_s"), _finite(bin_width_s, "bin_width_s")
-        for name, value, limit in (("bin_width_s", width, WIDEST_BIN_S), ("start_s", abs(start), LATEST_START_S)):
-            if value >= limit:
-                raise UnitError(
-                    f"TimeAxis.from_seconds: expected {name} in seconds, below {limit:g} s, got {value!r} s, which is "
-                    f"{seconds_to_opl(value):.4g} m of optical path. 50 ps are 50e-12 s, 4 ns are 4e-9 s. If it is "
-                    "meant, say it in metres: TimeAxis(start_opl, bin_width_opl, num_bins)."
-                )
+        near_seconds(width, "bin_width_s", "TimeAxis.from_seconds", WIDEST_BIN_S)
+        near_seconds(start, "start_s", "TimeAxis.from_seconds", LATEST_S)
         return cls(seconds_to_opl(start), seconds_to_opl(width), num_bins)
 
     @property

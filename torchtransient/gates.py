@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.pulses import CUT_STDDEVS, FWHM_PER_STDDEV, Pulse
-from torchtransient.units import seconds_to_opl
+from torchtransient.units import SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,11 @@ class Gate:
         start, end = float(self.start_opl), float(self.end_opl)
         if not (math.isfinite(start) and math.isfinite(end) and start < end):
             raise UnitError(f"Gate: expected a finite start before a finite end, got {start!r} m to {end!r} m.")
+        if end - start < SHORTEST_OPL:
+            raise UnitError(
+                f"Gate: expected start and end in metres of optical path, at least {SHORTEST_OPL:g} apart (0.3 fs), "
+                f"got {start!r} and {end!r}. Seconds? rectangular_s and gaussian_s take them."
+            )
         object.__setattr__(self, "start_opl", start)
         object.__setattr__(self, "end_opl", end)
 
@@ -93,12 +98,14 @@ class Gate:
     @classmethod
     def rectangular_s(cls, start_s: float, end_s: float) -> Gate:
         """As :meth:`rectangular`, in seconds."""
-        return cls.rectangular(seconds_to_opl(start_s), seconds_to_opl(end_s))
+        start, end = (near_seconds(t, "start_s and end_s", "Gate.rectangular_s") for t in (start_s, end_s))
+        return cls.rectangular(seconds_to_opl(start), seconds_to_opl(end))
 
     @classmethod
     def gaussian_s(cls, center_s: float, fwhm_s: float) -> Gate:
         """As :meth:`gaussian`, in seconds."""
-        return cls.gaussian(seconds_to_opl(center_s), seconds_to_opl(fwhm_s))
+        center, fwhm = (near_seconds(t, "center_s and fwhm_s", "Gate.gaussian_s") for t in (center_s, fwhm_s))
+        return cls.gaussian(seconds_to_opl(center), seconds_to_opl(fwhm))
 
     def shifted(self, opl: float) -> Gate:
         """The same gate, opened ``opl`` metres later."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.units import seconds_to_opl
+from torchtransient.units import LONGEST_PULSE_S, SHORTEST_OPL, near_seconds, seconds_to_opl
 
 Array = NDArray[np.float64]
 
@@ -53,6 +53,7 @@ class Pulse:
         width = _number(self.width_opl, "width")
         if width <= 0:
             raise UnitError(f"Pulse: expected a width above 0 metres, got {width!r}.")
+        _check_metres(width)
         object.__setattr__(self, "width_opl", width)
 
     def _check_table(self) -> None:
@@ -69,6 +70,7 @@ class Pulse:
                 "Pulse.tabulated: expected finite values, none negative and not all zero (subtract the background of "
                 f"a measured pulse first), got values between {values.min():g} and {values.max():g}."
             )
+        _check_metres(float(opl[-1] - opl[0]))
         object.__setattr__(self, "opl", tuple(opl.tolist()))
         object.__setattr__(self, "values", tuple(values.tolist()))
 
@@ -92,17 +94,24 @@ class Pulse:
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`gaussian`, in seconds."""
-        return cls.gaussian(seconds_to_opl(fwhm_s), seconds_to_opl(center_s))
+        width = near_seconds(_number(fwhm_s, "fwhm_s"), "fwhm_s", "Pulse.gaussian_s", LONGEST_PULSE_S)
+        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.gaussian_s")
+        return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
         """As :meth:`rectangular`, in seconds."""
-        return cls.rectangular(seconds_to_opl(width_s), seconds_to_opl(center_s))
+        width = near_seconds(_number(width_s, "width_s"), "width_s", "Pulse.rectangular_s", LONGEST_PULSE_S)
+        center = near_seconds(_number(center_s, "center_s"), "center_s", "Pulse.rectangular_s")
+        return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def tabulated_s(cls, times_s: Sequence[float], values: Sequence[float], center_s: float = 0.0) -> Pulse:
         """As :meth:`tabulated`, with times in seconds."""
-        lengths = seconds_to_opl(np.asarray(times_s, dtype=np.float64))
+        times = np.asarray(times_s, dtype=np.float64)
+        for time in times.ravel().tolist():
+            near_seconds(time, "times_s", "Pulse.tabulated_s")
+        lengths = seconds_to_opl(times)
         return cls.tabulated(lengths.tolist(), tuple(values), seconds_to_opl(center_s))
 
     def shifted(self, opl: float) -> Pulse:
@@ -188,6 +197,14 @@ def _convolve(a: Array, b: Array) -> Array:
         return np.convolve(a, b)
     product = np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b, size), size)
     return np.asarray(np.maximum(product, 0.0), dtype=np.float64)
+
+
+def _check_metres(width: float) -> None:
+    if width < SHORTEST_OPL:
+        raise UnitError(
+            f"Pulse: expected a width in metres of optical path, at least {SHORTEST_OPL:g} (0.3 fs), got {width!r}. "
+            "Seconds? gaussian_s, rectangular_s and tabulated_s take them."
+        )
 
 
 def _number(value: Any, name: str) -> float:

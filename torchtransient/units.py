@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s in vacuum, exact by the definition of the metre (SI)
+# What a number in another unit looks like. Bins and pulses are 0.3 fs long and more, a quarter of a period of visible
+# light: a shorter length is a time in seconds.
+SHORTEST_OPL = 1e-7
+# Pulses are far below the 1 ms that a picosecond is in nanoseconds, and light comes back from 1500 km away in 10 ms.
+LONGEST_PULSE_S = 1e-3
+LATEST_S = 1e-2
 
 Quantity = TypeVar("Quantity", "float", "Tensor", "NDArray[Any]")
 
@@ -36,6 +42,17 @@ def seconds_to_opl(time_s: Quantity) -> Quantity:
     """
     _refuse_half(time_s, "seconds_to_opl")
     return time_s * SPEED_OF_LIGHT
+
+
+def near_seconds(time_s: float, name: str, where: str, limit_s: float = LATEST_S) -> float:
+    """A time in seconds. UnitError from `limit_s` on, either side of zero: picoseconds, nanoseconds or metres."""
+    if abs(time_s) >= limit_s:
+        raise UnitError(
+            f"{where}: expected {name} in seconds, below {limit_s:g} s, got {time_s!r} s, which is "
+            f"{seconds_to_opl(float(time_s)):.4g} m of optical path. 50 ps are 50e-12 s, 4 ns are 4e-9 s. If it is "
+            "meant, say it in metres of optical path."
+        )
+    return time_s
 
 
 def _refuse_half(value: object, name: str) -> None:

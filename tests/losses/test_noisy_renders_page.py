@@ -65,4 +65,4 @@ def test_its_tables_are_those_of_the_numbers():
     squares, roots, poisson = (
         errors[name] for name in ("weighted squares, 64 samples", "`expected_root_loss`, 64", "`poisson_loss`, 64")
     )
-    assert squares < 0.6 * roots and roots < errors["the start"] < 0.6 * poisson
+    assert squares < 0.65 * roots and roots < errors["the start"] < 0.6 * poisson

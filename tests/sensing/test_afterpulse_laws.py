@@ -102,6 +102,30 @@ def test_draws_have_the_mean(name):
     assert bool(((added - mean).abs() < 5.5 * (1.5 * mean / pixels).sqrt() + 1e-3).all())
 
 
+@each_law
+@pytest.mark.parametrize("period", [BINS + 1, 64, 75, 300])
+def test_constant_counts_in_a_window_of_a_longer_period(name, period):
+    """What goes on outside of the window triggers afterpulses inside: as in a window of the whole period."""
+    whole = LAWS[name]()
+    part = LAWS[name]()
+    part.period_bins, part.background = period, 3.0
+    x = torch.full((1, period, 2, 2), 3.0, dtype=torch.float64)
+    x[:, 7] += 50.0
+    torch.testing.assert_close(part(x[:, :BINS]), whole(x)[:, :BINS], rtol=1e-9, atol=0)
+    constant = torch.full((1, BINS, 2, 2), 3.0, dtype=torch.float64)
+    assert float(part(constant).max() / part(constant).min() - 1) < 1e-9
+
+
+def test_draws_of_a_window_of_a_longer_period():
+    """In each of 4096 pixels of every bin: the mean, and the variance of a Poisson number."""
+    module = exponentials(5.0, (0.1, 30.0), period_s=90 * WIDTH, background=20.0)
+    x = torch.full((1, BINS, 64, 64), 20.0)
+    added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double().mean((0, 2, 3))
+    mean = float(module.extra(x.double()).mean())
+    assert mean == pytest.approx(20 * 0.1 / 0.9, rel=1e-6)
+    assert float((added - mean).abs().max()) < 5 * (1.2 * mean / 4096) ** 0.5
+
+
 def test_one_of_several_exponentials_is_one():
     x = torch.rand(1, BINS, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     one = Afterpulsing(0.1, 12e-10, 30e-10, bin_width_s=WIDTH)
@@ -260,6 +284,17 @@ def test_one_detection_a_cycle_has_afterpulses_in_later_cycles_only():
     assert float(sensor(x).sum() / alone - 1) == pytest.approx(late, rel=1e-3)
     longer = AfterpulsingSPAD(SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0), period_s=400 * WIDTH))
     assert float(longer(x).sum() / alone - 1) < 1e-12
+
+
+def test_a_detector_in_a_window_of_a_longer_period():
+    """Constant light that goes on outside: as dim light in a window of the whole period, constant to 1e-6."""
+    level, period, cycles = 1e-8, 90, 1000
+    parts = exponentials(12.3, (0.1, 30.0), period_s=period * WIDTH, background=level * cycles)
+    sensor = AfterpulsingSPAD(detector("several", 12.3, cycles=cycles), parts)
+    y = sensor(torch.full((1, BINS, 1, 1), level, dtype=torch.float64))
+    assert float(y.max() / y.min() - 1) < 1e-6
+    # the cycle's own pile-up is 4e-7 of it
+    assert float(y.mean()) == pytest.approx(level * cycles / 0.9, rel=1e-6)
 
 
 @pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])

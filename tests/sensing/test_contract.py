@@ -58,25 +58,36 @@ def test_dtype_and_device_are_kept(entry):
             assert error <= LOOSE[dtype] * (exact.abs().max() + 1e-12)
 
 
-@each
-@pytest.mark.parametrize("dtype", HALVES, ids=str)
-def test_half_precision_is_measured_in_single(entry, dtype):
+def same_as_in_single(entry, dtype, policies):
     """The mean and every draw of it: of the same numbers in float32, to the bit; the gradient goes back in halves."""
-    for policy in entry.policies if entry.random else (None,):
+    x = entry.x(dtype)[:1]
+    for policy in policies:
         module = entry.module(torch.float32, **({"grad": policy} if policy else {}))
-        x = entry.x(dtype)
 
         def measured(light, module=module):
             with ScoreFunction():
-                drawn = module(light, generator=torch.Generator().manual_seed(2))
-                return [value.detach() for value in (*parts(expected(module, light)), *parts(drawn))]
+                return [v.detach() for v in parts(module(light, generator=torch.Generator().manual_seed(2)))]
 
         for found, wanted in zip(measured(x), measured(x.float()), strict=True):
             assert found.dtype == (torch.complex64 if wanted.is_complex() else torch.float32)
             assert torch.equal(found, wanted)
     leaf = x.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(parts(expected(entry.module(torch.float32), leaf))[0].sum(), leaf)
+    mean = parts(expected(entry.module(torch.float32), leaf))[0]
+    assert torch.equal(mean.detach(), parts(expected(entry.module(torch.float32), x.float()))[0].detach())
+    (gradient,) = torch.autograd.grad(mean.sum(), leaf)
     assert gradient.dtype == dtype
+
+
+@each
+def test_half_precision_is_measured_in_single(entry):
+    same_as_in_single(entry, torch.bfloat16, ["straight_through" if entry.random else None])
+
+
+@pytest.mark.slow
+@each
+@pytest.mark.parametrize("dtype", HALVES, ids=str)
+def test_half_precision_under_every_policy(entry, dtype):
+    same_as_in_single(entry, dtype, entry.policies if entry.random else [None])
 
 
 @each

@@ -210,12 +210,15 @@ def test_one_change_of_a_device_reaches_all_stages():
     stages = (
         {**kind, **numbers, "exposure_s": 1e-3},
         {"kind": "SynchronousSPAD", "cycles": "@cycles"},
-        {**after, "axis": "@axis", "period_s": "@period_s"},
+        {**after, "axis": "@axis", "period_s": "@period_s", "background": "@background"},
     )
     device = sensing.Device("linked", "", (), stages, 100e-12, 128)
     sensor = sensing.Device.from_json(device.to_json()).sensor()
     assert [s.cycles for s in list(sensor.stages)[:2]] == [10_000] * 2
     assert sensor.stages[2].period_s == pytest.approx(100 * NS)
+    assert sensor.stages[2].background == 0
+    bright = device.changed("PhotonBudget", ambient_rate_hz=1e6, quantum_efficiency=0.5).sensor()
+    assert bright.stages[2].background == pytest.approx(0.5e6 * 10_000 * 100 * PS)
     faster = device.changed("PhotonBudget", repetition_rate_hz=20e6).sensor()
     assert faster.stages[1].cycles == 20_000 and faster.stages[2].period_s == pytest.approx(50 * NS)
     for stage in stages[1:]:

@@ -16,6 +16,7 @@ from torchtransient.sensing.added_counts import AddedCounts
 from torchtransient.sensing.afterpulse_delays import AfterpulseDelays, exponential_kernel, exponential_shares
 from torchtransient.sensing.draws import by_pieces
 from torchtransient.sensing.layout import TIME, bin_width_of, check_number, check_seconds, check_transient
+from torchtransient.sensing.pixel_maps import check_map, keep_map, over_time, wide
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.thinning import thin
 from torchtransient.sensing.time_convolution import check_choice, filter_rows
@@ -88,13 +89,20 @@ class Afterpulsing(AddedCounts):
     Works on counts, behind the SPAD. The histogram is taken round the laser period (`period_s`, by default the window):
     afterpulses of one cycle fall into later ones, constant light stays constant. Dead time is not applied to the
     afterpulses themselves, nor do they keep photons from being seen: right in dim light (`AfterpulsingSPAD` for the
-    rest). `learnable`: `logit_probability`, `log_tau_s`, as long as there are exponentials.
+    rest).
+
+    A period that is longer than the window has counts that nobody sees, whose afterpulses do come into the window:
+    `background`, constant counts of a bin of the exposure (a number or a map; `PhotonBudget.background_counts`), is
+    taken to go on outside of it, and constant light then stays constant. 0: the detector is dark or off there.
+
+    `learnable`: `logit_probability`, `log_tau_s`, as long as there are exponentials.
 
     Raises UnitError for probabilities whose sum is not in (0, 0.5], ShapeError where they and `tau_s` differ in number.
     """
 
     logit_probability: Tensor
     log_tau_s: Tensor
+    background: float | Tensor
 
     def __init__(
         self,
@@ -107,6 +115,7 @@ class Afterpulsing(AddedCounts):
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
         period_s: float | None = None,
+        background: float | Tensor = 0.0,
         learnable: bool = False,
         grad: GradPolicy = "expected",
     ) -> None:
@@ -127,6 +136,7 @@ class Afterpulsing(AddedCounts):
             self.period_s = check_seconds(period_s, "period_s", where, open_low=True, high=1.0)
             self.period_bins = round(self.period_s / self.bin_width_s)
             _check_period(self.period_bins, 1)
+        keep_map(self, "background", check_map(background, "background", where))
         self.delays, self.counted_from = delays, counted_from
         self._keep(probability, [] if tau_s is None else tau_s, learnable)
         if delays is not None:  # says what is wrong with a law and a dead time that do not go together
@@ -197,7 +207,21 @@ class Afterpulsing(AddedCounts):
     @in_single
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
-        return add_afterpulses(x, 1.0, self.kernel(self._period_bins(x)), only_added=True)
+        added = add_afterpulses(x, 1.0, self.kernel(self._period_bins(x)), only_added=True)
+        beyond = self._beyond(x)
+        return added if beyond is None else added + beyond
+
+    def _beyond(self, x: Tensor) -> Tensor | None:
+        """Mean afterpulses in the window of constant counts outside of it; None where there are none."""
+        bins, period = x.shape[TIME], self._period_bins(x)
+        dark = not isinstance(self.background, Tensor) and self.background == 0
+        if dark or period <= bins:
+            return None
+        window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=x.device)
+        kernel = self.kernel(period).to(x.device)
+        total = kernel.sum() / (1 - kernel.sum())
+        missing = (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).view(-1, 1, 1)
+        return (missing * over_time(wide(self.background), x, "background", "Afterpulsing")).to(x.dtype).expand_as(x)
 
     def share(self) -> float:
         p = float(self._seen().detach().sum())
@@ -255,7 +279,8 @@ class Afterpulsing(AddedCounts):
         total = counts.clone(memory_format=torch.contiguous_format)
         for places in by_pieces(follow, counts.reshape(-1), generator):
             total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        return total
+        beyond = self._beyond(counts)
+        return total if beyond is None else total + self._poisson(beyond, generator)
 
 
 def hot_pixel_rates(

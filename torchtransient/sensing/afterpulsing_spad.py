@@ -12,12 +12,13 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.layout import TIME, check_transient
+from torchtransient.sensing.pixel_maps import over_time, wide
 from torchtransient.sensing.policies import GradPolicy
 from torchtransient.sensing.spad import SynchronousSPAD
 from torchtransient.sensing.time_convolution import filter_rows
-from torchtransient.sensing.wrapped_detector import WrappedDetector
+from torchtransient.sensing.wrapped_detector import WrappedDetector, cycles_of
 
-_LEFT = 1e-7  # of the afterpulses, where generations end
+_LEFT = 1e-8  # of all counts, where generations end
 
 
 class AfterpulsingSPAD(WrappedDetector):
@@ -25,12 +26,13 @@ class AfterpulsingSPAD(WrappedDetector):
 
     Carriers that are set free act on the detector as photons do: they fire it when it is armed and are lost when it is
     dead; those that fire start a dead time and leave carriers of their own. Their rate, `released(x)`, follows from the
-    mean of all detections round the laser period, which follows from it: iterated until 1e-7 of it is left. It is
-    added to that of the photons, so that means, draws and all four policies are the detector's own.
+    mean of all detections round the laser period, which follows from it: iterated until 1e-8 of the counts is left. It
+    is added to that of the photons, so that means, draws and all four policies are the detector's own.
 
     `afterpulsing`: an `Afterpulsing`, of the detector's bins and dead time. One detection per cycle (`SynchronousSPAD`
     without dead time) leaves the detector dead to the end of the cycle: only afterpulses of later cycles are seen. A
-    closed gate stops them, too. `period_s` beyond the window: nothing is detected outside of the window.
+    closed gate stops them, too. With a `period_s` beyond the window the `background` of the Afterpulsing, counts of a
+    bin of the whole exposure, goes on outside of it.
 
     Releases are taken as independent of whether a photon has fired the detector since the detection that they come
     from: right in dim light, in constant light and where most delays are longer than the next dead time; else off by up
@@ -94,14 +96,27 @@ class AfterpulsingSPAD(WrappedDetector):
             free = (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
         return free.movedim(-1, TIME)
 
+    def _from_outside(self, x: Tensor, round_period: Tensor, period: int) -> Tensor | float:
+        """Carriers of the constant counts outside of the window, per cycle and bin: float64."""
+        given = self.afterpulsing.background
+        if period == x.shape[TIME] or (not isinstance(given, Tensor) and given == 0):
+            return 0.0
+        level = over_time(wide(given), x, "background", "AfterpulsingSPAD")
+        all_of_one = round_period[0].real
+        ones = torch.ones(1, x.shape[TIME], dtype=torch.float64, device=x.device)
+        missing = (all_of_one - filter_rows(ones, round_period, period, 0, x.shape[TIME])).clamp_min(0)
+        return missing.view(-1, 1, 1) * level / ((1 - all_of_one) * cycles_of(self.detector))
+
     @in_single
     def released(self, x: Tensor) -> Tensor:
         """Rate of carriers set free, per cycle and bin, in the shape and dtype of `x`; they fire an armed detector."""
         transfers = self._transfers(x)
         most = float(self.afterpulsing.kernel(transfers[2]).detach().sum())
+        outside = self._from_outside(x, transfers[0], transfers[2])
         free = torch.zeros_like(x)
-        for _ in range(max(1, math.ceil(math.log(_LEFT) / math.log(most)))):
-            free = self._released(self.detector.probabilities(x + free), transfers).to(x.dtype)
+        for _ in range(max(1, math.ceil(math.log(_LEFT) / math.log(most)) - 1)):
+            inside = self._released(self.detector.probabilities(x + free), transfers)
+            free = (inside + outside).to(x.dtype)
         return free
 
     @in_single

@@ -2,9 +2,9 @@
 
 A stage is a dictionary with a ``kind`` (a name in `KINDS`) and the arguments of that class or function; arguments may
 be stages themselves (a response, a code). The strings ``"@axis"`` and ``"@num_bins"`` stand for the axis that the
-sensor is built for, ``"@cycles"`` and ``"@period_s"`` for the laser cycles and the laser period of the chain's
-`PhotonBudget`, so that one change reaches all stages that have to agree. Only kinds in the list are ever called, so
-that a file from elsewhere runs no code of its own.
+sensor is built for, ``"@cycles"``, ``"@period_s"`` and ``"@background"`` for the laser cycles, the laser period and the
+constant counts of a bin of the chain's `PhotonBudget`, so that one change reaches all stages that have to agree. Only
+kinds in the list are ever called, so that a file from elsewhere runs no code of its own.
 
     device = tt.sensing.device("kinect_v2_like")
     sensor = device.sensor(axis, grad="gaussian")          # a Compose, behind a TransientRenderer with that axis
@@ -218,9 +218,9 @@ class Device:
 def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, Any] | None = None) -> Any:
     """The object that a stage stands for: a sensor, response, code, or the value itself where it is no dictionary.
 
-    ``budget``: the stage of the `PhotonBudget` that ``"@cycles"`` and ``"@period_s"`` refer to. Raises StorageError for
-    an unknown kind, an argument that the kind does not take, or a placeholder for what is not there; errors of the
-    values themselves (UnitError, ShapeError) pass.
+    ``budget``: the stage of the `PhotonBudget` that ``"@cycles"``, ``"@period_s"`` and ``"@background"`` refer to.
+    Raises StorageError for an unknown kind, an argument that the kind does not take, or a placeholder for what is not
+    there; errors of the values themselves (UnitError, ShapeError) pass.
     """
     if isinstance(spec, str) and spec.startswith("@"):
         return _placeholder(spec, axis, budget)
@@ -245,10 +245,13 @@ def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | N
         if axis is None:
             raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
         return axis if name == "@axis" else axis.num_bins
-    if name not in ("@cycles", "@period_s"):
-        raise StorageError(f"build_stage: expected '@axis', '@num_bins', '@cycles' or '@period_s', got {name!r}.")
+    if name not in ("@cycles", "@period_s", "@background"):
+        known = "'@axis', '@num_bins', '@cycles', '@period_s' or '@background'"
+        raise StorageError(f"build_stage: expected {known}, got {name!r}.")
     if budget is None:
         raise StorageError(f"build_stage: expected a PhotonBudget in the chain for {name!r}. Give the number itself.")
+    if name == "@background":
+        return build_stage(budget, axis).background_counts
     rate_hz = check_number(budget.get("repetition_rate_hz", 0.0), "repetition_rate_hz", "PhotonBudget", open_low=True)
     if name == "@period_s":
         return 1 / rate_hz

@@ -242,6 +242,13 @@ class PhotonBudget(Sensor):
         return self.cycles / self.repetition_rate_hz
 
     @property
+    def background_counts(self) -> float | Tensor:
+        """Ambient and dark counts of a bin in the whole exposure, before pile-up: a number, or a map."""
+        ambient = wide(self.ambient_rate_hz) * wide(self.quantum_efficiency)
+        counts = (ambient + self.dark_count_rate_hz.double()) * (self.bin_width_s * self.cycles)
+        return counts if counts.ndim else float(counts)
+
+    @property
     def detections_per_unit(self) -> float | Tensor:
         """Detections per cycle for a radiance of 1 in a bin: a number, or a map where the efficiency is one."""
         photons = self.pulse_energy_j * self.optics.etendue_m2_sr / self.photon_energy_j

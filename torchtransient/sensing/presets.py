@@ -156,6 +156,7 @@ _SINGLE_PHOTON = (
                 "tau_s": 30e-9,
                 "dead_time_s": 75e-9,
                 "period_s": "@period_s",
+                "background": "@background",
                 "axis": _AXIS,
             },
         ),

@@ -19,7 +19,7 @@ _ROOM = 2e-6  # for the rounding of probabilities and uniform numbers in single 
 _HEAVY = 6.0  # expected events of an entry, above which torch.binomial is cheaper than inversion
 _GRID = 65536.0  # steps of a 16 bit number
 _BITS = 31  # random bits of an int32 that is not negative
-_MOST_WORDS = 2
+_MOST_WORDS = 2  # as many as `_coins` counts together
 _TURNED = 2.0  # number of coins an entry has to turn, above which tossing them does not pay
 _FEW_MISFITS = 0.04  # share of entries with too many counts, above which more random bits are drawn
 _MOST_MISFITS = 0.6  # ... above which tossing coins does not pay at all
@@ -195,22 +195,33 @@ def _coins(
     if misfits:
         coins, unfit = n * fits, (~fits).nonzero().squeeze(-1)
     left = coins.to(torch.int32)
-    heads = torch.zeros_like(left)
-    for _ in range(words):
-        bits = torch.empty_like(left).random_(generator=generator)  # 0 to 2^31 - 1
-        now = left if words == 1 else left.clamp_max(_BITS)
-        # a shift by 31 leaves no bit
-        heads += _bit_count(bits.bitwise_right_shift_(_BITS - now))
-        left = left - now
+    if words == 1:
+        nibbles = _nibble_counts(_tossed(left, generator))
+    else:
+        now = left.clamp_max(_BITS)
+        nibbles = _nibble_counts(_tossed(now, generator))
+        # two words have at most eight ones in a nibble
+        nibbles += _nibble_counts(_tossed(left.sub_(now), generator))
+    heads = _sum_of_nibbles(nibbles)
     return tilt, coins, heads.to(n.dtype), unfit
 
 
-def _bit_count(v: Tensor) -> Tensor:
-    """Number of ones of int32 values >= 0, adding neighbours of 1, 2, 4, 8 and 16 bits. `v` is overwritten."""
+def _tossed(coins: Tensor, generator: torch.Generator | None) -> Tensor:
+    """As many random bits as there are coins (int32, up to 31), the others 0."""
+    bits = torch.empty_like(coins).random_(generator=generator)  # 0 to 2^31 - 1
+    # a shift by 31 leaves no bit
+    return bits.bitwise_right_shift_(_BITS - coins)
+
+
+def _nibble_counts(v: Tensor) -> Tensor:
+    """Number of ones of every 4 bits of int32 values >= 0, in their place. `v` is overwritten."""
     v -= (v >> 1).bitwise_and_(0x55555555)
     pairs = (v >> 2).bitwise_and_(0x33333333)
-    v.bitwise_and_(0x33333333).add_(pairs)
-    v.add_(v >> 4).bitwise_and_(0x0F0F0F0F)
-    v += v >> 8
-    v += v >> 16
-    return v.bitwise_and_(0x3F)
+    return v.bitwise_and_(0x33333333).add_(pairs)
+
+
+def _sum_of_nibbles(v: Tensor) -> Tensor:
+    """Sum of the eight nibbles, each at most 8. `v` is overwritten."""
+    v = (v >> 4).bitwise_and_(0x0F0F0F0F).add_(v.bitwise_and_(0x0F0F0F0F))
+    # the product holds the sum of all bytes, at most 64, in the highest one
+    return v.mul_(0x01010101).bitwise_right_shift_(24)

@@ -38,6 +38,15 @@ def obeyed(detector, dead_time_s=70 * PS):
 ENTRIES = [
     Entry("Afterpulsing-several", several, random=True),
     Entry(
+        "Afterpulsing-background",
+        lambda **k: several(period_s=600 * PS, background=torch.linspace(0.0, 0.5, 6).view(2, 3), **k),
+        random=True,
+        errors=(
+            (lambda: several(background=-1.0), UnitError),
+            (lambda: several(period_s=600 * PS, background=torch.ones(2, 2))(torch.ones(1, 12, 2, 3)), ShapeError),
+        ),
+    ),
+    Entry(
         "Afterpulsing-power-law",
         power_law,
         random=True,

@@ -53,11 +53,11 @@ OF_DEVICES = frozenset(
         "full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits",
         "black_level_dn", "shot_noise", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins", "f_number",
         "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
-        "spads", "coincidence", "window_s", "exponent", "longest_s", "counted_from",
+        "spads", "coincidence", "window_s", "exponent", "longest_s", "counted_from", "background",
     )
 )  # fmt: skip
 # Those among them that may be maps of pixels.
-_MAPS_OF_DEVICES = frozenset(("quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz", "delay_s"))
+_MAPS_OF_DEVICES = frozenset(("quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz", "delay_s", "background"))
 # Under which plugins keep the numbers of a texture, spectrum or volume.
 _LEAVES = frozenset(("value", "values", "data", "color0", "color1"))
 
